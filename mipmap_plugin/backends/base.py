@@ -1,0 +1,84 @@
+"""The contract of a backend: Gaussians + Camera + Effects -> Rendered, and the reasons why it cannot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+
+# Raised when `Backend.render` or the records below change in a way that an old backend cannot serve.
+API_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """One image. Differentiable in the Gaussians that it was rendered from."""
+
+    image: Tensor  # [H, W, 3], background included, not clamped
+    alpha: Tensor  # [H, W], 1 - transmittance
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a request asks of a backend."""
+
+    device: str  # torch device type: "cpu", "cuda", ...
+    dtype: torch.dtype
+    gradients: bool
+    sh_degree: int
+    screen_filter: str
+    covariances: bool = False
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, effects: Effects, *, gradients: bool) -> Needs:
+        means = gaussians.means
+        return cls(means.device.type, means.dtype, gradients, effects.sh_degree, effects.screen_filter, gaussians.covariances is not None)
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a backend can do, as data."""
+
+    devices: frozenset[str] | None  # torch device types; None: any
+    dtypes: frozenset[torch.dtype]
+    screen_filters: frozenset[str]
+    gradients: bool = True
+    max_sh_degree: int = 4
+    covariances: bool = True
+
+    def lacking(self, needs: Needs) -> list[str]:
+        """One sentence for each need that is not met; empty when all are."""
+        reasons = []
+        if self.devices is not None and needs.device not in self.devices:
+            reasons.append(f"it runs on {', '.join(sorted(self.devices))}, not on {needs.device}")
+        if needs.dtype not in self.dtypes:
+            reasons.append(f"it computes in {', '.join(sorted(map(str, self.dtypes)))}, not in {needs.dtype}")
+        if needs.gradients and not self.gradients:
+            reasons.append("it has no gradients")
+        if needs.sh_degree > self.max_sh_degree:
+            reasons.append(f"it evaluates SH up to degree {self.max_sh_degree}, not {needs.sh_degree}")
+        if needs.screen_filter not in self.screen_filters:
+            reasons.append(f"it has the screen filters {', '.join(sorted(self.screen_filters))}, not {needs.screen_filter}")
+        if needs.covariances and not self.covariances:
+            reasons.append("it takes quaternions and scales, not covariances")
+        return reasons
+
+
+class Backend(Protocol):
+    """What turns Gaussians into an image. One sample per pixel; supersampling is built on top (`supersample.py`)."""
+
+    name: str
+    api_version: int
+    speed: int  # rank for `auto`: of those that lack nothing, the highest is taken
+
+    def lacking(self, needs: Needs) -> list[str]:
+        """Why this backend cannot serve `needs`, in sentences; empty when it can."""
+
+    def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+        """The view of `camera`, [H, W, 3] and [H, W], on the device and in the dtype of `gaussians`."""

@@ -1,0 +1,62 @@
+"""Camera: a pinhole view. Pixel centres lie at +0.5, axes are OpenCV's (x right, y down, z forward)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.errors import SettingsError, ShapeError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One view. Compared and hashed by identity, so that a cache keyed by a camera is exact."""
+
+    width: int  # px
+    height: int  # px
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px, continuous: the left edge of the image is 0
+    cy: float  # px
+    viewmat: Tensor  # [4, 4] float64 on the CPU, world to camera
+    name: str = ""
+    split: Literal["train", "test"] = "train"
+    time: float | None = None  # 0..1, for moving scenes
+
+    def __post_init__(self) -> None:
+        if tuple(self.viewmat.shape) != (4, 4):
+            raise ShapeError(f"viewmat: expected shape [4, 4], got {list(self.viewmat.shape)}")
+        if min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:
+            raise SettingsError(f"camera {self.name!r}: {self.width}x{self.height} px with focal lengths {self.fx}, {self.fy} is not a view")
+        object.__setattr__(self, "viewmat", self.viewmat.detach().to("cpu", torch.float64))
+
+    @property
+    def center(self) -> Tensor:
+        """[3] float64, the eye in world space."""
+        rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
+        return -torch.linalg.solve(rotation, translation)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width), as images are indexed."""
+        return self.height, self.width
+
+    def zoomed(self, factor: float) -> Camera:
+        """The same view sampled `factor` times more densely per axis.
+
+        Width and height are rounded as Pillow users do, and the focal lengths follow each axis' true factor, so
+        that the field of view is exactly kept.
+        """
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same field of view at `width` x `height` px."""
+        x, y = width / self.width, height / self.height
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
+
+    def looking_from(self, viewmat: Tensor, name: str) -> Camera:
+        """The same lens at another pose."""
+        return replace(self, viewmat=viewmat, name=name)

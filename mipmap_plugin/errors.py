@@ -1,0 +1,33 @@
+"""One exception tree: every error a user can cause is a `MipmapPluginError` whose text says what, where and what to do."""
+
+
+class MipmapPluginError(Exception):
+    """Base of all errors that the command line turns into one sentence and exit code 2."""
+
+
+class CheckpointError(MipmapPluginError, ValueError):
+    """A checkpoint that cannot be read, or not in the way that was asked."""
+
+
+class SceneError(MipmapPluginError, ValueError):
+    """Cameras or images that cannot be read."""
+
+
+class ShapeError(MipmapPluginError, ValueError):
+    """Tensors that do not fit together."""
+
+
+class SettingsError(MipmapPluginError, ValueError):
+    """A request that cannot be served as it was put."""
+
+
+class BackendUnavailable(MipmapPluginError, ImportError):
+    """No backend can serve a request; the text holds each backend's reasons."""
+
+
+class PluginError(MipmapPluginError, ImportError):
+    """A registered name whose target does not import or does not fit."""
+
+
+class OutputExists(MipmapPluginError, FileExistsError):
+    """An output that is already there and was not to be overwritten."""

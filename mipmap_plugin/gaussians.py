@@ -1,0 +1,65 @@
+"""Gaussians: the one interface between every checkpoint family and every backend."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.errors import ShapeError
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N splats in world space, activated: scales are lengths, opacities are in 0..1. Checked once, here."""
+
+    means: Tensor  # [N, 3] world units
+    quats: Tensor  # [N, 4] wxyz, any norm > 0
+    scales: Tensor  # [N, 3] world units, standard deviations along the local axes
+    opacities: Tensor  # [N]
+    sh: Tensor  # [N, (degree + 1)**2, 3] basis-major
+    covariances: Tensor | None = None  # [N, 3, 3] world units², overrides quats and scales where a family needs it
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        bands = math.isqrt(self.sh.shape[1]) if self.sh.dim() == 3 else 0
+        want = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, max(bands, 1) ** 2, 3)}
+        if self.covariances is not None:
+            want["covariances"] = (n, 3, 3)
+        for name, shape in want.items():
+            tensor = getattr(self, name)
+            if tuple(tensor.shape) != shape:
+                raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
+            if (tensor.device, tensor.dtype) != (self.means.device, self.means.dtype):
+                raise ShapeError(f"{name}: {tensor.dtype} on {tensor.device}, but means are {self.means.dtype} on {self.means.device}")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def __getitem__(self, rows: Tensor) -> Gaussians:
+        """The splats at `rows`, a boolean mask [N] or indices."""
+        return self._each(lambda tensor: tensor[rows])
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
+        return self._each(lambda tensor: tensor.to(device=device, dtype=dtype))
+
+    def detach(self) -> Gaussians:
+        return self._each(Tensor.detach)
+
+    @property
+    def sh_degree(self) -> int:
+        """The degree that the coefficients have room for."""
+        return math.isqrt(self.sh.shape[1]) - 1
+
+    def used_sh_degree(self) -> int:
+        """The highest band with a non-zero coefficient; bands above it need no evaluation."""
+        if len(self) == 0:
+            return 0
+        lit = self.sh.detach().abs().amax(dim=(0, 2)).nonzero()
+        return math.isqrt(int(lit.max())) if len(lit) else 0
+
+    def _each(self, change) -> Gaussians:
+        held = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: change(tensor) for name, tensor in held.items() if tensor is not None})

@@ -1,0 +1,55 @@
+"""The contract of a model: a checkpoint of any family that answers a camera with Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import DILATION
+from mipmap_plugin.gaussians import Gaussians
+
+
+@dataclass(frozen=True)
+class TrainedScale:
+    """The screen filter that a checkpoint was trained with, and how its cameras were sampled."""
+
+    screen_filter: str = "classic"  # a name of backends/filters.py
+    eps2d: float = DILATION  # px² of a training pixel
+    resolution: float = -1  # INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px
+    background: tuple[float, float, float] | None = None  # linear RGB; None: the checkpoint does not say
+
+
+class SplatModel(Protocol):
+    """What any family offers to be rendered, adapted and saved. A Protocol: plug-ins need no base class.
+
+    Raw parameters are as the family stores them (log scales, logits); `gaussians` activates them.
+    """
+
+    family: str  # "3dgs", "scaffold", ...
+    trained: TrainedScale
+
+    def gaussians(self, camera: Camera) -> Gaussians:
+        """The splats that this camera sees, differentiable in `parameters()`."""
+
+    def parameters(self) -> dict[str, Tensor]:
+        """What adaptation may move, by name; row i of each belongs to the same splat. A deformation network is never among them."""
+
+    def copy(self) -> SplatModel:
+        """An independent model with leaf parameters of its own that require gradients; this one stays as it is."""
+
+    def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
+        """Take these tensors, all with the same number of rows, as the model's own leaves. Only ever called on a copy."""
+
+    def reshape(self, scales: Tensor, opacities: Tensor) -> None:
+        """Make these activated scales [N, 3] and opacities [N] the model's own. Only ever called on a copy."""
+
+    def to(self, device: torch.device | str) -> SplatModel:
+        """A copy on another device."""
+
+    def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
+        """Write the model in the format it came in, atomically; return the file written. Raises OutputExists."""

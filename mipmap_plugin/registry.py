@@ -1,0 +1,49 @@
+"""Names in, objects out at first use: built-ins as strings, strangers through `add` or an entry point."""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import entry_points
+from typing import Any
+
+from mipmap_plugin.errors import PluginError, SettingsError
+
+
+class Registry:
+    """Objects by name, imported only when asked for.
+
+    A target is `"package.module:Name"` or the object itself. Names from the entry-point group are seen too; a name
+    registered here wins over an installed one, so that no package can shadow a built-in.
+    """
+
+    def __init__(self, group: str, builtins: dict[str, str]) -> None:
+        self.group = group
+        self._targets: dict[str, Any] = dict(builtins)
+
+    def add(self, name: str, target: Any, *, replace: bool = False) -> None:
+        """Register `target` under `name`. Raises SettingsError when another target has the name already."""
+        if not replace and self._targets.get(name, target) != target:
+            raise SettingsError(f"{self.group}: the name {name!r} is taken; pass replace=True to override it")
+        self._targets[name] = target
+
+    def names(self) -> list[str]:
+        """All known names, registered and installed, sorted."""
+        return sorted({*self._targets, *self._installed()})
+
+    def get(self, name: str) -> Any:
+        """The object behind `name`. Raises SettingsError for an unknown name, PluginError for a broken target."""
+        if name not in self._targets and name not in self._installed():
+            raise SettingsError(f"{self.group}: there is no {name!r}; known are {', '.join(self.names())}")
+        target = self._targets.get(name) or self._installed()[name]
+        return _load(name, target) if isinstance(target, str) else target
+
+    def _installed(self) -> dict[str, str]:
+        return {e.name: e.value for e in entry_points(group=self.group)}
+
+
+def _load(name: str, target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except Exception as error:  # a stranger's module may fail in any way; one broken plugin must not break the others
+        raise PluginError(f"{name!r} ({target}) cannot be loaded: {type(error).__name__}: {error}") from error
