@@ -1,0 +1,61 @@
+"""The registry of backends, and the choice among them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mipmap_plugin.backends.base import API_VERSION, Backend, Needs
+from mipmap_plugin.errors import BackendUnavailable, PluginError
+from mipmap_plugin.registry import Registry
+
+BACKENDS = Registry(
+    "mipmap_plugin.backends",
+    {
+        "reference": "mipmap_plugin.backends.reference:ReferenceBackend",
+        "cpu": "mipmap_plugin.backends.cpu:CpuBackend",
+    },
+)
+
+
+def register_backend(name: str, target: Any, *, replace: bool = False) -> None:
+    """Add a backend under `name`: a class, or `"package.module:Class"` that is imported at first use."""
+    BACKENDS.add(name, target, replace=replace)
+
+
+def get_backend(name: str) -> Backend:
+    """The backend `name`. Raises SettingsError when unknown, PluginError when it does not load or is of another API version."""
+    backend = BACKENDS.get(name)()
+    if getattr(backend, "api_version", None) != API_VERSION:
+        raise PluginError(f"backend {name!r} is written for API version {getattr(backend, 'api_version', 'unknown')}, this package has {API_VERSION}")
+    return backend
+
+
+def survey(needs: Needs) -> dict[str, list[str]]:
+    """Every known backend and why it cannot serve `needs`; an empty list where it can."""
+    reasons = {}
+    for name in BACKENDS.names():
+        try:
+            reasons[name] = get_backend(name).lacking(needs)
+        except PluginError as error:
+            reasons[name] = [str(error)]
+    return reasons
+
+
+def choose_backend(name: str, needs: Needs) -> tuple[Backend, str]:
+    """The backend for `needs` and why it was taken. `"auto"`: the fastest that lacks nothing.
+
+    Raises BackendUnavailable with every reason when there is none.
+    """
+    if name != "auto":
+        backend = get_backend(name)
+        reasons = backend.lacking(needs)
+        if reasons:
+            raise BackendUnavailable(f"backend {name!r} cannot do this: {'; '.join(reasons)}")
+        return backend, f"{name}: asked for"
+    reasons_of = survey(needs)
+    able = [get_backend(name) for name, reasons in reasons_of.items() if not reasons]
+    if not able:
+        raise BackendUnavailable("no backend can do this: " + " | ".join(f"{n}: {'; '.join(r)}" for n, r in reasons_of.items()))
+    best = max(able, key=lambda backend: backend.speed)
+    faster_not = [f"{n} not, because {r[0]}" for n, r in reasons_of.items() if r]
+    return best, f"{best.name}: the fastest that lacks nothing" + "".join(f"; {reason}" for reason in faster_not)

@@ -1,0 +1,84 @@
+"""EWA projection: Gaussians in the world -> Gaussians on the image plane (Zwicker et al. 2001, as 3DGS uses it)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.gaussians import Gaussians
+
+# The share of the half field of view by which a centre may lie outside the image before the Jacobian is frozen there;
+# further out the affine approximation would blow splats up (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
+FRUSTUM_MARGIN = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """N splats on the image plane, without any screen filter."""
+
+    means2d: Tensor  # [N, 2] px
+    depths: Tensor  # [N] world units along the optical axis
+    xx: Tensor  # [N] px², the covariance's entries
+    xy: Tensor  # [N] px²
+    yy: Tensor  # [N] px²
+    det: Tensor  # [N] px⁴, never negative
+
+
+def project(gaussians: Gaussians, camera: Camera, near: float) -> Projected:
+    """Means, depths and covariances on the image plane. Splats nearer than `near` get finite values of no meaning."""
+    viewmat = camera.viewmat.to(gaussians.means)
+    in_camera = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depths = in_camera[:, 2]
+    safe = depths.clamp_min(near)
+    slopes = in_camera[:, :2] / safe[:, None]
+    focal = slopes.new_tensor([camera.fx, camera.fy])
+    means2d = slopes * focal + slopes.new_tensor([camera.cx, camera.cy])
+    to_image = _jacobian(slopes, safe, camera) @ viewmat[:3, :3]
+    if gaussians.covariances is not None:
+        xx, xy, yy, det = _from_covariances(to_image, gaussians.covariances)
+    else:
+        xx, xy, yy, det = _from_factors(to_image @ (rotations(gaussians.quats) * gaussians.scales[:, None, :]))
+    return Projected(means2d, depths, xx, xy, yy, det)
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """Quaternions wxyz of any norm [N, 4] -> rotation matrices [N, 3, 3]; a zero quaternion is the identity."""
+    squared = quats.square().sum(-1, keepdim=True)
+    zero = squared == 0
+    # `where` before the root as well as after it: the root's gradient at 0 is infinite, and infinity times zero is NaN.
+    unit = torch.where(zero, 0.0, quats * torch.where(zero, 1.0, squared).rsqrt())
+    w, x, y, z = unit.unbind(-1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera) -> Tensor:
+    """The projection's derivative at each centre [N, 2, 3]; slopes are frozen outside the widened frustum."""
+    half = slopes.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2
+    left = slopes.new_tensor([camera.cx / camera.fx, camera.cy / camera.fy])
+    margin = FRUSTUM_MARGIN * half
+    u, v = torch.minimum(torch.maximum(slopes, -left - margin), 2 * half - left + margin).unbind(-1)
+    per_x, per_y, zero = camera.fx / depths, camera.fy / depths, torch.zeros_like(depths)
+    return torch.stack([per_x, zero, -per_x * u, zero, per_y, -per_y * v], -1).unflatten(-1, (2, 3))
+
+
+def _from_factors(factor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Covariance entries and determinant of F Fᵀ for F [N, 2, 3].
+
+    The determinant is the sum of F's squared minors (Cauchy-Binet): unlike xx·yy - xy² it cannot turn negative when a
+    needle's axes differ by many orders of magnitude.
+    """
+    first, second = factor.unbind(1)
+    det = torch.linalg.cross(first, second).square().sum(-1)
+    return first.square().sum(-1), (first * second).sum(-1), second.square().sum(-1), det
+
+
+def _from_covariances(to_image: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    flat = to_image @ covariances @ to_image.mT
+    xx, xy, yy = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1]
+    return xx, xy, yy, (xx * yy - xy * xy).clamp_min(0)

@@ -1,0 +1,24 @@
+"""N x N supersampling on top of any backend: the exact answer that other filters are compared with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from mipmap_plugin.backends.base import Backend, Rendered
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+
+
+def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+    """The view of `camera` with `effects.supersampling`² samples in each pixel, averaged.
+
+    The screen filter keeps its size in output pixels. With eps2d = 0.3·s² and N = 1/s this is the base render, box-averaged.
+    """
+    n = effects.supersampling
+    if n == 1:
+        return backend.render(gaussians, camera, effects)
+    fine = camera.resized(camera.width * n, camera.height * n)
+    rendered = backend.render(gaussians, fine, replace(effects, supersampling=1, eps2d=effects.eps2d * n**2))
+    blocks = rendered.image.unflatten(1, (-1, n)).unflatten(0, (-1, n))
+    return Rendered(blocks.mean(dim=(1, 3)), rendered.alpha.unflatten(1, (-1, n)).unflatten(0, (-1, n)).mean(dim=(1, 3)))

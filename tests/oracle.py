@@ -1,0 +1,69 @@
+"""An independent float64 renderer: one sum per pixel over all splats, written from the formulas and not from the package's code."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+
+def brute_force(gaussians, camera, eps2d=0.3, background=(0.0, 0.0, 0.0), antialiased=False, near=0.2):
+    """(image [H, W, 3], alpha [H, W]) in float64 from any Gaussians with SH of degree <= 1."""
+    g = gaussians.to(dtype=torch.float64)
+    view = camera.viewmat
+    p = g.means @ view[:3, :3].T + view[:3, 3]
+    order = [int(i) for i in p[:, 2].argsort(stable=True) if p[i, 2] > near]
+    ys, xs = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    ys, xs = ys.double(), xs.double()
+    image = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
+    through = torch.ones(camera.height, camera.width, dtype=torch.float64)
+    done = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    for i in order:
+        covariance, mean = project_one(g, i, p[i], camera)
+        dilated = covariance + eps2d * torch.eye(2, dtype=torch.float64)
+        opacity = g.opacities[i]
+        if antialiased:
+            opacity = opacity * (torch.linalg.det(covariance) / torch.linalg.det(dilated)).clamp_min(0.005**2).sqrt()
+        offset = torch.stack([xs - mean[0], ys - mean[1]], -1)
+        power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(dilated), offset)
+        alpha = (opacity * power.exp()).clamp_max(0.99)
+        alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+        done = done | ((through * (1 - alpha) < 1e-4) & (alpha > 0))
+        alpha = torch.where(done, 0.0, alpha)
+        image = image + (through * alpha)[..., None] * color_one(g, i, camera)
+        through = through * (1 - alpha)
+    return image + through[..., None] * torch.tensor(background, dtype=torch.float64), 1 - through
+
+
+def project_one(g, i, p, camera):
+    x, y, z = p
+    tan_x, tan_y = camera.width / camera.fx / 2, camera.height / camera.fy / 2
+    u = (x / z).clamp(-camera.cx / camera.fx - 0.3 * tan_x, (camera.width - camera.cx) / camera.fx + 0.3 * tan_x)
+    v = (y / z).clamp(-camera.cy / camera.fy - 0.3 * tan_y, (camera.height - camera.cy) / camera.fy + 0.3 * tan_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack([torch.stack([camera.fx / z, zero, -camera.fx * u / z]), torch.stack([zero, camera.fy / z, -camera.fy * v / z])])
+    if g.covariances is None:
+        rotation = rotation_one(g.quats[i] / g.quats[i].norm())
+        covariance = rotation @ torch.diag(g.scales[i] ** 2) @ rotation.T
+    else:
+        covariance = g.covariances[i]
+    w = camera.viewmat[:3, :3]
+    mean = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+    return jacobian @ w @ covariance @ w.T @ jacobian.T, mean
+
+
+def rotation_one(q):
+    w, v = q[0], q[1:]
+    zero = torch.zeros_like(w)
+    cross = torch.stack([torch.stack([zero, -v[2], v[1]]), torch.stack([v[2], zero, -v[0]]), torch.stack([-v[1], v[0], zero])])
+    return torch.eye(3, dtype=q.dtype) + 2 * w * cross + 2 * cross @ cross
+
+
+def color_one(g, i, camera):
+    d = g.means[i] - camera.center
+    d = d / d.norm()
+    color = math.sqrt(1 / (4 * math.pi)) * g.sh[i, 0]
+    if g.sh.shape[1] > 1:
+        c1 = math.sqrt(3 / (4 * math.pi))
+        color = color - c1 * d[1] * g.sh[i, 1] + c1 * d[2] * g.sh[i, 2] - c1 * d[0] * g.sh[i, 3]
+    return (color + 0.5).clamp_min(0)

@@ -1,0 +1,144 @@
+"""The reference against a brute-force sum, published test vectors, finite differences and gsplat's CPU twins."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from oracle import brute_force
+from samples import camera, gaussians, leaves
+
+from mipmap_plugin.backends import compositing
+from mipmap_plugin.backends.filters import footprint
+from mipmap_plugin.backends.harmonics import basis
+from mipmap_plugin.backends.projection import project
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.backends.supersample import render
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+
+BACKEND = ReferenceBackend()
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("eps2d", [0.3, 0.02])
+def test_equals_a_sum_over_every_pixel(antialiased, eps2d):
+    g, view = gaussians(), camera(cx=17.3, cy=12.9)
+    effects = Effects(1, "antialiased" if antialiased else "classic", eps2d, (0.2, 0.5, 0.9))
+    rendered = BACKEND.render(g, view, effects)
+    image, alpha = brute_force(g, view, eps2d, effects.background, antialiased)
+    torch.testing.assert_close(rendered.image, image, atol=1e-10, rtol=0)
+    torch.testing.assert_close(rendered.alpha, alpha, atol=1e-10, rtol=0)
+
+
+def test_float32_equals_float64_but_for_pixels_on_a_cut_off():
+    view = camera(80, 64, 90.0, 84.0)
+    exact = BACKEND.render(gaussians(400), view, Effects(1)).image
+    single = BACKEND.render(gaussians(400, dtype=torch.float32), view, Effects(1)).image
+    gap = (single.double() - exact).abs()
+    assert (gap > 2e-5).double().mean() < 0.002  # a splat that crosses 1/255 in one precision only moves its pixel by up to 1/255
+    assert gap.max() < 2 / 255
+
+
+def test_covariances_override_quats_and_scales():
+    g = gaussians()
+    rotation = torch.stack([torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(i)))[0] for i in range(len(g))])
+    covariances = rotation @ torch.diag_embed(g.scales**2) @ rotation.mT
+    given = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh, covariances)
+    torch.testing.assert_close(BACKEND.render(given, camera(), Effects(1)).image, brute_force(given, camera())[0], atol=1e-10, rtol=0)
+
+
+def test_batches_do_not_change_the_image(monkeypatch):
+    whole = BACKEND.render(gaussians(), camera(), Effects(1)).image
+    monkeypatch.setattr(compositing, "BATCH_PAIRS", 16 * 16 * 8)
+    torch.testing.assert_close(BACKEND.render(gaussians(), camera(), Effects(1)).image, whole, atol=1e-12, rtol=0)
+
+
+def test_gradients_equal_finite_differences():
+    # The cut-offs are steps, where no derivative exists: opacities are kept so high, and splats so few and large, that none is crossed.
+    g = gaussians(5, seed=3)
+    view = camera(6, 5, 7.0, 6.5)
+    g = Gaussians(torch.cat([g.means[:, :2] * 0.2, 2 + g.means[:, 2:].abs()], 1), g.quats, g.scales + 0.8, 0.1 + 0.6 * g.opacities, g.sh)
+    tensors, _ = leaves(g)
+    for name in ("classic", "antialiased"):
+        effects = Effects(1, name, 0.3, (1.0, 1.0, 1.0))
+        assert torch.autograd.gradcheck(lambda *t, e=effects: BACKEND.render(Gaussians(*t), view, e).image, tensors, eps=1e-6, atol=1e-6)
+
+
+def test_every_parameter_has_a_gradient():
+    tensors, g = leaves(gaussians())
+    BACKEND.render(g, camera(), Effects(1)).image.square().sum().backward()
+    for tensor in tensors:
+        assert torch.isfinite(tensor.grad).all() and tensor.grad.abs().sum() > 0
+
+
+def test_t1_spherical_harmonics():
+    want = [0.282094792, -0.261169028, 0.391753542, -0.130584514, 0.156078347, -0.468235042, 0.292863596, -0.234117521,
+            -0.117058760, 0.022527969, 0.331092173, -0.540952781, 0.064115724, -0.270476391, -0.248319130, 0.123903829]  # fmt: skip
+    direction = torch.nn.functional.normalize(torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64))
+    torch.testing.assert_close(basis(direction, 3)[0], torch.tensor(want, dtype=torch.float64), atol=1e-9, rtol=0)
+
+
+def test_degree_four_is_orthonormal():
+    rng = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=rng, dtype=torch.float64))
+    functions = basis(directions, 4)
+    gram = 4 * math.pi * functions.T @ functions / len(functions)
+    assert (gram - torch.eye(25)).abs().max() < 0.03  # Monte Carlo noise of 200 000 directions
+
+
+def t2_camera() -> Camera:
+    rows = [[0.726315789, -0.610526316, -0.315789474, 0.5], [0.526315789, 0.789473684, -0.315789474, -0.25],
+            [0.442105263, 0.063157895, 0.894736842, 4.0], [0, 0, 0, 1]]  # fmt: skip
+    return Camera(64, 48, 70.0, 72.0, 32.0, 24.0, torch.tensor(rows, dtype=torch.float64))
+
+
+def t3_gaussian() -> Gaussians:
+    t = lambda *x: torch.tensor([x], dtype=torch.float64)  # noqa: E731
+    return Gaussians(t(0.1, 0.2, 0.3), t(1, 0.5, -0.5, 0.25), t(0.2, 0.1, 0.05), torch.sigmoid(t(1.0))[0], t(0.5, -0.3, 0.1)[:, None])
+
+
+def test_t3_projection():
+    projected = project(t3_gaussian(), t2_camera(), 0.2)
+    got = torch.cat([projected.depths, projected.means2d[0], projected.xx, projected.xy, projected.yy])
+    want = [4.325263158, 37.758091993, 21.765879776, 2.718538992, 0.113341465, 0.784628197]
+    torch.testing.assert_close(got, torch.tensor(want, dtype=torch.float64), atol=1e-7, rtol=0)
+    dilated = footprint(projected, t3_gaussian().opacities, "classic", 0.3)
+    assert float(dilated.across * dilated.yy) == pytest.approx(3.261146218, abs=1e-7)
+    compensated = footprint(projected, t3_gaussian().opacities, "antialiased", 0.3)
+    assert float(compensated.opacities / dilated.opacities) == pytest.approx(0.806311541, abs=1e-7)
+
+
+def test_t3_pixel():
+    pixel = BACKEND.render(t3_gaussian(), t2_camera(), Effects(0)).image[21, 37]
+    torch.testing.assert_close(pixel, torch.tensor([0.449633559, 0.291343503, 0.370488531], dtype=torch.float64), atol=1e-6, rtol=0)
+
+
+def test_supersampled_scaled_filter_is_the_resized_base():
+    g, base = gaussians(), camera(64, 48, 72.0, 72.0)
+    target = base.zoomed(1 / 4)
+    box = BACKEND.render(g, base, Effects(1)).image.unflatten(1, (-1, 4)).unflatten(0, (-1, 4)).mean((1, 3))
+    fine = render(BACKEND, g, target, Effects(1, "classic", 0.3 / 16, supersampling=4))
+    torch.testing.assert_close(fine.image, box, atol=1e-12, rtol=0)
+
+
+def test_projection_equals_gsplat():
+    twins = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is in the test extra")
+    g, view = gaussians(300), camera()
+    k = torch.tensor([[[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]]], dtype=torch.float64)
+    covariances, _ = twins._quat_scale_to_covar_preci(g.quats, g.scales, compute_preci=False)
+    radii, means2d, depths, conics, compensation = twins._fully_fused_projection(
+        g.means, covariances, view.viewmat[None], k, view.width, view.height, eps2d=0.3, near_plane=0.2, calc_compensations=True
+    )
+    projected = project(g, view, 0.2)
+    ours = footprint(projected, g.opacities, "antialiased", 0.3)
+    seen = (radii[0] > 0).all(-1) if radii.dim() == 3 else radii[0] > 0
+    assert seen.sum() > 100
+    torch.testing.assert_close(projected.means2d[seen], means2d[0][seen], atol=1e-8, rtol=1e-8)
+    torch.testing.assert_close(projected.depths[seen], depths[0][seen], atol=1e-9, rtol=0)
+    det = ours.across * ours.yy
+    conic = torch.stack([ours.yy / det, -ours.shear * ours.yy / det, (projected.xx + 0.3) / det], -1)
+    torch.testing.assert_close(conic[seen], conics[0][seen], atol=1e-7, rtol=1e-6)
+    torch.testing.assert_close((ours.opacities / g.opacities)[seen], compensation[0][seen].clamp_min(0.005), atol=1e-8, rtol=1e-6)
