@@ -1,0 +1,39 @@
+"""Scenes: cameras and images from the files that people have, and generated views where they have none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes.base import Scene
+from mipmap_plugin.scenes.cameras_json import read_cameras
+from mipmap_plugin.scenes.trajectories import jittered, orbit
+from mipmap_plugin.scenes.transforms import read_transforms
+
+__all__ = ["Scene", "jittered", "load_scene", "orbit", "read_cameras", "read_transforms"]
+
+
+def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
+    """The scene at `path`: a model folder with a cameras.json, that file itself, or a transforms file or its folder.
+
+    `cfg` is the checkpoint's cfg_args, which tell a cameras.json's test split and training size (`read_cameras`).
+    Raises SceneError.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SceneError(f"{path}: there is no such file or folder; check the path")
+    if path.is_file():
+        return read_transforms(path) if path.name.startswith("transforms") else _cameras_only(path, path, cfg)
+    if (path / "cameras.json").is_file():
+        return _cameras_only(path / "cameras.json", path, cfg)
+    if any(path.glob("transforms*.json")):
+        return read_transforms(path)
+    if (path / "sparse").is_dir():
+        raise SceneError(f"{path}: COLMAP scenes are not read by this version; give a cameras.json or transforms file")
+    raise SceneError(f"{path}: holds neither cameras.json nor transforms files; give the folder or file that has the cameras")
+
+
+def _cameras_only(file: Path, source: Path, cfg: dict[str, Any] | None) -> Scene:
+    notes = [] if cfg else [f"{file.name} was read without cfg_args: all cameras count as training views, at the size that the file states"]
+    return Scene(tuple(read_cameras(file, cfg)), {}, source, notes)

@@ -1,0 +1,38 @@
+"""Scene: the cameras of a place, and the photographs that belong to some of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SceneError, SettingsError
+from mipmap_plugin.scenes.images import read_image
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What one path holds. Cameras without an image are usable views: adaptation needs no photographs."""
+
+    cameras: tuple[Camera, ...]
+    images: dict[Camera, Path]  # may be empty
+    source: Path
+    notes: list[str] = field(default_factory=list)  # what was assumed or left out, one sentence each
+
+    def split(self, name: str) -> list[Camera]:
+        """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""
+        if name not in ("train", "test"):
+            raise SettingsError(f"there is no split {name!r}; ask for 'train' or 'test'")
+        return [camera for camera in self.cameras if camera.split == name]
+
+    def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
+        """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution.
+
+        Raises SceneError when there is none: cameras are compared by identity, so a zoomed copy has none.
+        """
+        if camera not in self.images:
+            raise SceneError(f"{self.source}: camera {camera.name!r} has no image; ask with a camera that is a key of `images`")
+        return read_image(self.images[camera], background)

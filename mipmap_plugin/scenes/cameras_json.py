@@ -1,0 +1,97 @@
+"""cameras.json, as graphdeco-inria's 3DGS and its many descendants write it beside a checkpoint."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
+
+# INRIA's reader holds out every eighth photograph of a COLMAP scene.
+TEST_EVERY = 8
+
+# `-r`: these divide the size; -1 caps the width; any other number is a width.
+DIVISORS = (1, 2, 4, 8)
+WIDTH_CAP = 1600  # px
+
+
+def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Camera]:
+    """The cameras of a cameras.json, at the size that they were trained at.
+
+    Args:
+        path: the file.
+        cfg: the checkpoint's cfg_args; `eval` tells whether there is a test split, `resolution` and `images` the
+            training size. Without it every camera is for training and has the size in the file.
+
+    Raises:
+        SceneError: a file or an entry that cannot be read, or a `resolution` that is none.
+    """
+    path, cfg = Path(path), cfg or {}
+    entries = read_json(path)
+    if not isinstance(entries, list) or not entries:
+        raise SceneError(f"{path}: is not a list of cameras; give the cameras.json that lies beside the checkpoint")
+    names = [_name(entry, f"{path}, entry {index}") for index, entry in enumerate(entries)]
+    tests = count_test_cameras(names) if cfg.get("eval") else 0
+    cameras = []
+    for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
+        camera = _camera(entry, name, "test" if index < tests else "train", f"{path}, entry {index} ({name})")
+        cameras.append(camera.resized(*trained_size(camera.width, camera.height, cfg)))
+    return cameras
+
+
+def count_test_cameras(names: list[str]) -> int:
+    """How many of the leading cameras are for testing; the file lists them first but does not say how many.
+
+    A Blender scene names its test and its training views alike (r_0, r_1, ...), so that the first repeated name
+    starts the training views. A COLMAP scene names each view once, and one in eight is for testing.
+    """
+    seen: set[str] = set()
+    for index, name in enumerate(names):
+        if name in seen:
+            return index
+        seen.add(name)
+    return math.ceil(len(names) / TEST_EVERY)
+
+
+def trained_size(width: int, height: int, cfg: dict[str, Any]) -> tuple[int, int]:
+    """(width, height) in px after INRIA's `-i images_N` and `-r`, from the size in cameras.json.
+
+    COLMAP scenes store the full resolution there, however small the photographs were that trained on. The folders
+    images_2, images_4 and images_8 hold photographs shrunk by that factor. Rounding is `loadCam`'s: the divisors
+    round, the cap and the target width cut off.
+    """
+    shrunk = re.fullmatch(r"images_(\d+)", str(cfg.get("images", "")))
+    if shrunk and int(shrunk[1]) > 0:
+        width, height = max(1, round(width / int(shrunk[1]))), max(1, round(height / int(shrunk[1])))
+    resolution = cfg.get("resolution", 1)
+    if not isinstance(resolution, (int, float)) or (resolution <= 0 and resolution != -1):
+        raise SceneError(f"cfg_args: resolution={resolution!r} is no training size; use 1, 2, 4, 8, -1 or a width in pixels")
+    if resolution in DIVISORS:
+        return max(1, round(width / resolution)), max(1, round(height / resolution))
+    target = min(width, WIDTH_CAP) if resolution == -1 else resolution
+    shrink = width / target
+    return max(1, int(width / shrink)), max(1, int(height / shrink))
+
+
+def _name(entry: Any, where: str) -> str:
+    if not isinstance(entry, dict):
+        raise SceneError(f"{where}: is not a camera; give the cameras.json that lies beside the checkpoint")
+    return str(present(entry, "img_name", where))
+
+
+def _camera(entry: dict[str, Any], name: str, split: Any, where: str) -> Camera:
+    """`rotation` is camera to world, `position` the eye; the principal point is the image centre by construction."""
+    camera_to_world = rotation(present(entry, "rotation", where), f"{where}, rotation")
+    position = numbers(present(entry, "position", where), (3,), f"{where}, position")
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = camera_to_world.T
+    viewmat[:3, 3] = -camera_to_world.T @ position
+    width, height = (pixels(present(entry, key, where), f"{where}, {key}") for key in ("width", "height"))
+    fx, fy = (positive(present(entry, key, where), f"{where}, {key}") for key in ("fx", "fy"))
+    return Camera(width, height, fx, fy, width / 2, height / 2, viewmat, name, split)

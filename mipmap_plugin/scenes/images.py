@@ -1,0 +1,89 @@
+"""Image files: read, put on a background, write. Pillow (which scikit-image brings along) is used nowhere else."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from mipmap_plugin.errors import OutputExists, SceneError, ShapeError
+
+# What Pillow calls 16-bit gray; 16-bit color it reads to 8 bits by itself, keeping the high byte.
+GRAY_16_BIT = ("I;16", "I;16B", "I;16L", "I;16N", "I")
+
+# What Pillow raises for a file that is no image, a broken one, a broken PNG chunk and an absurd size.
+UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+
+
+def read_image(path: str | Path, background: Sequence[float]) -> Tensor:
+    """A PNG or JPEG file as [H, W, 3] float32 in 0..1; transparency shows `background` (RGB in 0..1).
+
+    EXIF rotation is not applied: cameras are calibrated on the pixels as they are stored. Raises SceneError.
+    """
+    with _opened(path) as image:
+        try:
+            if image.mode in GRAY_16_BIT:
+                gray = torch.from_numpy(np.asarray(image).astype(np.float32)) / 65535
+                return gray[..., None].expand(-1, -1, 3).contiguous()
+            pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+        except UNREADABLE as error:
+            raise SceneError(f"{path}: the image is damaged ({error}); download or export it again") from error
+    if pixels.shape[2] == 4:
+        pixels = composite(pixels, background)
+    return torch.from_numpy(pixels.astype(np.float32)) / 255
+
+
+def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
+    """8-bit straight-alpha RGBA [H, W, 4] over `background` (RGB in 0..1), as 8-bit RGB [H, W, 3].
+
+    Fractions are cut off, not rounded, as graphdeco-inria's Blender reader does (scene/dataset_readers.py casts
+    0..255 floats to bytes): half-transparent pixels are up to one step darker, opaque ones and black or white background exact.
+    The published protocols composite before any resizing, on these 8 bits.
+    """
+    color, alpha = rgba[..., :3] / 255.0, rgba[..., 3:] / 255.0
+    blended = color * alpha + np.asarray(background, dtype=np.float64) * (1 - alpha)
+    return (blended * 255.0).astype(np.uint8)
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """(width, height) in px of an image file, from its header alone. Raises SceneError."""
+    with _opened(path) as image:
+        return image.size
+
+
+def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> Path:
+    """Write `image` [H, W, 3], clamped to 0..1 and rounded to 8 bits, as a PNG file; return its path.
+
+    Atomic: an interrupted write leaves the old file. Raises OutputExists, ShapeError, and SceneError for NaN.
+    """
+    path = Path(path)
+    if image.dim() != 3 or image.shape[2] != 3:
+        raise ShapeError(f"image for {path}: expected shape [H, W, 3], got {list(image.shape)}")
+    if not image.isfinite().all():
+        raise SceneError(f"{path}: the image holds NaN or infinity and is not written; check the render that it came from")
+    if path.exists() and not overwrite:
+        raise OutputExists(f"{path} is already there; pass --overwrite (overwrite=True) or another path")
+    pixels = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        Image.fromarray(pixels).save(temporary, format="PNG")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _opened(path: str | Path) -> Image.Image:
+    try:
+        return Image.open(path)
+    except FileNotFoundError as error:
+        raise SceneError(f"{path}: there is no such image; check the path") from error
+    except UNREADABLE as error:
+        advice = "give a PNG or JPEG file (or, if it is a Git LFS pointer, run `git lfs pull` where it came from)"
+        raise SceneError(f"{path}: is not an image that Pillow reads; {advice}") from error

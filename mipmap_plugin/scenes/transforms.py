@@ -1,0 +1,155 @@
+"""transforms_{train,test}.json of NeRF-Synthetic, and the transforms.json of instant-ngp and nerfstudio."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes.base import Scene
+from mipmap_plugin.scenes.images import image_size
+from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
+
+IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+# OpenGL's camera looks along -z with y up, OpenCV's along +z with y down.
+OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
+def read_transforms(path: str | Path) -> Scene:
+    """The scene of a folder with transforms files, or of one such file.
+
+    `transforms_test.json` is the test split; without it `transforms_val.json` is. A frame's image may be absent:
+    the camera stays where the file states its size (`w`, `h`) and is left out otherwise; `notes` count both.
+
+    Raises:
+        SceneError: no transforms file, no usable frame, a lens with distortion, or an entry that cannot be read.
+    """
+    path = Path(path)
+    cameras: list[Camera] = []
+    images: dict[Camera, Path] = {}
+    notes: list[str] = []
+    for file, split in transforms_files(path):
+        found, absent = _read_file(file, split)
+        cameras += [camera for camera, _ in found]
+        images |= {camera: image for camera, image in found if image}
+        if absent:
+            unsized = absent - sum(image is None for _, image in found)
+            notes.append(f"{file.name}: {absent} listed images are absent; {unsized} of their cameras are left out because the file has no w and h")
+    if not cameras:
+        raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
+    return Scene(tuple(cameras), images, path, notes)
+
+
+def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
+    """The transforms files behind `path`, each with its split. Raises SceneError when there is none."""
+    if path.is_file():
+        return [(path, "test" if path.stem.endswith(("_test", "_val")) else "train")]
+    train = _first_file(path, "transforms_train.json", "transforms.json")
+    test = _first_file(path, "transforms_test.json", "transforms_val.json")
+    if not train and not test:
+        raise SceneError(f"{path}: holds no transforms_train.json, transforms_test.json or transforms.json; give the folder that does")
+    return [*((file, "train") for file in train), *((file, "test") for file in test)]
+
+
+def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
+    """World to camera [4, 4], OpenCV axes, from a camera-to-world pose [4, 4] with OpenGL axes.
+
+    graphdeco-inria before commit 0f125cb, and its descendants, have the translation's x with the other sign. That is
+    the same camera only where this x is 0, as in all of NeRF-Synthetic; this is the exact inverse.
+    """
+    return torch.linalg.inv(camera_to_world @ OPENGL_TO_OPENCV)
+
+
+def _first_file(folder: Path, *names: str) -> list[Path]:
+    return [folder / name for name in names if (folder / name).is_file()][:1]
+
+
+def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[Camera, Path | None]], int]:
+    """Each usable camera with its image, and how many listed images are absent."""
+    data = read_json(file)
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise SceneError(f"{file}: has no list of 'frames'; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
+    found: list[tuple[Camera, Path | None]] = []
+    absent = 0
+    for index, frame in enumerate(frames):
+        where = f"{file}, frame {index}"
+        if not isinstance(frame, dict):
+            raise SceneError(f"{where}: is not a camera; export the file again")
+        values = {**data, **frame}  # a frame's own lens wins over the file's
+        listed = str(present(frame, "file_path", where))
+        image = _image(file.parent, listed)
+        absent += image is None
+        stated = _stated_size(values, where)
+        actual = image_size(image) if image else stated  # the image may have been shrunk since
+        if actual:
+            name = image.stem if image else listed.replace("\\", "/").rsplit("/", 1)[-1]
+            camera = _camera(values, stated or actual, name, split, f"{where} ({name})")
+            found.append((camera.resized(*actual), image))
+    return found, absent
+
+
+def _image(folder: Path, listed: str) -> Path | None:
+    """The image file behind a `file_path`, which may lack its extension; None when it is absent."""
+    stem = listed.replace("\\", "/")
+    return next((folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES if (folder / f"{stem}{suffix}").is_file()), None)
+
+
+def _stated_size(values: Mapping[str, Any], where: str) -> tuple[int, int] | None:
+    if not {"w", "h"} <= values.keys():
+        return None
+    return pixels(values["w"], f"{where}, w"), pixels(values["h"], f"{where}, h")
+
+
+def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: Literal["train", "test"], where: str) -> Camera:
+    """The camera at `size` (width, height) px, which the lens is stated at."""
+    _refuse_distortion(values, where)
+    width, height = size
+    fx = _focal(values, "x", width, where)
+    if fx is None:
+        raise SceneError(f"{where}: has neither 'fl_x' nor 'camera_angle_x'; add one to the file")
+    fy = _focal(values, "y", height, where) or fx
+    cx = numbers(values.get("cx", width / 2), (), f"{where}, cx").item()
+    cy = numbers(values.get("cy", height / 2), (), f"{where}, cy").item()
+    time = numbers(values["time"], (), f"{where}, time").item() if values.get("time") is not None else None
+    return Camera(width, height, fx, fy, cx, cy, _viewmat(values, where), name, split, time)
+
+
+def _viewmat(values: Mapping[str, Any], where: str) -> Tensor:
+    pose = present(values, "transform_matrix", where)
+    rows = pose[:3] if isinstance(pose, list) else pose  # the last row is 0 0 0 1, and some files leave it out
+    upper = numbers(rows, (3, 4), f"{where}, transform_matrix")
+    rotation(upper[:, :3].tolist(), f"{where}, transform_matrix")
+    camera_to_world = torch.eye(4, dtype=torch.float64)
+    camera_to_world[:3] = upper
+    return viewmat_from_opengl(camera_to_world)
+
+
+def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float | None:
+    """The focal length in px from `fl_x` or `camera_angle_x` (radians), or their y twins; None when neither is given."""
+    if f"fl_{axis}" in values:
+        return positive(values[f"fl_{axis}"], f"{where}, fl_{axis}")
+    if f"camera_angle_{axis}" not in values:
+        return None
+    angle = positive(values[f"camera_angle_{axis}"], f"{where}, camera_angle_{axis}")
+    if angle >= math.pi:
+        raise SceneError(f"{where}, camera_angle_{axis}: is {angle:g} but must be below pi; give it in radians")
+    return size / (2 * math.tan(angle / 2))
+
+
+def _refuse_distortion(values: Mapping[str, Any], where: str) -> None:
+    bent = [key for key in DISTORTION if values.get(key)]
+    model = values.get("camera_model", "PINHOLE")
+    if bent or values.get("is_fisheye") or model not in PERSPECTIVE_MODELS:
+        what = f"distortion ({', '.join(bent)})" if bent else "a lens that is not perspective"
+        raise SceneError(f"{where}: has {what}; undistort the images first (COLMAP: `colmap image_undistorter`)")

@@ -1,0 +1,92 @@
+"""Camera: zooms keep the field of view, and a known point lands on a known pixel."""
+
+import math
+
+import pytest
+import torch
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SettingsError, ShapeError
+
+# Evaluated by hand in float64: quaternion (0.9, 0.1, -0.2, 0.3) normalized, translation (0.5, -0.25, 4).
+VIEWMAT = torch.tensor(
+    [
+        [0.726315789, -0.610526316, -0.315789474, 0.5],
+        [0.526315789, 0.789473684, -0.315789474, -0.25],
+        [0.442105263, 0.063157895, 0.894736842, 4.0],
+        [0.0, 0.0, 0.0, 1.0],
+    ],
+    dtype=torch.float64,
+)
+
+
+@pytest.fixture
+def camera() -> Camera:
+    return Camera(64, 48, 70.0, 72.0, 32.0, 24.0, VIEWMAT, "view", "test", 0.5)
+
+
+def fields_of_view(camera: Camera) -> tuple[float, float]:
+    return 2 * math.atan(camera.width / (2 * camera.fx)), 2 * math.atan(camera.height / (2 * camera.fy))
+
+
+def project(camera: Camera, point: tuple[float, float, float]) -> tuple[float, float]:
+    x, y, z, _ = (camera.viewmat @ torch.tensor([*point, 1.0], dtype=torch.float64)).tolist()
+    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+
+
+def test_field_of_view_of_the_test_vector(camera):
+    assert fields_of_view(camera) == pytest.approx((0.857556055, 0.643501109), abs=1e-9)
+
+
+def test_center_of_the_test_vector(camera):
+    assert camera.center.tolist() == pytest.approx([-2.0, 0.25, -3.5], abs=1e-7)
+
+
+def test_projection_of_the_test_vector(camera):
+    assert project(camera, (0.1, 0.2, 0.3)) == pytest.approx((37.758091993, 21.765879776), abs=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1 / 64, 1 / 8, 0.37, 1.0, 1.7, 8.0])
+def test_zoom_keeps_the_field_of_view(camera, factor):
+    assert fields_of_view(camera.zoomed(factor)) == pytest.approx(fields_of_view(camera), rel=1e-12)
+
+
+@pytest.mark.parametrize("factor", [1 / 8, 0.37, 4.0])
+def test_zoom_scales_every_pixel_position(camera, factor):
+    zoomed = camera.zoomed(factor)
+    x, y = project(camera, (0.1, 0.2, 0.3))
+    assert project(zoomed, (0.1, 0.2, 0.3)) == pytest.approx((x * zoomed.width / 64, y * zoomed.height / 48))
+
+
+def test_zoom_rounds_the_size_and_follows_it_per_axis():
+    zoomed = Camera(5025, 3312, 4328.6, 4285.5, 2512.5, 1656.0, VIEWMAT).zoomed(1 / 8)
+    assert (zoomed.size, zoomed.fx, zoomed.fy) == ((414, 628), pytest.approx(4328.6 * 628 / 5025), pytest.approx(4285.5 / 8))
+
+
+def test_zoom_never_goes_below_one_pixel(camera):
+    assert camera.zoomed(1e-6).size == (1, 1)
+
+
+def test_zoom_keeps_name_split_and_time(camera):
+    zoomed = camera.zoomed(0.5)
+    assert (zoomed.name, zoomed.split, zoomed.time) == ("view", "test", 0.5)
+
+
+def test_equal_cameras_are_different_keys(camera):
+    assert len({camera: 0, camera.zoomed(1.0): 1}) == 2
+
+
+def test_viewmat_is_kept_in_float64():
+    assert Camera(2, 2, 1.0, 1.0, 1.0, 1.0, torch.eye(4)).viewmat.dtype == torch.float64
+
+
+def test_a_viewmat_of_another_shape_is_refused():
+    with pytest.raises(ShapeError, match=r"expected shape \[4, 4\], got \[3, 4\]"):
+        Camera(2, 2, 1.0, 1.0, 1.0, 1.0, torch.eye(4)[:3])
+
+
+@pytest.mark.parametrize("size", [(0, 4, 1.0), (4, 4, 0.0), (4, 4, -1.0)])
+def test_a_lens_that_sees_nothing_is_refused(size):
+    width, height, focal = size
+    with pytest.raises(SettingsError, match="is not a view"):
+        Camera(width, height, focal, focal, 0.0, 0.0, torch.eye(4))

@@ -1,0 +1,190 @@
+"""Generated views: they stay where the scene was seen, see it, and come out the same for the same seed."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import NEAR_PLANE
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.scenes import jittered, load_scene, orbit
+from mipmap_plugin.scenes.trajectories import guess_up, rotation_matrix, rotation_vector
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def cloud(*spread: float) -> torch.Tensor:
+    return torch.randn(4000, 3, generator=seeded(), dtype=torch.float64) * torch.tensor(spread) + torch.tensor([5.0, -2.0, 1.0])
+
+
+def ring(count: int = 12) -> list[Camera]:
+    return [replace(c, width=80, cx=40.0, split="test") for c in orbit(cloud(1, 1, 1), (60, 60), count, seeded(7))]
+
+
+def poses(cameras: list[Camera]) -> torch.Tensor:
+    return torch.stack([camera.viewmat for camera in cameras])
+
+
+def forwards(cameras: list[Camera]) -> torch.Tensor:
+    return poses(cameras)[:, 2, :3]
+
+
+def in_view(camera: Camera, points: torch.Tensor) -> torch.Tensor:
+    x, y, z = (points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]).unbind(1)
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return (z > NEAR_PLANE) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+
+
+# orbit
+
+
+def test_orbit_frames_nine_tenths_of_the_splats():
+    means = cloud(1, 1, 0.5)
+    assert min(in_view(camera, means).double().mean().item() for camera in orbit(means, (48, 64), 10, seeded())) >= 0.9
+
+
+def test_orbit_ignores_far_floaters_and_broken_rows():
+    means = cloud(1, 1, 1)
+    dirty = torch.cat([means, torch.full((40, 3), 1e6, dtype=torch.float64), torch.full((1, 3), math.nan, dtype=torch.float64)])
+    clean, spoilt = (orbit(m, (64, 64), 1, seeded())[0].center for m in (means, dirty))
+    torch.testing.assert_close(spoilt, clean, atol=0.5, rtol=0)
+
+
+def test_orbit_stands_above_the_horizon_with_the_vertical_upright():
+    for camera in orbit(cloud(1, 1, 1), (64, 64), 10, seeded()):
+        assert camera.center[2] > 1.0
+        assert camera.viewmat[0, 2].abs() < 1e-9  # the image's x axis is level
+        assert camera.viewmat[1, 2] < 0  # the image's y axis points down
+
+
+def test_orbit_takes_a_given_vertical():
+    assert all(camera.center[0] > 5.0 for camera in orbit(cloud(1, 1, 1), (64, 64), 10, seeded(), up=(2, 0, 0)))
+
+
+def test_orbit_poses_are_rotations():
+    rotations = poses(orbit(cloud(1, 1, 1), (64, 64), 5, seeded()))[:, :3, :3]
+    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand(5, 3, 3))
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(5, dtype=torch.float64))
+
+
+def test_orbit_repeats_with_the_seed_and_only_then():
+    means = cloud(1, 1, 1)
+    first, again, other = (poses(orbit(means, (64, 64), 6, seeded(seed))) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_orbit_of_one_splat_sees_it():
+    point = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64)
+    assert all(in_view(camera, point).all() for camera in orbit(point, (8, 8), 4, seeded()))
+
+
+def test_orbit_without_splats_is_refused():
+    with pytest.raises(SettingsError, match="0 finite splats"):
+        orbit(torch.full((3, 3), math.inf), (8, 8), 4, seeded())
+
+
+def test_a_scene_flat_along_y_is_taken_for_colmaps():
+    assert guess_up(cloud(3, 1, 3)).tolist() == [0, -1, 0]
+
+
+def test_any_other_scene_is_taken_for_z_up():
+    assert guess_up(cloud(1, 1, 1)).tolist() == [0, 0, 1]
+
+
+# jittered
+
+
+def test_rotation_vector_and_matrix_are_inverse():
+    vector = torch.tensor([0.3, -0.8, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(rotation_vector(rotation_matrix(vector)), vector)
+
+
+def test_rotation_vector_of_no_rotation_is_zero():
+    assert rotation_vector(torch.eye(3, dtype=torch.float64)).tolist() == [0, 0, 0]
+
+
+def test_jittered_views_keep_the_lens_and_get_names_of_their_own():
+    view = jittered(ring(), 8, seeded())[7]
+    assert (view.size, view.fx, view.fy, view.cx) == (ring()[0].size, ring()[0].fx, ring()[0].fy, 40.0)
+    assert (view.name, view.split) == ("jittered_0007", "train")
+
+
+def test_jittered_views_stay_near_a_given_one():
+    given = torch.stack([camera.center for camera in ring()])
+    neighbor = torch.cdist(given, given).topk(5, largest=False).values.max()
+    new = torch.stack([camera.center for camera in jittered(ring(), 100, seeded())])
+    assert torch.cdist(new, given).min(dim=1).values.max() < neighbor
+
+
+def test_jittered_views_look_where_the_given_ones_looked():
+    cosine = (forwards(jittered(ring(), 100, seeded())) @ forwards(ring()).T).max(dim=1).values
+    assert cosine.min() > math.cos(math.radians(25))
+
+
+def test_jittered_views_see_the_scene():
+    middle = torch.tensor([[5.0, -2.0, 1.0]], dtype=torch.float64)
+    assert all(in_view(camera, middle).all() for camera in jittered(ring(), 100, seeded()))
+
+
+def test_without_amount_the_views_lie_on_the_line_between_two_given_ones():
+    first, second = (camera.center for camera in ring(2))
+    left, right = (replace(camera, viewmat=ring(2)[0].viewmat.clone()) for camera in ring(2))
+    right.viewmat[:3, 3] = -right.viewmat[:3, :3] @ second
+    for view in jittered([left, right], 10, seeded(), amount=0.0):
+        along = (view.center - first).norm() + (view.center - second).norm()
+        torch.testing.assert_close(along, (second - first).norm())
+
+
+def test_halfway_rotations_turn_by_part_of_the_angle():
+    turned = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
+    turned.viewmat[:3, :3] = rotation_matrix(torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64))
+    straight = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
+    for view in jittered([straight, turned], 10, seeded(), amount=0.0):
+        x, y, z = rotation_vector(view.viewmat[:3, :3]).tolist()
+        assert (x, z) == pytest.approx((0, 0), abs=1e-12)
+        assert 0 <= y <= 0.5
+
+
+def test_cameras_that_look_apart_are_not_mixed():
+    back = rotation_matrix(torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64))
+    turned = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
+    turned.viewmat[:3, :3] = back
+    views = jittered([Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4)), turned], 10, seeded(), amount=0.0)
+    assert forwards(views)[:, 2].abs().min() > 1 - 1e-12
+
+
+def test_every_camera_is_used_in_turn():
+    cameras = [replace(camera, fx=camera.fx + i) for i, camera in enumerate(ring(5))]
+    assert {view.fx for view in jittered(cameras, 5, seeded())} == {camera.fx for camera in cameras}
+
+
+def test_jittered_repeats_with_the_seed_and_only_then():
+    first, again, other = (poses(jittered(ring(), 6, seeded(seed))) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_one_camera_is_turned_on_the_spot():
+    only = ring()[:1]
+    views = jittered(only, 5, seeded())
+    torch.testing.assert_close(torch.stack([v.center for v in views]), only[0].center.expand(5, 3))
+    assert not torch.equal(poses(views)[0], poses(views)[1])
+
+
+def test_no_camera_is_refused():
+    with pytest.raises(SettingsError, match="need cameras"):
+        jittered([], 3, seeded())
+
+
+@pytest.mark.parametrize("name", ["bases/lego_200", "flowers_r8"])
+def test_views_around_real_cameras_keep_their_distance(shared_data, name):
+    cameras = load_scene(shared_data / "checkpoints" / name).cameras
+    given = torch.stack([camera.center for camera in cameras])
+    new = torch.stack([camera.center for camera in jittered(cameras, 50, seeded())])
+    radius = (given - given.mean(dim=0)).norm(dim=1)
+    assert torch.cdist(new, given).min(dim=1).values.max() < 0.25 * radius.max()
