@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from mipmap_plugin.errors import OutputExists, SceneError, SettingsError, ShapeError
-from mipmap_plugin.scenes import load_scene, read_cameras, read_transforms
+from mipmap_plugin.scenes import load_scene, model_cameras, read_cameras, read_transforms
 from mipmap_plugin.scenes.cameras_json import count_test_cameras, trained_size
 from mipmap_plugin.scenes.images import composite, image_size, read_image, write_image
 
@@ -298,6 +298,12 @@ def test_a_cameras_json_alone_says_what_it_lacks(tmp_path):
     scene = load_scene(path)
     assert (scene.source, scene.images) == (path, {})
     assert "without cfg_args" in scene.notes[0]
+
+
+def test_a_checkpoint_may_come_with_cameras_or_without(tmp_path):
+    assert model_cameras(None) == model_cameras(tmp_path) == []
+    write_json(tmp_path / "cameras.json", [entry()])
+    assert [camera.size for camera in model_cameras(tmp_path, {"resolution": 2})] == [(24, 32)]
 
 
 def test_a_colmap_folder_is_refused_with_advice(tmp_path):

@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import read_cameras
 from mipmap_plugin.scenes.trajectories import jittered, orbit
 from mipmap_plugin.scenes.transforms import read_transforms
 
-__all__ = ["Scene", "jittered", "load_scene", "orbit", "read_cameras", "read_transforms"]
+__all__ = ["Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_transforms"]
 
 
 def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
@@ -32,6 +33,13 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     if (path / "sparse").is_dir():
         raise SceneError(f"{path}: COLMAP scenes are not read by this version; give a cameras.json or transforms file")
     raise SceneError(f"{path}: holds neither cameras.json nor transforms files; give the folder or file that has the cameras")
+
+
+def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) -> list[Camera]:
+    """The cameras beside a checkpoint, at their training size; empty where it came without any. Raises SceneError for a broken file."""
+    if folder is None or not (Path(folder) / "cameras.json").is_file():
+        return []
+    return read_cameras(Path(folder) / "cameras.json", cfg)
 
 
 def _cameras_only(file: Path, source: Path, cfg: dict[str, Any] | None) -> Scene:
