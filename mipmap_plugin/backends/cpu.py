@@ -1,0 +1,61 @@
+"""The CPU backend: compiled kernels in float32, exact gradients, the same bytes at any number of threads."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.gaussians import Gaussians
+
+NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
+
+
+class CpuBackend:
+    """Renders and differentiates Gaussians fast without a GPU. numba is imported, and the kernels compiled, at the first image."""
+
+    name = "cpu"
+    api_version = API_VERSION
+    speed = 10
+    capabilities = Capabilities(
+        devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased"})
+    )
+
+    def lacking(self, needs: Needs) -> list[str]:
+        missing = [] if importlib.util.find_spec("numba") else [NO_NUMBA]
+        return missing + self.capabilities.lacking(needs)
+
+    def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+        """The view of `camera`. Raises BackendUnavailable, an ImportError, when numba is missing or the request is not for this backend."""
+        reasons = self.lacking(Needs.of(gaussians, effects, gradients=True))
+        if reasons:
+            raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
+        g = gaussians
+        image, alpha = _Draw.apply(camera, effects, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)
+        return Rendered(image, alpha)
+
+
+class _Draw(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, camera, effects, *tensors):
+        from mipmap_plugin.backends.cpu_kernels import drawing
+
+        image, ctx.drawing = drawing.draw(drawing.splats_of(tensors), camera, effects)
+        ctx.save_for_backward(*tensors)
+        return torch.from_numpy(image), 1 - torch.from_numpy(ctx.drawing.through)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, d_image, d_alpha):
+        from mipmap_plugin.backends.cpu_kernels import drawing
+
+        splats = drawing.splats_of(ctx.saved_tensors)
+        grads = drawing.draw_back(ctx.drawing, splats, d_image.contiguous().numpy(), d_alpha.contiguous().numpy())
+        # The way of giving a shape that was not taken has no rows: no gradient.
+        known = [torch.from_numpy(grad) if len(grad) == len(splats.means) else None for grad in grads]
+        return None, None, *(known if len(splats.means) else (None,) * len(known))

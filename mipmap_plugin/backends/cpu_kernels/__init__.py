@@ -1,0 +1,1 @@
+"""The compiled half of the CPU backend: the only place that imports numba."""

@@ -1,0 +1,115 @@
+"""Which splats touch which tile: exact at the rows and columns of the ellipse alpha >= 1/255, in depth order within each tile."""
+
+import math
+
+import numba
+import numpy as np
+
+from mipmap_plugin.backends.cpu_kernels.records import FALL_X, FALL_Y, LOG_MIN_ALPHA, PEAK, REACH_Y, SHEAR, SLACK, TIP, X, Y
+
+# px. Wide tiles: a splat is cut into few pieces, and the piece of a row is still exact. A tile's state fits a first-level cache.
+TILE_ROWS = 16
+TILE_COLUMNS = 64
+
+# Bits of a depth sorted at a time.
+_DIGIT = 11
+
+
+@numba.njit(cache=True)
+def tile_grid(width, height):
+    """Columns and rows of tiles."""
+    return -(-width // TILE_COLUMNS), -(-height // TILE_ROWS)
+
+
+@numba.njit(cache=True)
+def rows_of(table, i, first, last):
+    """The pixel rows first..last that splat i touches. Clipped while still a float: no integer could hold every reach."""
+    reach = table[i, REACH_Y] + SLACK
+    low, high = math.ceil(table[i, Y] - 0.5 - reach), math.floor(table[i, Y] - 0.5 + reach)
+    return int(min(max(low, first), last + 1.0)), int(max(min(high, last), first - 1.0))
+
+
+@numba.njit(cache=True)
+def half_width(table, i, dy):
+    """px from the ridge to where alpha falls below 1/255, `dy` px from the center."""
+    room = table[i, PEAK] - LOG_MIN_ALPHA - table[i, FALL_Y] * dy * dy
+    return math.sqrt(max(room, 0.0) / table[i, FALL_X]) + SLACK
+
+
+@numba.njit(cache=True)
+def tile_columns(table, i, first, last, width):
+    """The columns of tiles that splat i touches between the pixel rows first..last; none: the second is the smaller."""
+    above, below = first + 0.5 - table[i, Y], last + 0.5 - table[i, Y]
+    right_most = min(max(table[i, TIP], above), below)
+    left_most = min(max(-table[i, TIP], above), below)
+    right = table[i, X] + table[i, SHEAR] * right_most + half_width(table, i, right_most) - 0.5
+    left = table[i, X] + table[i, SHEAR] * left_most - half_width(table, i, left_most) - 0.5
+    low, high = math.ceil(max(left, 0.0)), math.floor(min(right, width - 1.0))
+    if low > high:
+        return 0, -1
+    return int(low) // TILE_COLUMNS, int(high) // TILE_COLUMNS
+
+
+@numba.njit(cache=True)
+def count_tiles(table, i, width, height):
+    """The number of tiles that splat i touches."""
+    first, last = rows_of(table, i, 0, height - 1)
+    count = 0
+    for tile_row in range(first // TILE_ROWS, last // TILE_ROWS + 1):
+        top, bottom = max(first, tile_row * TILE_ROWS), min(last, tile_row * TILE_ROWS + TILE_ROWS - 1)
+        left, right = tile_columns(table, i, top, bottom, width)
+        count += right - left + 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def cover(start, stop, table, slots, width, height, tiles):
+    """Write the tiles of the splats start..stop into their slots."""
+    columns = tile_grid(width, height)[0]
+    for i in range(start, stop):
+        slot = slots[i]
+        if slot == slots[i + 1]:
+            continue
+        first, last = rows_of(table, i, 0, height - 1)
+        for tile_row in range(first // TILE_ROWS, last // TILE_ROWS + 1):
+            top, bottom = max(first, tile_row * TILE_ROWS), min(last, tile_row * TILE_ROWS + TILE_ROWS - 1)
+            left, right = tile_columns(table, i, top, bottom, width)
+            for tile_column in range(left, right + 1):
+                tiles[slot] = tile_row * columns + tile_column
+                slot += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def depth_order(depths, counts):
+    """Indices of the drawn splats, front to back; equal depths stay in order. A radix sort: positive floats sort as their bits do."""
+    drawn = np.flatnonzero(counts)
+    keys = depths[drawn].view(np.uint32)
+    other_keys, other = np.empty_like(keys), np.empty_like(drawn)
+    for shift in range(0, 32, _DIGIT):
+        starts = np.zeros((1 << _DIGIT) + 1, np.int64)
+        for key in keys:
+            starts[((key >> shift) & ((1 << _DIGIT) - 1)) + 1] += 1
+        starts = np.cumsum(starts)
+        for n in range(len(keys)):
+            digit = (keys[n] >> shift) & ((1 << _DIGIT) - 1)
+            other_keys[starts[digit]], other[starts[digit]] = keys[n], drawn[n]
+            starts[digit] += 1
+        keys, other_keys, drawn, other = other_keys, keys, other, drawn
+    return drawn
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_lists(order, slots, tiles, tile_count):
+    """Each tile's splats and their slots, front to back: starts [tiles + 1] into members [pairs] and their slots [pairs]."""
+    starts = np.zeros(tile_count + 1, np.int64)
+    for tile in tiles:
+        starts[tile + 1] += 1
+    starts = np.cumsum(starts)
+    cursors = starts[:-1].copy()
+    members, member_slots = np.empty(len(tiles), np.int64), np.empty(len(tiles), np.int64)
+    for i in order:
+        for slot in range(slots[i], slots[i + 1]):
+            at = cursors[tiles[slot]]
+            members[at], member_slots[at] = i, slot
+            cursors[tiles[slot]] += 1
+    return starts, members, member_slots

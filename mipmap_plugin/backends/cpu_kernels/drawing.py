@@ -1,0 +1,119 @@
+"""The kernels in order: one image, and its gradients. Work is cut into ranges that threads take as they come free."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mipmap_plugin.backends.cpu_kernels import binning, compositing, projection
+from mipmap_plugin.backends.cpu_kernels.records import COLUMNS, PULLS, Splats, View
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+
+# The share of the half field of view by which a center may lie outside the image before the Jacobian is frozen there.
+FRUSTUM_MARGIN = 0.3
+
+# Splats and tiles in one range: some hundred microseconds of work, so that handing it out costs nothing.
+SPLATS_AT_ONCE = 4096
+TILES_AT_ONCE = 4
+
+
+class Drawing(NamedTuple):
+    """What the backward pass needs to know of a forward pass."""
+
+    view: View
+    background: np.ndarray  # [3]
+    table: np.ndarray  # [N, COLUMNS]
+    slots: np.ndarray  # [N + 1] where each splat's tiles begin
+    starts: np.ndarray  # [tiles + 1] where each tile's members begin
+    members: np.ndarray  # [pairs] splats, tile by tile, front to back
+    member_slots: np.ndarray  # [pairs]
+    through: np.ndarray  # [H, W]
+    stops: np.ndarray  # [H, W] place in the tile's list at which a pixel stopped
+
+
+def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, Drawing]:
+    """The image [H, W, 3] and what to remember of it."""
+    view = view_of(camera, effects, splats)
+    count, (height, width) = len(splats.means), camera.size
+    table, depths, counts = _empty(count, COLUMNS), _empty(count), np.empty(count, np.int64)
+    _share(projection.project, count, SPLATS_AT_ONCE, view, splats, table, depths, counts)
+
+    slots = np.concatenate([[0], np.cumsum(counts)])
+    tiles = np.empty(slots[-1], np.int32)
+    _share(binning.cover, count, SPLATS_AT_ONCE, table, slots, width, height, tiles)
+    columns, rows = binning.tile_grid(width, height)
+    starts, members, member_slots = binning.fill_lists(binning.depth_order(depths, counts), slots, tiles, columns * rows)
+
+    background = np.array(effects.background, np.float32)
+    image, through, stops = _empty(height, width, 3), _empty(height, width), _empty(height, width)
+    _share(compositing.composite, columns * rows, TILES_AT_ONCE, table, starts, members, background, image, through, stops)
+    return image, Drawing(view, background, table, slots, starts, members, member_slots, through, stops)
+
+
+def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np.ndarray) -> Splats:
+    """The gradients of the splats from those of the image [H, W, 3] and its alpha [H, W]."""
+    d = drawing
+    pulls = _empty(len(d.members), PULLS)
+    maps = (d.background, d.through, d.stops, d_image, d_alpha)
+    _share(compositing.composite_back, len(d.starts) - 1, TILES_AT_ONCE, d.table, d.starts, d.members, d.member_slots, *maps, pulls)
+    grads = Splats(*(_empty(*array.shape) for array in splats))
+    _share(projection.project_back, len(splats.means), SPLATS_AT_ONCE, d.view, splats, d.table, d.slots, pulls, grads)
+    return grads
+
+
+def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
+    left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
+    top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
+    across, down = FRUSTUM_MARGIN * (left + right) / 2, FRUSTUM_MARGIN * (top + bottom) / 2
+    viewmat = camera.viewmat.numpy()
+    return View(
+        rotation=np.ascontiguousarray(viewmat[:3, :3]),
+        translation=np.ascontiguousarray(viewmat[:3, 3]),
+        eye=camera.center.numpy(),
+        fx=float(camera.fx),
+        fy=float(camera.fy),
+        cx=float(camera.cx),
+        cy=float(camera.cy),
+        slopes=np.array([-left - across, right + across, -top - down, bottom + down]),
+        width=camera.width,
+        height=camera.height,
+        near=float(effects.near_plane),
+        eps2d=float(effects.eps2d),
+        antialiased=effects.screen_filter == "antialiased",
+        sh_degree=min(effects.sh_degree, int(splats.sh.shape[1] ** 0.5) - 1),
+    )
+
+
+def splats_of(tensors: tuple[Tensor | None, ...]) -> Splats:
+    """Means, quats, scales, opacities, sh and covariances or None as arrays; of the two ways to give a shape, one stays empty."""
+    means, quats, scales, opacities, sh, covariances = tensors
+    if covariances is None:
+        covariances = means.new_empty(0, 3, 3)
+    else:
+        quats, scales = quats[:0], scales[:0]
+    return Splats(*(tensor.detach().contiguous().numpy() for tensor in (means, quats, scales, opacities, sh, covariances)))
+
+
+def _empty(*shape: int) -> np.ndarray:
+    return torch.empty(shape).numpy()  # aligned to cache lines, which numpy's own memory is not
+
+
+def _share(kernel: Callable[..., None], count: int, at_once: int, *arguments) -> None:
+    """Run `kernel(start, stop, *arguments)` over 0..count on torch's number of threads.
+
+    Threads live as long as the call: an idle pool would not survive a fork, and two callers would get in each other's way.
+    """
+    ranges = [(start, min(start + at_once, count)) for start in range(0, count, at_once)]
+    threads = min(torch.get_num_threads(), len(ranges))
+    if threads < 2:
+        kernel(0, count, *arguments)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(kernel, *each, *arguments) for each in ranges]:
+            done.result()
