@@ -1,0 +1,71 @@
+"""Outputs appear whole or not at all: written under a temporary sibling name, then renamed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from mipmap_plugin.errors import CheckpointError, OutputExists
+
+
+@contextlib.contextmanager
+def new_file(path: Path, overwrite: bool) -> Iterator[Path]:
+    """A temporary path to write to, which becomes `path` if the block ends well. Raises OutputExists, CheckpointError."""
+    refuse_existing(path, overwrite)
+    with _temporary(path) as temporary:
+        yield temporary
+        os.replace(temporary, path)
+
+
+@contextlib.contextmanager
+def new_folder(path: Path, overwrite: bool) -> Iterator[Path]:
+    """A temporary folder to fill, which becomes `path` if the block ends well; an old folder is taken away only then."""
+    refuse_existing(path, overwrite)
+    with _temporary(path) as temporary:
+        temporary.mkdir()
+        yield temporary
+        _swap_in(temporary, path)
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise OutputExists when something is at `path` and was not to be replaced."""
+    if path.exists() and not overwrite:
+        raise OutputExists(f"{path} exists already; pass --overwrite (overwrite=True) to replace it, or choose another path")
+
+
+@contextlib.contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be written: {error.strerror or error}") from error
+    finally:
+        _remove(temporary)
+
+
+def _swap_in(new: Path, path: Path) -> None:
+    """Directories cannot be exchanged portably, so that the old one steps aside for the moment of one rename."""
+    if not path.exists():
+        new.rename(path)
+        return
+    aside = new.with_suffix(".old")
+    path.rename(aside)
+    try:
+        new.rename(path)
+    except OSError:
+        aside.rename(path)
+        raise
+    _remove(aside)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

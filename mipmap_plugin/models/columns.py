@@ -1,0 +1,106 @@
+"""The columns of a 3DGS PLY, as raw parameters and back. The names and their order are the original project's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mipmap_plugin.errors import CheckpointError
+
+# The constant basis function of real spherical harmonics, 1 / (2·sqrt(pi)): a color is C0·f_dc + 0.5.
+C0 = 0.28209479177387814
+
+# Columns of f_rest, and the SH degree that they make.
+SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
+
+# Rows that are transposed together: 1 to 2 MB of a file's rows, which stay in the cache while each column is picked out.
+CHUNK = 8192
+
+POSITION = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")  # always 0 in 3DGS, and read by nobody
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALE = ("scale_0", "scale_1", "scale_2")
+QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
+RGB = ("red", "green", "blue")
+
+
+def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Tensor]:
+    """Raw float32 parameters, named and shaped as gsplat does.
+
+    means [N, 3], scales [N, 3] log, quats [N, 4] wxyz, opacities [N] logit, sh0 [N, 1, 3], shN [N, K, 3] basis-major.
+    Raises CheckpointError for missing columns and for a number of f_rest columns that fits no SH degree.
+    """
+    columns = _with_dc(columns)
+    missing = [name for name in (*POSITION, *DC, "opacity", *SCALE, *QUATERNION) if name not in columns]
+    if missing:
+        raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}")
+    rest = rest_names(columns)
+    if len(rest) not in SH_DEGREES:
+        raise CheckpointError(f"{path} has {len(rest)} f_rest columns, which fit no SH degree: 0, 9, 24, 45 or 72 do; export it again")
+    bands = len(rest) // 3
+    basis_major = tuple(rest[c * bands + j] for j in range(bands) for c in range(3))  # the file is channel-major
+    return {
+        "means": _stacked(columns, POSITION),
+        "scales": _stacked(columns, SCALE),
+        "quats": _stacked(columns, QUATERNION),
+        "opacities": _stacked(columns, ("opacity",))[:, 0],
+        "sh0": _stacked(columns, DC)[:, None],
+        "shN": _stacked(columns, basis_major).unflatten(1, (bands, 3)),
+    }
+
+
+def to_columns(parameters: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+    """The columns that 3DGS writes, all f4, in its order."""
+    raw = {name: tensor.detach().to("cpu", torch.float32) for name, tensor in parameters.items()}
+    count, bands = raw["shN"].shape[:2]
+    rest = tuple(f"f_rest_{i}" for i in range(3 * bands))
+    blocks = {
+        POSITION: raw["means"],
+        NORMAL: torch.zeros(count, 3),
+        DC: raw["sh0"][:, 0],
+        rest: raw["shN"].transpose(1, 2).flatten(1),
+        ("opacity",): raw["opacities"][:, None],
+        SCALE: raw["scales"],
+        QUATERNION: raw["quats"],
+    }
+    return {name: block[:, i].numpy() for names, block in blocks.items() for i, name in enumerate(names)}
+
+
+def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Copies of the columns that 3DGS does not know, such as a confidence or a segment id."""
+    known = {*POSITION, *NORMAL, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+    known |= set() if DC[0] in columns else set(RGB)
+    return {name: column.copy() for name, column in columns.items() if name not in known}
+
+
+def rest_names(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """f_rest_0, f_rest_1, ... by their number, since neither the file's order nor the alphabet's is theirs."""
+    names = [name for name in columns if re.fullmatch(r"f_rest_\d+", name)]
+    return tuple(sorted(names, key=lambda name: int(name.removeprefix("f_rest_"))))
+
+
+def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    """Red, green and blue stand in for f_dc: integers of their full range, or floats of 0..1."""
+    if DC[0] in columns or not all(name in columns for name in RGB):
+        return columns
+    return {**columns, **{dc: (_unit(columns[name]) - 0.5) / C0 for dc, name in zip(DC, RGB, strict=True)}}
+
+
+def _unit(column: np.ndarray) -> np.ndarray:
+    full = np.iinfo(column.dtype).max if column.dtype.kind in "iu" else 1
+    return column.astype(np.float64) / full
+
+
+def _stacked(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> Tensor:
+    """[N, len(names)] float32. What float32 cannot hold becomes infinite, and is found by `health`."""
+    block = np.empty((len(columns["x"]), len(names)), np.float32)
+    with np.errstate(over="ignore"):
+        for start in range(0, len(block), CHUNK):
+            for i, name in enumerate(names):
+                block[start : start + CHUNK, i] = columns[name][start : start + CHUNK]
+    return torch.from_numpy(block)

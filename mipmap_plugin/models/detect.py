@@ -1,0 +1,189 @@
+"""Which family a checkpoint belongs to, told from bytes, column names and companions."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.models.cfg_args import read_cfg_args
+from mipmap_plugin.models.magic import kind_of, names_in_torch_file
+from mipmap_plugin.models.ply import Header, read_header
+from mipmap_plugin.models.tags import render_mode
+
+# Every family that is recognized, loaded or not, by the name that `register_model` takes.
+FAMILIES = {
+    "3dgs": "3D Gaussian splatting",
+    "mip": "Mip-Splatting",
+    "gof": "Gaussian Opacity Fields",
+    "analytic": "Analytic-Splatting",
+    "2dgs": "2D Gaussian splatting",
+    "scaffold": "Scaffold-GS",
+    "octree": "Octree-GS",
+    "deformable": "Deformable 3D Gaussians",
+    "sc-gs": "SC-GS",
+    "4dgs": "4D Gaussians",
+    "spacetime": "SpacetimeGaussians",
+    "gsplat": "gsplat",
+    "splatfacto": "splatfacto (nerfstudio)",
+}
+
+EXCHANGE = {"spz": "SPZ", "sog": "SOG", "ksplat": "KSPLAT", "splat": "SPLAT", "compressed": "compressed PLY"}
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint that was found."""
+
+    family: str  # a key of FAMILIES
+    path: Path  # the file that holds the splats
+    folder: Path | None = None  # the model folder around it
+    iteration: int | None = None
+    notes: tuple[str, ...] = ()  # what was passed over, in sentences
+
+
+def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
+    """Find the splats at `path`, a file or a model folder, and name their family.
+
+    Of a folder, the newest `iteration_<N>` whose PLY is whole is taken, or the one asked for.
+    Raises CheckpointError for what is missing, damaged, or not a checkpoint.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _detect_folder(path, iteration)
+    if not path.exists():
+        raise CheckpointError(f"{path} does not exist; give a PLY file or a model folder")
+    if iteration is not None:
+        raise CheckpointError(f"{path} is a file and has no iterations; give its model folder to choose iteration {iteration}")
+    kind = kind_of(path)
+    if kind == "torch":
+        return Checkpoint(_family_of_torch_file(path), path)
+    if kind != "ply":
+        raise CheckpointError(_why_not(path, kind))
+    return _detect_ply(path)
+
+
+def not_loaded(family: str) -> str:
+    """The sentence for a family that is recognized, but that nothing is registered for."""
+    return f"this is a {FAMILIES.get(family, family)} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
+
+
+def _detect_ply(path: Path) -> Checkpoint:
+    header = read_header(path)
+    names = {name for element in header.elements for name in element.names}
+    if "packed_position" in names:
+        raise CheckpointError(_why_not(path, "compressed"))
+    folder, iteration = _around(path)
+    return Checkpoint(_family(path, header, folder), path, folder, iteration)
+
+
+def _around(ply: Path) -> tuple[Path | None, int | None]:
+    """The model folder and iteration of `<folder>/point_cloud/iteration_<N>/point_cloud.ply`."""
+    place = ply.absolute().parent
+    number = re.fullmatch(r"iteration_(\d+)", place.name)
+    if number and place.parent.name == "point_cloud":
+        return place.parent.parent, int(number[1])
+    return (place if (place / "cfg_args").is_file() else None), None
+
+
+def _family(path: Path, header: Header, folder: Path | None) -> str:
+    """By columns first, then by companions: a dynamic scene's own PLY looks like plain 3DGS."""
+    names = set(header.vertex.names)
+    if "f_anchor_feat_0" in names:
+        return "octree" if {"level", "extra_level", "info"} <= names else "scaffold"
+    for column, family in {"trbf_center": "spacetime", "fea_0": "sc-gs"}.items():
+        if column in names:
+            return family
+    if "filter_3D" in names:
+        return _family_of_filter_3d(folder)
+    if ({"scale_0", "scale_1", "rot_0"} <= names and "scale_2" not in names) or render_mode(header.comments) == "2dgs":
+        return "2dgs"
+    if not {"opacity", "scale_0", "rot_0"} <= names:
+        columns = ", ".join(header.vertex.names[:8])
+        raise CheckpointError(f"{path} is a plain point cloud or a mesh (columns {columns}), not Gaussian splats; give a trained model")
+    return _family_of_companions(path, folder)
+
+
+def _family_of_companions(ply: Path, folder: Path | None) -> str:
+    if (ply.parent / "deformation.pth").exists() or re.match(r"coarse_iteration_\d+$", ply.parent.name):
+        return "4dgs"
+    networks = sorted(folder.glob("deform/iteration_*/deform.pth")) if folder else []
+    if networks:
+        return "sc-gs" if "nodes" in names_in_torch_file(networks[-1], ("nodes",)) else "deformable"
+    return "3dgs"
+
+
+def _family_of_filter_3d(folder: Path | None) -> str:
+    options: dict[str, Any] = read_cfg_args(folder / "cfg_args") if folder and (folder / "cfg_args").is_file() else {}
+    if "use_decoupled_appearance" in options:
+        return "gof"
+    return "analytic" if "load_allres" in options and "kernel_size" not in options else "mip"
+
+
+def _family_of_torch_file(path: Path) -> str:
+    found = names_in_torch_file(path, ("splats", "pipeline", "gauss_params", "linear.0.weight", "nodes", "param_groups"))
+    if "splats" in found:
+        return "gsplat"
+    if found & {"pipeline", "gauss_params"}:
+        return "splatfacto"
+    if found & {"linear.0.weight", "nodes"}:
+        raise CheckpointError(f"{path} is a deformation network without its splats; give the model folder that holds both")
+    if "param_groups" in found:
+        raise CheckpointError(f"{path} is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it")
+    raise CheckpointError(f"{path} is a torch file that holds no known checkpoint; give a PLY file or a model folder")
+
+
+def _why_not(path: Path, kind: str) -> str:
+    if kind in EXCHANGE:
+        plain = path.with_name(path.name.split(".")[0] + (".ply" if path.suffix != ".ply" or path.name.endswith(".compressed.ply") else "-plain.ply"))
+        return f"{path} is {EXCHANGE[kind]}, an exchange format; convert it first: splat-transform {shlex.quote(str(path))} {shlex.quote(str(plain))}"
+    return {
+        "glb": f"{path} is glTF, which is not read here, nor by splat-transform; export a PLY from the program that made it",
+        "torchscript": f"{path} is a TorchScript network, one companion of an anchor model; give the model folder that holds its point_cloud.ply",
+        "zip": f"{path} is a zip archive; unpack it and give the PLY or the folder in it",
+        "gzip": f"{path} is a gzip file; unpack it first",
+    }.get(kind, f"{path} is no checkpoint that is known here; give a PLY file or a model folder")
+
+
+def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
+    if (folder / "point_cloud").is_dir():
+        return _detect_iteration(folder, iteration)
+    if iteration is not None:
+        raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
+    if (folder / "meta.json").is_file() and any(folder.glob("*.webp")):
+        raise CheckpointError(_why_not(folder / "meta.json", "sog"))
+    for family, pattern in {"gsplat": "ckpts/ckpt_*.pt", "splatfacto": "nerfstudio_models/*.ckpt"}.items():
+        if files := sorted(folder.glob(pattern), key=_numbers):
+            return Checkpoint(family, files[-1], folder)
+    clouds = sorted(folder.glob("*.ply"))
+    if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
+        clouds = [folder / "point_cloud.ply"]
+    if len(clouds) == 1:
+        return detect(clouds[0])
+    told = f"{len(clouds)} PLY files ({', '.join(c.name for c in clouds[:5])})" if clouds else "no point_cloud folder and no PLY file"
+    raise CheckpointError(f"{folder} holds {told}; give one PLY file, or a model folder with point_cloud/iteration_<N>")
+
+
+def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
+    """The newest iteration that is whole. What is passed over on the way is noted."""
+    entries = {int(m[1]): entry for entry in (folder / "point_cloud").iterdir() if (m := re.fullmatch(r"iteration_(\d+)", entry.name))}
+    if not entries:
+        raise CheckpointError(f"{folder / 'point_cloud'} holds no iteration_<N> folder; give the PLY file itself")
+    if wanted is not None and wanted not in entries:
+        raise CheckpointError(f"{folder / 'point_cloud'} has no iteration_{wanted}; it has {', '.join(map(str, sorted(entries)))}")
+    troubles: list[str] = []
+    for number in [wanted] if wanted is not None else sorted(entries, reverse=True):
+        ply = entries[number] / "point_cloud.ply"
+        try:
+            found = detect(ply)
+            return Checkpoint(found.family, ply, folder, number, tuple(f"iteration_{number} is taken, since {trouble}" for trouble in troubles))
+        except CheckpointError as error:
+            troubles.append(str(error))
+    raise CheckpointError(f"{folder} has no whole checkpoint: {'; '.join(troubles)}")
+
+
+def _numbers(path: Path) -> list[int]:
+    return [int(digits) for digits in re.findall(r"\d+", path.name)]

@@ -1,0 +1,100 @@
+"""The model folder of 3DGS around a PLY: what its companions tell, and how a new one is laid out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.errors import CheckpointError, OutputExists
+from mipmap_plugin.models.atomic import new_folder
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args
+
+# Copied byte for byte: the cameras, and what SIBR's viewer and `load_ply` of 3DGS look for.
+COMPANIONS = ("cameras.json", "input.ply", "exposure.json")
+
+# 3DGS takes iteration 0 for "nothing loaded" (scene/__init__.py), so a model that came without one gets the usual last one.
+DEFAULT_ITERATION = 30_000
+
+
+def read_options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
+    """The options of the folder's cfg_args, {} where there are none, and a note when they cannot be read."""
+    if folder is None or not (folder / "cfg_args").is_file():
+        return {}, []
+    try:
+        return read_cfg_args(folder / "cfg_args"), []
+    except CheckpointError as error:
+        return {}, [f"the training options are not known: {error}"]
+
+
+def trained_scale(options: dict[str, Any], screen_filter: str | None) -> TrainedScale:
+    """How the checkpoint was trained, as far as its options and its header tag say so."""
+    resolution, white = options.get("resolution"), options.get("white_background")
+    if not isinstance(resolution, (int, float)) or isinstance(resolution, bool):
+        resolution = TrainedScale.resolution
+    return TrainedScale(
+        screen_filter=screen_filter or TrainedScale.screen_filter,
+        resolution=resolution,
+        background=(float(white),) * 3 if isinstance(white, bool) else None,
+    )
+
+
+def companion_notes(folder: Path | None, options: dict[str, Any], sh_degree: int) -> list[str]:
+    """What differs from the plain case, in sentences."""
+    notes = []
+    if options.get("sh_degree", sh_degree) != sh_degree:
+        notes.append(f"cfg_args says SH degree {options['sh_degree']}, but the PLY holds degree {sh_degree}; the PLY is trusted")
+    if options.get("train_test_exp"):
+        notes.append("trained with train_test_exp: the original multiplies each training view by its exposure, which is not applied here")
+    if folder is not None and (folder / "exposure.json").is_file():
+        notes.append(_exposure_note(folder / "exposure.json"))
+    return notes
+
+
+def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: int | None, overwrite: bool, write_ply: Callable[[Path], Any]) -> Path:
+    """Lay out a model folder around the PLY that `write_ply` writes, all or nothing; return that PLY's path. Raises OutputExists."""
+    _refuse_to_lose(target, source)
+    within = Path("point_cloud", f"iteration_{iteration or DEFAULT_ITERATION}", "point_cloud.ply")
+    with new_folder(target, overwrite) as fresh:
+        (fresh / within).parent.mkdir(parents=True)
+        write_ply(fresh / within)
+        (fresh / "cfg_args").write_text(cfg_args, encoding="utf-8", newline="")
+        for name in COMPANIONS:
+            if source is not None and (source / name).is_file():
+                shutil.copyfile(source / name, fresh / name)
+    return target / within
+
+
+def cfg_args_for(source: Path | None, target: Path, trained: TrainedScale, sh_degree: int) -> str:
+    """The source's own text where its SH degree fits; else its options, or the defaults of 3DGS, with the degree set."""
+    options, _ = read_options(source)
+    if source is not None and options.get("sh_degree") == sh_degree:
+        return (source / "cfg_args").read_bytes().decode("utf-8")
+    usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": False}
+    white = trained.background == (1.0, 1.0, 1.0)
+    return format_cfg_args({**usual, "white_background": white, **options, "sh_degree": sh_degree})
+
+
+def _refuse_to_lose(target: Path, source: Path | None) -> None:
+    """Replacing a folder deletes what is in it, which must be neither the base checkpoint nor anything but a model."""
+    if source is not None and source.resolve().is_relative_to(target.resolve()):
+        raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
+    if target.is_dir() and any(target.iterdir()) and not (target / "point_cloud").is_dir():
+        raise OutputExists(f"{target} is a folder with other things in it, which --overwrite would delete; choose another folder")
+    if target.is_file():
+        raise OutputExists(f"{target} is a file; choose another folder, or a path that ends in .ply")
+
+
+def _exposure_note(path: Path) -> str:
+    try:
+        exposures = json.loads(path.read_text(encoding="utf-8"))
+        identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+        changed = sum(matrix != identity for matrix in exposures.values())
+    except (OSError, ValueError, AttributeError) as error:
+        return f"exposure.json cannot be read ({error}); exposures are not applied here"
+    if not changed:
+        return "exposure.json holds only identities: no exposure was trained"
+    return f"exposure.json changes {changed} of {len(exposures)} views; the splats are rendered without exposure"

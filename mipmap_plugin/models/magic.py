@@ -1,0 +1,103 @@
+"""What a file is by its first bytes, whatever its name says; nothing in it is ever executed."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from mipmap_plugin.errors import CheckpointError
+
+# Bytes that tell every format here apart; a .splat file has no magic and is judged by its first records.
+HEAD = 64 * 1024
+
+# Bytes of a zip member that are looked at for names; the pickle of a gsplat or splatfacto checkpoint has a few kB.
+MAX_PICKLE = 16 * 1024 * 1024
+
+
+def read_head(path: Path, size: int = HEAD) -> bytes:
+    """The first `size` bytes. Raises CheckpointError when there are none, or when a placeholder stands for the data."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(size)
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}") from error
+    _refuse_placeholder(path, head)
+    return head
+
+
+def _refuse_placeholder(path: Path, head: bytes) -> None:
+    start = head[:512].lstrip().lower()
+    if not head:
+        raise CheckpointError(f"{path} is empty; download or export it again")
+    if start.startswith(b"version https://git-lfs"):
+        size = re.search(rb"size (\d+)", head)
+        told = f" of a file of {int(size[1]):,} bytes" if size else ""
+        raise CheckpointError(f"{path} is only the Git-LFS pointer{told}; run `git lfs pull` in its repository")
+    if start.startswith((b"<!doctype", b"<html", b"<?xml")):
+        raise CheckpointError(f"{path} is a web page, so the download went wrong; download it again")
+    if start.startswith((b'{"error', b'{"message', b'{"status')):
+        raise CheckpointError(f"{path} is a server's error message, so the download went wrong; download it again")
+
+
+def kind_of(path: Path) -> str:
+    """One of: ply, spz, sog, zip, gzip, torch, torchscript, glb, ksplat, splat, unknown. Raises CheckpointError (`read_head`)."""
+    head = read_head(path)
+    if re.match(rb"ply\s", head):
+        return "ply"
+    if head.startswith(b"\x1f\x8b"):
+        return "spz" if _inflated(head) == b"NGSP" else "gzip"
+    for magic, kind in {b"NGSP": "spz", b"glTF": "glb", b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19": "torch"}.items():
+        if head.startswith(magic):
+            return kind
+    if head.startswith(b"PK\x03\x04"):
+        return _kind_of_zip(path)
+    size = path.stat().st_size
+    if head.startswith(b"\x00\x01\x00\x00") and size >= 5120 and int.from_bytes(head[20:22], "little") <= 2:
+        return "ksplat"
+    return "splat" if _plausible_splat(head, size) else "unknown"
+
+
+def names_in_torch_file(path: Path, wanted: tuple[str, ...]) -> set[str]:
+    """Which of these words stand in a torch file's pickle, which is searched as bytes and never unpickled."""
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            pickles = [name for name in archive.namelist() if name.endswith("data.pkl")]
+            with archive.open(pickles[0]) as file:
+                text = file.read(MAX_PICKLE)
+    else:
+        text = read_head(path, MAX_PICKLE)
+    return {word for word in wanted if word.encode() in text}
+
+
+def _inflated(head: bytes) -> bytes:
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, 4)
+    except zlib.error:
+        return b""
+
+
+def _kind_of_zip(path: Path) -> str:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except zipfile.BadZipFile as error:
+        raise CheckpointError(f"{path} is a damaged zip archive ({error}); download or copy it again") from error
+    leaves = {name.rpartition("/")[2] for name in names}
+    if "data.pkl" in leaves:
+        compiled = any("/code/" in name for name in names) or "constants.pkl" in leaves
+        return "torchscript" if compiled else "torch"
+    return "sog" if "meta.json" in leaves and any(leaf.endswith(".webp") for leaf in leaves) else "zip"
+
+
+def _plausible_splat(head: bytes, size: int) -> bool:
+    """Records of 32 bytes: 3 f4 position, 3 f4 scale, 4 u1 color, 4 u1 quaternion around 128 (antimatter15/splat)."""
+    if size % 32:
+        return False
+    rows = np.frombuffer(head[: len(head) // 32 * 32], np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)]))
+    length = np.linalg.norm(rows["quat"].astype(np.float32) / 128 - 1, axis=1)
+    scale = rows["scale"]
+    return bool(np.isfinite(rows["position"]).all() and (scale > 0).all() and (scale < 1e6).all() and ((length > 0.5) & (length < 1.8)).all())

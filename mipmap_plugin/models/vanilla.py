@@ -1,0 +1,224 @@
+"""Plain 3D Gaussian splatting: a PLY, alone or in a model folder, of 3DGS or of anything that writes the same columns."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import CheckpointError, SettingsError, ShapeError
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
+from mipmap_plugin.models.detect import detect, not_loaded
+from mipmap_plugin.models.health import drop, examine
+from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
+from mipmap_plugin.models.ply import read_ply, write_ply
+from mipmap_plugin.models.tags import render_mode, with_tags
+
+# World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so that it can grow again.
+MIN_SCALE = 1e-18
+
+# An opacity is kept this far from 0 and 1, where its logit is infinite: a thousandth of what 8 bits show, and exact in float32.
+OPACITY_MARGIN = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """Where a model came from, and what of its file is carried along unchanged."""
+
+    source: Path | None = None  # the PLY; None: made in memory
+    digest: str = ""  # sha256 of its bytes, hexadecimal
+    folder: Path | None = None  # the model folder around it
+    iteration: int | None = None
+    comments: tuple[str, ...] = ()
+    extras: dict[str, np.ndarray] = field(default_factory=dict)  # columns that 3DGS does not know, [N] each
+
+
+class VanillaModel:
+    """N splats that look the same to every camera.
+
+    Raw parameters, named and shaped as gsplat's: means [N, 3], scales [N, 3] log, quats [N, 4] wxyz, opacities [N]
+    logit, sh0 [N, 1, 3], shN [N, (degree + 1)**2 - 1, 3]. Those of a loaded model require no gradient, a copy's do.
+    """
+
+    family = "3dgs"
+
+    def __init__(
+        self, parameters: dict[str, Tensor], trained: TrainedScale = TrainedScale(), origin: Origin = Origin(), notes: Iterable[str] = ()  # noqa: B008
+    ) -> None:
+        """Take the tensors as they are. Raises ShapeError."""
+        _check(parameters)
+        self._parameters = dict(parameters)
+        self._origin = origin
+        self.source, self.folder, self.digest = origin.source, origin.folder, origin.digest
+        self.trained = trained
+        self.notes: list[str] = list(notes)
+
+    @classmethod
+    def from_gaussians(cls, gaussians: Gaussians, trained: TrainedScale = TrainedScale()) -> VanillaModel:  # noqa: B008
+        """The model that activates to `gaussians`, but for scales and opacities at their ends (`MIN_SCALE`, `OPACITY_MARGIN`)."""
+        if gaussians.covariances is not None:
+            raise SettingsError("Gaussians with covariances of their own have no 3DGS parameters; give quaternions and scales")
+        held = gaussians.detach()
+        scales, opacities = _log(held.scales), _logit(held.opacities)
+        named = {"means": held.means, "scales": scales, "quats": held.quats, "opacities": opacities, "sh0": held.sh[:, :1], "shN": held.sh[:, 1:]}
+        return cls({name: tensor.clone() for name, tensor in named.items()}, trained)
+
+    @property
+    def sh_degree(self) -> int:
+        return math.isqrt(self._parameters["shN"].shape[1] + 1) - 1
+
+    def __len__(self) -> int:
+        return len(self._parameters["means"])
+
+    def gaussians(self, camera: Camera | None = None) -> Gaussians:
+        """All splats, activated: exp, sigmoid, unit quaternions. `camera` is not looked at."""
+        raw = self._parameters
+        sh = torch.cat([raw["sh0"], raw["shN"]], dim=1)
+        return Gaussians(raw["means"], unit_quaternions(raw["quats"]), raw["scales"].exp(), raw["opacities"].sigmoid(), sh)
+
+    def parameters(self) -> dict[str, Tensor]:
+        return dict(self._parameters)
+
+    def copy(self) -> VanillaModel:
+        """An independent model whose leaves require gradients."""
+        return self._with({name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()})
+
+    def to(self, device: torch.device | str) -> VanillaModel:
+        """A copy on another device, which requires gradients where this one does."""
+        return self._with({name: _moved(tensor, device) for name, tensor in self._parameters.items()})
+
+    def keep_rows(self, keep: Tensor) -> VanillaModel:
+        """A new model of the rows where `keep` [N] is True, extra columns included."""
+        extras = {name: column[keep.cpu().numpy()] for name, column in self._origin.extras.items()}
+        kept = {name: tensor.detach()[keep].requires_grad_(tensor.requires_grad) for name, tensor in self._parameters.items()}
+        return self._with(kept, replace(self._origin, extras=extras))
+
+    def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
+        """Take these very tensors as leaves, as an optimizer does. Rows are no longer known, so extra columns go. Raises ShapeError."""
+        _check(parameters)
+        leaves = {name: tensor if tensor.is_leaf else tensor.detach() for name, tensor in parameters.items()}
+        self._parameters = {name: leaf.requires_grad_() for name, leaf in leaves.items()}
+        if self._origin.extras:
+            self.notes.append(f"the extra columns {', '.join(self._origin.extras)} are dropped, since splats were added or removed")
+            self._origin = replace(self._origin, extras={})
+
+    def reshape(self, scales: Tensor, opacities: Tensor) -> None:
+        """Set the activated scales [N, 3] and opacities [N], in place, so that an optimizer keeps its leaves. Raises ShapeError."""
+        for name, wanted in {"scales": _log(scales), "opacities": _logit(opacities)}.items():
+            held = self._parameters[name]
+            if wanted.shape != held.shape:
+                raise ShapeError(f"{name}: expected shape {list(held.shape)}, got {list(wanted.shape)}")
+            with torch.no_grad():
+                held.copy_(wanted)
+
+    def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
+        """Write a PLY where `path` ends in .ply, else a 3DGS model folder, atomically; return the PLY written.
+
+        The folder repeats the iteration, cfg_args, cameras and exposures that the model came with. Raises OutputExists,
+        and CheckpointError when the disk refuses.
+        """
+        path = Path(path)
+        columns = {**to_columns(self._parameters), **self._origin.extras}
+        comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
+        if path.suffix.lower() == ".ply":
+            return write_ply(path, columns, comments, overwrite=overwrite)
+        cfg_args = cfg_args_for(self.folder, path, self.trained, self.sh_degree)
+        return write_folder(path, self.folder, cfg_args, self._origin.iteration, overwrite, partial(write_ply, columns=columns, comments=comments))
+
+    def row_opacities(self) -> Tensor:
+        """[N], 0..1, without gradient."""
+        return self._parameters["opacities"].detach().sigmoid()
+
+    def _with(self, parameters: dict[str, Tensor], origin: Origin | None = None) -> VanillaModel:
+        return VanillaModel(parameters, self.trained, origin or self._origin, self.notes)
+
+
+def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
+    """Load a 3DGS PLY or model folder. Splats that are not finite once activated are dropped, with a note.
+
+    Raises CheckpointError for what is damaged, of another family, or no checkpoint.
+    """
+    found = detect(path, iteration=iteration)
+    if found.family != "3dgs":
+        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
+    ply = read_ply(found.path)
+    parameters, extras = to_parameters(ply.columns, found.path), extra_columns(ply.columns)
+    options, notes = read_options(found.folder)
+    screen_filter = render_mode(ply.comments)
+    origin = Origin(found.path, _sha256(found.path), found.folder, found.iteration, ply.comments, extras)
+    model = VanillaModel(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
+    del ply  # as large as the model, and no longer needed by what follows
+    model.notes += companion_notes(found.folder, options, model.sh_degree)
+    if screen_filter:
+        model.notes.append(f"the header says that the splats were trained {screen_filter}, so they are rendered so")
+    if extras:
+        model.notes.append(f"extra columns are carried along: {', '.join(extras)}")
+    return _without_poison(model)
+
+
+def unit_quaternions(quats: Tensor) -> Tensor:
+    """[N, 4] -> [N, 4] of length 1, with a finite gradient everywhere; a zero quaternion becomes the identity.
+
+    Dividing by the largest component first keeps the squares in range. It is taken as a constant, which is exact: the
+    result does not depend on it.
+    """
+    largest = quats.detach().abs().amax(dim=1, keepdim=True)
+    is_zero = largest < torch.finfo(quats.dtype).tiny
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    scaled = torch.where(is_zero, identity, quats / torch.where(is_zero, 1.0, largest))
+    return scaled / scaled.norm(dim=1, keepdim=True)
+
+
+def _without_poison(model: VanillaModel) -> VanillaModel:
+    health = examine(model)
+    if not health.poisonous.any():
+        return model
+    if health.poisonous.all():
+        raise CheckpointError(f"{model.source}: none of its {health.splats:,} splats is finite; the training or the export failed")
+    model = drop(model, health.poisonous)
+    model.notes.append("found while loading: " + "; ".join(health.non_finite()))
+    return model
+
+
+def _check(parameters: dict[str, Tensor]) -> None:
+    if set(parameters) != {"means", "scales", "quats", "opacities", "sh0", "shN"}:
+        raise ShapeError(f"parameters: expected means, scales, quats, opacities, sh0 and shN, got {', '.join(parameters)}")
+    n = len(parameters["means"])
+    bands = parameters["shN"].shape[1] if parameters["shN"].dim() == 3 else 0
+    want = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, bands, 3)}
+    for name, shape in want.items():
+        if tuple(parameters[name].shape) != shape:
+            raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(parameters[name].shape)}")
+    if 3 * bands not in SH_DEGREES:
+        raise ShapeError(f"shN: {bands} coefficients fit no SH degree; 0, 3, 8, 15 or 24 do")
+
+
+def _log(scales: Tensor) -> Tensor:
+    return scales.detach().clamp_min(MIN_SCALE).log()
+
+
+def _logit(opacities: Tensor) -> Tensor:
+    return opacities.detach().logit(eps=OPACITY_MARGIN)
+
+
+def _moved(tensor: Tensor, device: torch.device | str) -> Tensor:
+    return tensor.detach().to(device, copy=True).requires_grad_(tensor.requires_grad)
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()

@@ -1,0 +1,259 @@
+"""Detection: every family and exchange format by its bytes, and the right file of a model folder."""
+
+import gzip
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from ply_files import splat_columns, write, write_model_folder, write_splats
+
+from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
+from mipmap_plugin.models import MODELS, load_model, register_model
+from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args
+from mipmap_plugin.models.detect import FAMILIES, detect
+
+
+def f4(*names: str) -> dict[str, np.ndarray]:
+    return {name: np.zeros(2, np.float32) for name in names}
+
+
+SPLAT = splat_columns(2, bands=0)
+FAMILY_COLUMNS = {
+    "3dgs": SPLAT,
+    "mip": {**SPLAT, **f4("filter_3D")},
+    "2dgs": {name: column for name, column in SPLAT.items() if name != "scale_2"},
+    "scaffold": f4("x", "y", "z", "f_offset_0", "f_anchor_feat_0", "opacity", "scale_0", "rot_0"),
+    "octree": f4("x", "y", "z", "level", "extra_level", "info", "f_offset_0", "f_anchor_feat_0", "opacity", "scale_0", "rot_0"),
+    "spacetime": {**SPLAT, **f4("trbf_center")},
+    "sc-gs": {**SPLAT, **f4("fea_0")},
+}
+
+
+@pytest.mark.parametrize("family", FAMILY_COLUMNS)
+def test_family_by_columns(tmp_path, family):
+    assert detect(write(tmp_path / "a.ply", FAMILY_COLUMNS[family])).family == family
+
+
+def test_family_by_header_tag(tmp_path):
+    assert detect(write(tmp_path / "a.ply", SPLAT, comments=("SplatRenderMode: 2dgs",))).family == "2dgs"
+
+
+@pytest.mark.parametrize(
+    ("options", "family"), [("kernel_size=0.1", "mip"), ("kernel_size=0.0, use_decoupled_appearance=True", "gof"), ("load_allres=False", "analytic")]
+)
+def test_family_of_filter_3d_by_options(tmp_path, options, family):
+    folder = write_model_folder(tmp_path / "m", cfg_args=f"Namespace({options})")
+    write(folder / "point_cloud/iteration_7000/point_cloud.ply", FAMILY_COLUMNS["mip"])
+    assert detect(folder).family == family
+
+
+def test_family_by_companions(tmp_path):
+    dynamic = write_model_folder(tmp_path / "4d")
+    torch.save({}, dynamic / "point_cloud/iteration_7000/deformation.pth")
+    assert detect(dynamic).family == "4dgs"
+    for family, key in {"deformable": "linear.0.weight", "sc-gs": "nodes"}.items():
+        folder = write_model_folder(tmp_path / family)
+        (folder / "deform/iteration_7000").mkdir(parents=True)
+        torch.save({key: torch.zeros(1)}, folder / "deform/iteration_7000/deform.pth")
+        assert detect(folder).family == detect(folder / "point_cloud/iteration_7000/point_cloud.ply").family == family
+
+
+@pytest.mark.parametrize(
+    ("content", "family"), [({"step": 1, "splats": {}}, "gsplat"), ({"pipeline": {"_model.gauss_params.means": torch.zeros(1)}}, "splatfacto")]
+)
+def test_family_of_torch_files(tmp_path, content, family):
+    torch.save(content, tmp_path / "a.pt")
+    assert detect(tmp_path / "a.pt").family == family
+    with pytest.raises(CheckpointError, match="recognized but not loaded by this version"):
+        load_model(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"), [({"linear.0.weight": 0}, "deformation network"), ([{"param_groups": []}, 7], "training run"), (1, "no known")]
+)
+def test_torch_files_that_are_no_model(tmp_path, content, sentence):
+    torch.save(content, tmp_path / "a.pth")
+    with pytest.raises(CheckpointError, match=sentence):
+        detect(tmp_path / "a.pth")
+
+
+def test_result_folders_of_gsplat_and_splatfacto(tmp_path):
+    written = {"gsplat": ["ckpts/ckpt_999_rank0.pt", "ckpts/ckpt_29999_rank0.pt"], "splatfacto": ["nerfstudio_models/step-000029999.ckpt"]}
+    for family, names in written.items():
+        for name in names:
+            (tmp_path / family / name).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / family / name).touch()
+        found = detect(tmp_path / family)
+        assert (found.family, found.path) == (family, tmp_path / family / names[-1])
+
+
+def splat_record() -> bytes:
+    return bytes.fromhex("7a72abc1b6e792c1f011b5c1b6cbe23f9f59683f0c309c4075c9fffff779599a")
+
+
+EXCHANGE = {
+    "spz v4": (b"NGSP" + bytes(28), "SPZ"),
+    "spz v2": (gzip.compress(b"NGSP" + bytes(12)), "SPZ"),
+    "ksplat": (b"\0\1\0\0" + bytes(6000), "KSPLAT"),
+    "splat": (splat_record() * 3, "SPLAT"),
+}
+
+
+@pytest.mark.parametrize("case", EXCHANGE)
+def test_exchange_formats_are_answered_with_a_command(tmp_path, case):
+    content, name = EXCHANGE[case]
+    path = tmp_path / "my scene.bin"
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError) as caught:
+        load_model(path)
+    assert f"is {name}, an exchange format" in str(caught.value)
+    assert str(caught.value).endswith(f"splat-transform '{path}' '{tmp_path / 'my scene.ply'}'")
+
+
+@pytest.mark.parametrize("name", ["a.compressed.ply", "a.ply"])
+def test_compressed_ply_is_not_told_to_convert_onto_itself(tmp_path, name):
+    write(tmp_path / name, {"packed_position": np.zeros(1, np.int32)})
+    with pytest.raises(CheckpointError, match=r"compressed PLY, an exchange format; convert it first: splat-transform (\S+) (?!\1$)\S+\.ply"):
+        detect(tmp_path / name)
+
+
+def test_sog_file_and_folder(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        archive.writestr("meta.json", "{}")
+        archive.writestr("means_l.webp", "")
+    (tmp_path / "folder").mkdir()
+    for name in ("meta.json", "means_l.webp"):
+        (tmp_path / "folder" / name).touch()
+    for path in (tmp_path / "a.sog", tmp_path / "folder"):
+        with pytest.raises(CheckpointError, match=r"SOG, an exchange format; .*splat-transform"):
+            detect(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [(b"glTF" + bytes(20), "glTF"), (gzip.compress(b"x"), "gzip"), (b"PK\3\4broken", "damaged zip"), (b"hello", "no checkpoint")],
+)
+def test_other_files(tmp_path, content, sentence):
+    (tmp_path / "a.bin").write_bytes(content)
+    with pytest.raises(CheckpointError, match=sentence):
+        detect(tmp_path / "a.bin")
+
+
+def test_point_cloud_is_not_a_splat(tmp_path):
+    write(tmp_path / "points3D.ply", f4("x", "y", "z", "red", "green", "blue"))
+    with pytest.raises(CheckpointError, match="plain point cloud or a mesh"):
+        detect(tmp_path / "points3D.ply")
+
+
+def test_newest_iteration_by_number_among_strays(tmp_path):
+    folder = write_model_folder(tmp_path / "m", 7000)
+    write_splats(folder / "point_cloud/iteration_30000/point_cloud.ply")
+    (folder / "point_cloud/.DS_Store").touch()
+    (folder / "point_cloud/coarse_iteration_99999").mkdir()
+    found = detect(folder)
+    assert (found.iteration, found.folder, found.notes) == (30000, folder, ())
+    assert detect(folder, iteration=7000).iteration == 7000
+    assert detect(folder / "point_cloud/iteration_7000/point_cloud.ply").folder == folder
+
+
+def test_an_incomplete_newest_iteration_is_passed_over_with_a_note(tmp_path):
+    folder = write_model_folder(tmp_path / "m", 7000)
+    newest = write_splats(folder / "point_cloud/iteration_30000/point_cloud.ply")
+    newest.write_bytes(newest.read_bytes()[:-1])
+    found = detect(folder)
+    assert found.iteration == 7000
+    assert "iteration_7000 is taken, since" in found.notes[0]
+    assert "truncated" in found.notes[0]
+    with pytest.raises(CheckpointError, match="truncated"):
+        detect(folder, iteration=30000)
+
+
+def test_folders_without_an_answer(tmp_path):
+    folder = write_model_folder(tmp_path / "m", 7000)
+    with pytest.raises(CheckpointError, match="has no iteration_5; it has 7000"):
+        detect(folder, iteration=5)
+    with pytest.raises(CheckpointError, match="is a file and has no iterations"):
+        detect(folder / "point_cloud/iteration_7000/point_cloud.ply", iteration=5)
+    (tmp_path / "e/point_cloud").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match="holds no iteration_<N> folder"):
+        detect(tmp_path / "e")
+    with pytest.raises(CheckpointError, match="no point_cloud folder and no PLY file"):
+        detect(tmp_path)
+    with pytest.raises(CheckpointError, match="does not exist"):
+        detect(tmp_path / "none")
+
+
+def test_folder_with_one_ply_and_with_several(tmp_path):
+    only = write_splats(tmp_path / "fused.ply")
+    assert detect(tmp_path).path == only
+    write_splats(tmp_path / "other.ply")
+    with pytest.raises(CheckpointError, match=r"2 PLY files \(fused.ply, other.ply\)"):
+        detect(tmp_path)
+    named = write_splats(tmp_path / "point_cloud.ply")
+    assert detect(tmp_path).path == named
+
+
+def test_a_registered_family_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr(MODELS, "_targets", dict(MODELS._targets))
+    path = write(tmp_path / "a.ply", FAMILY_COLUMNS["2dgs"])
+    with pytest.raises(CheckpointError, match="2D Gaussian splatting checkpoint"):
+        load_model(path)
+    register_model("2dgs", lambda path, iteration: (path, iteration))
+    assert load_model(path) == (path, None)
+    with pytest.raises(SettingsError, match="replace=True"):
+        register_model("2dgs", "other.module:load")
+    register_model("2dgs", "no_such_module:load", replace=True)
+    with pytest.raises(PluginError, match="no_such_module"):
+        load_model(path)
+
+
+def test_every_registered_family_has_a_name():
+    assert set(MODELS.names()) <= set(FAMILIES)
+
+
+def test_cfg_args_of_every_shape(tmp_path):
+    options = {"sh_degree": 3, "source_path": "C:\\scenes\\a", "eval": True, "render_items": ["RGB"], "k": {"a": [1, 2.5]}, "n": None}
+    (tmp_path / "cfg_args").write_text(format_cfg_args(options))
+    assert read_cfg_args(tmp_path / "cfg_args") == options
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Namespace(a=__import__('os').system('true'))",
+        "__import__('os').system('true')",
+        "Namespace(**{'a': 1})",
+        "Namespace(1)",
+        "Namespace(a=1",
+        "Namespace(a=1, a=2)",
+        "Namespace(a=" + "-" * 20_000 + "1)",
+        "Namespace(a=" + "(" * 5_000 + ")" * 5_000 + ")",
+        "Namespace(a='\udcff')",
+    ],
+)
+def test_hostile_cfg_args_are_refused_and_not_run(tmp_path, text):
+    (tmp_path / "cfg_args").write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(CheckpointError, match="is not executed") as caught:
+        read_cfg_args(tmp_path / "cfg_args")
+    assert len(str(caught.value)) < 400
+
+
+def test_endless_cfg_args_are_refused(tmp_path):
+    (tmp_path / "cfg_args").write_text("Namespace(a='" + "x" * 70_000 + "')")
+    with pytest.raises(CheckpointError, match="64 kB"):
+        read_cfg_args(tmp_path / "cfg_args")
+
+
+def test_real_companions_are_named(shared_data):
+    folder = shared_data / "checkpoints"
+    for path, sentence in {
+        "octree_mlps/color_mlp.pt": "TorchScript",
+        "deform/deform.pth": "deformation network",
+        "filter3d_2000": "Mip-Splatting checkpoint",
+        "lod_tiles": "4 PLY files",
+        "yashica-t4/yashica-t4-top8192.spz": "SPZ",
+        "yashica-t4/yashica-t4-top8192.sog": "SOG",
+    }.items():
+        with pytest.raises(CheckpointError, match=sentence):
+            load_model(folder / path)

@@ -1,0 +1,118 @@
+"""Health: each fault is counted once and by its own name, and only poison is dropped unasked."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from ply_files import splat_columns, write
+
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.health import drop, examine
+from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+
+FIELDS = {"means": "x", "scales": "scale_1", "quats": "rot_2", "opacities": "opacity", "sh0": "f_dc_1", "shN": "f_rest_7"}
+
+
+def healthy(count: int = 200) -> VanillaModel:
+    torch.manual_seed(0)
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (0, 3)}
+    raw = {name: torch.randn(count, *shape) for name, shape in shapes.items()}
+    return VanillaModel({**raw, "scales": raw["scales"] - 4})
+
+
+def spoiled(name: str, row: int, value) -> VanillaModel:
+    model = healthy()
+    model.parameters()[name][row] = torch.as_tensor(value, dtype=torch.float32)
+    return model
+
+
+def test_a_healthy_model_has_nothing_to_tell():
+    health = examine(healthy())
+    assert health.sentences() == []
+    assert not health.poisonous.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("quats", [0.0] * 4, "1 of 200 splats have a zero quaternion"),
+        ("scales", [9.0, 0, 0], "1 of 200 splats are longer than the scene"),
+        ("scales", [-30.0, 0, 0], "1 of 200 splats have an axis below"),
+        ("opacities", -6.0, "1 of 200 splats have an opacity below 1/255"),
+    ],
+)
+def test_oddities_are_counted_and_kept(name, value, sentence):
+    health = examine(spoiled(name, 7, value))
+    assert [told for told in health.sentences() if told.startswith(sentence)]
+    assert len(health.sentences()) == 1
+    assert not health.poisonous.any()
+
+
+@pytest.mark.parametrize("logit", [math.log(1 / 254) - 1e-4, math.log(1 / 254) + 1e-4])
+def test_invisible_is_below_one_eight_bit_step(logit):
+    assert examine(spoiled("opacities", 0, logit)).invisible == (logit < math.log(1 / 254))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("field", FIELDS)
+def test_poison_in_one_row_is_dropped_at_load_with_a_note(tmp_path, field, value):
+    columns = splat_columns(8)
+    columns[FIELDS[field]][3] = value
+    model = load_vanilla(write(tmp_path / "a.ply", columns))
+    if (field == "opacities" and not math.isnan(value)) or (field == "scales" and value == -math.inf):  # opacity 0 or 1, length 0
+        assert len(model) == 8 and not model.notes
+        return
+    assert model.notes[0] == "1 of 8 splats were dropped"
+    assert f"1 of 8 splats hold {'a NaN' if math.isnan(value) else 'an infinity'} in {field}" in model.notes[1]
+    rows = [i for i in range(8) if i != 3]
+    np.testing.assert_array_equal(model.parameters()["means"], np.stack([columns[axis][rows] for axis in "xyz"], 1))
+
+
+@pytest.mark.parametrize("log_scale", [89.0, 45.0])
+def test_scales_whose_variance_overflows_are_poison(log_scale):
+    health = examine(spoiled("scales", 5, [log_scale, 0, 0]))
+    assert health.poisonous.nonzero().tolist() == [[5]]
+
+
+def test_strays_do_not_set_the_extent():
+    assert examine(spoiled("means", 0, [1e9, 0, 0])).extent < 10
+
+
+@pytest.mark.parametrize(("name", "flag"), [("scales", "scales_look_linear"), ("opacities", "opacities_look_activated")])
+def test_values_that_look_activated_are_told_and_not_changed(name, flag):
+    model = healthy()
+    model.parameters()[name].uniform_(0.01, 0.9)
+    before = model.parameters()[name].clone()
+    health = examine(model)
+    assert getattr(health, flag)
+    assert any("export the file again" in told for told in health.sentences())
+    assert torch.equal(model.parameters()[name], before)
+
+
+def test_a_few_splats_say_nothing_about_distributions():
+    model = healthy(3)
+    model.parameters()["opacities"].fill_(0.5)
+    assert not examine(model).opacities_look_activated
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_nearly_empty_models(count):
+    health = examine(healthy(count))
+    assert (health.splats, health.extent, health.huge, len(health.poisonous)) == (count, 0.0, 0, count)
+
+
+def test_drop_takes_rows_of_every_field_and_of_extra_columns(tmp_path):
+    model = load_vanilla(write(tmp_path / "a.ply", {**splat_columns(4), "segment": np.arange(4, dtype=np.int32)}))
+    left = drop(model, torch.tensor([False, True, False, True]))
+    saved = load_vanilla(left.save(tmp_path / "b.ply", provenance={}))
+    assert len(model) == 4 and model.notes == ["extra columns are carried along: segment"]
+    assert left.notes[-1] == "2 of 4 splats were dropped"
+    assert saved._origin.extras["segment"].tolist() == [0, 2]
+    assert torch.equal(left.parameters()["shN"], model.parameters()["shN"][[0, 2]])
+
+
+def test_real_checkpoints(shared_data):
+    flowers = examine(load_model(shared_data / "checkpoints/flowers_r8"))
+    assert (flowers.tiny, flowers.invisible, flowers.scales_look_linear) == (9_878, 4_838, False)
+    assert examine(load_model(shared_data / "checkpoints/vanilla_iter7000")).sentences() == []

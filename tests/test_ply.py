@@ -1,0 +1,169 @@
+"""PLY files: every kind that the format allows is read alike, and every broken one is refused in one sentence."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+from ply_files import splat_columns, write, write_splats
+
+from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
+from mipmap_plugin.models import ply as ply_module
+from mipmap_plugin.models.ply import read_header, read_ply, write_ply
+
+
+def header(*lines: str) -> bytes:
+    return "\n".join(["ply", *lines, ""]).encode()
+
+
+@pytest.mark.parametrize("newline", ["\n", "\r", "\r\n"])
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_reads_every_encoding_alike(tmp_path, form, newline):
+    columns = splat_columns(7)
+    file = read_ply(write(tmp_path / "a.ply", columns, form, newline, ("made by hand",)))
+    assert (list(file.columns), file.comments, file.format) == (list(columns), ("made by hand",), form)
+    for name, column in columns.items():
+        np.testing.assert_array_equal(file.columns[name], column)
+
+
+def test_body_that_starts_with_a_newline_byte_after_a_cr_header(tmp_path):
+    value = np.frombuffer(b"\n\r\n\x41", "<f4")
+    file = read_ply(write(tmp_path / "a.ply", {"x": value}, newline="\r"))
+    assert file.columns["x"].tobytes() == value.tobytes()
+
+
+def test_mixed_types_keep_their_values(tmp_path):
+    columns = {"x": np.array([0.1]), "id": np.array([2**31 - 1], np.int32), "red": np.array([255], np.uint8)}
+    held = read_ply(write(tmp_path / "a.ply", columns)).columns
+    assert [held[name][0] for name in columns] == [0.1, 2**31 - 1, 255]
+
+
+def test_keeps_comments_and_obj_info_of_any_alphabet(tmp_path):
+    lines = header("format ascii 1.0", "comment Brüder", "element vertex 1", "obj_info two", "comment three", "property float x", "end_header")
+    (tmp_path / "a.ply").write_bytes(lines.replace(b"\xc3\xbc", b"\xfc") + b"1\n")
+    assert read_ply(tmp_path / "a.ply").comments == ("Br\ufffdder", "two", "three")
+
+
+@pytest.mark.parametrize("before", [b"element camera 2\nproperty uchar k\n", b"element face 1\nproperty list uchar int i\n"])
+def test_skips_elements_before_the_vertices(tmp_path, before):
+    body = b"\x01\x02" if b"camera" in before else b"\x00"
+    text = b"ply\nformat binary_little_endian 1.0\n" + before + b"element vertex 1\nproperty float x\nend_header\n"
+    (tmp_path / "a.ply").write_bytes(text + body + np.float32(3).tobytes())
+    assert read_ply(tmp_path / "a.ply").columns["x"].tolist() == [3]
+
+
+def test_ignores_elements_after_the_vertices(tmp_path):
+    text = header("format ascii 1.0", "element vertex 1", "property float x", "element face 1", "property list uchar int i", "end_header")
+    (tmp_path / "a.ply").write_bytes(text + b"3\n2 0 0\n")
+    assert read_ply(tmp_path / "a.ply").columns["x"].tolist() == [3]
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+def test_reads_no_rows(tmp_path, form):
+    assert len(read_ply(write(tmp_path / "a.ply", splat_columns(0), form)).columns["x"]) == 0
+
+
+def test_surplus_bytes_are_tolerated_with_a_note(tmp_path):
+    path = write_splats(tmp_path / "a.ply")
+    path.write_bytes(path.read_bytes() + b"123")
+    file = read_ply(path)
+    assert len(file.columns["x"]) == 5
+    assert "3 bytes more" in file.notes[0]
+
+
+def test_misdeclared_colors_of_nerfstudio_are_read_as_rgb(tmp_path):
+    text = header("format binary_little_endian 1.0", "element vertex 2", "property uchar colors", "property uchar opacity", "end_header")
+    (tmp_path / "a.ply").write_bytes(text + bytes([1, 2, 3, 9, 4, 5, 6, 8]))
+    columns = read_ply(tmp_path / "a.ply").columns
+    assert {name: column.tolist() for name, column in columns.items()} == {"red": [1, 4], "green": [2, 5], "blue": [3, 6], "opacity": [9, 8]}
+
+
+F4 = "property float x"
+MALFORMED = {
+    "empty": (b"", "is empty"),
+    "lfs": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12345678\n", r"12,345,678 bytes; run `git lfs pull`"),
+    "html": (b"\n<!DOCTYPE html><html>", "web page"),
+    "json": (b'{"error": "not found"}', "server's error message"),
+    "not ply": (b"plyer\n", "not a PLY"),
+    "no end": (header("format ascii 1.0", "element vertex 3"), "no end_header"),
+    "endless": (b"ply\n" + b"comment no end\n" * 20_000, "no end_header in its first 128 kB"),
+    "no format": (header("element vertex 1", F4, "end_header") + b"1\n", "no `format`"),
+    "format": (header("format text 1.0", "end_header"), "line 2 .* cannot be read"),
+    "keyword": (header("format ascii 1.0", "elephant", "end_header"), "line 3 .* cannot be read: 'elephant'"),
+    "type": (header("format ascii 1.0", "element vertex 1", "property half x", "end_header"), "line 4 .* cannot be read"),
+    "property first": (header("format ascii 1.0", F4, "end_header"), "line 3 .* cannot be read"),
+    "twice": (header("format ascii 1.0", "element vertex 1", F4, F4, "end_header"), "line 5 .* cannot be read"),
+    "negative": (header("format ascii 1.0", "element vertex -1", F4, "end_header"), "line 3 .* cannot be read"),
+    "no count": (header("format ascii 1.0", "element vertex", F4, "end_header"), "line 3 .* cannot be read"),
+    "no vertex": (header("format ascii 1.0", "element face 1", F4, "end_header") + b"1\n", "no vertex element"),
+    "no property": (header("format ascii 1.0", "element vertex 99999999999999", "end_header"), "no vertex element"),
+    "list": (header("format ascii 1.0", "element vertex 1", "property list uchar float x", "end_header") + b"1 1\n", "list properties"),
+    "truncated": (header("format binary_little_endian 1.0", "element vertex 1000", F4, "end_header") + bytes(4 * 990 + 3), "10 of them are missing"),
+    "hostile": (header("format binary_little_endian 1.0", "element vertex 99999999999999", F4, "end_header") + bytes(8), "99,999,999,999,997"),
+    "hostile ascii": (header("format ascii 1.0", "element vertex 99999999999999", F4, "end_header") + b"1\n2\n", "are missing"),
+    "short ascii": (header("format ascii 1.0", "element vertex 2", F4, "end_header") + b"1.00\n", "damaged or truncated"),
+    "words": (header("format ascii 1.0", "element vertex 1", F4, "end_header") + b"one\n", "damaged or truncated"),
+    "too large": (header("format ascii 1.0", "element vertex 1", "property uchar x", "end_header") + b"300\n", "damaged or truncated"),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_refuses_malformed_files_in_one_sentence(tmp_path, case):
+    content, sentence = MALFORMED[case]
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(CheckpointError, match=sentence) as caught:
+        read_ply(tmp_path / "a.ply")
+    assert str(tmp_path / "a.ply") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_refuses_what_is_not_there(tmp_path):
+    with pytest.raises(CheckpointError, match="cannot be read: No such file"):
+        read_header(tmp_path / "none.ply")
+
+
+def test_writes_what_it_reads(tmp_path):
+    columns = {**splat_columns(9), "segment": np.arange(9, dtype=np.int32)}
+    columns["x"][0], columns["y"][0] = np.nan, -np.inf
+    file = read_ply(write_ply(tmp_path / "a.ply", columns, ["first", "Brüder\nsecond"]))
+    assert file.comments == ("first", "Br\\xfcder second")
+    assert {name: column.tobytes() for name, column in file.columns.items()} == {name: column.tobytes() for name, column in columns.items()}
+
+
+def test_does_not_overwrite_unless_told(tmp_path):
+    path = write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)})
+    with pytest.raises(OutputExists, match="--overwrite"):
+        write_ply(path, {"x": np.ones(1, np.float32)})
+    write_ply(path, {"x": np.ones(1, np.float32)}, overwrite=True)
+    assert read_ply(path).columns["x"].tolist() == [1]
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)})
+    old = path.read_bytes()
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ply_module.os, "fsync", full)
+    with pytest.raises(CheckpointError, match="cannot be written: No space left"):
+        write_ply(path, {"x": np.ones(1, np.float32)}, overwrite=True)
+    assert path.read_bytes() == old
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_refuses_comments_that_it_could_not_read_back(tmp_path):
+    with pytest.raises(SettingsError, match=re.escape("131,072")):
+        write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)}, ["x" * 140_000])
+    assert not list(tmp_path.iterdir())
+
+
+def test_reads_every_real_file_without_a_warning(shared_data):
+    files = sorted((shared_data / "checkpoints").rglob("*.ply"))
+    assert files
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for path in files:
+            file = read_ply(path)
+            assert len(file.columns["x"]) == read_header(path).vertex.count
+            assert not file.notes
