@@ -2,10 +2,10 @@
 
 import math
 
-import numba
 import numpy as np
 
-from mipmap_plugin.backends.cpu_kernels.records import FALL_X, FALL_Y, LOG_MIN_ALPHA, PEAK, REACH_Y, SHEAR, SLACK, TIP, X, Y
+from mipmap_plugin.backends.cpu_kernels import compiled
+from mipmap_plugin.backends.cpu_kernels.records import FALL_Y, LOG_MIN_ALPHA, PEAK, REACH_Y, SHEAR, SLACK, SPREAD, TIP, X, Y
 
 # px. Wide tiles: a splat is cut into few pieces, and the piece of a row is still exact. A tile's state fits a first-level cache.
 TILE_ROWS = 16
@@ -15,13 +15,13 @@ TILE_COLUMNS = 64
 _DIGIT = 11
 
 
-@numba.njit(cache=True)
+@compiled
 def tile_grid(width, height):
     """Columns and rows of tiles."""
     return -(-width // TILE_COLUMNS), -(-height // TILE_ROWS)
 
 
-@numba.njit(cache=True)
+@compiled
 def rows_of(table, i, first, last):
     """The pixel rows first..last that splat i touches. Clipped while still a float: no integer could hold every reach."""
     reach = table[i, REACH_Y] + SLACK
@@ -29,14 +29,14 @@ def rows_of(table, i, first, last):
     return int(min(max(low, first), last + 1.0)), int(max(min(high, last), first - 1.0))
 
 
-@numba.njit(cache=True)
+@compiled
 def half_width(table, i, dy):
     """px from the ridge to where alpha falls below 1/255, `dy` px from the center."""
     room = table[i, PEAK] - LOG_MIN_ALPHA - table[i, FALL_Y] * dy * dy
-    return math.sqrt(max(room, 0.0) / table[i, FALL_X]) + SLACK
+    return math.sqrt(max(room, 0.0) * table[i, SPREAD]) + SLACK
 
 
-@numba.njit(cache=True)
+@compiled
 def tile_columns(table, i, first, last, width):
     """The columns of tiles that splat i touches between the pixel rows first..last; none: the second is the smaller."""
     above, below = first + 0.5 - table[i, Y], last + 0.5 - table[i, Y]
@@ -50,7 +50,7 @@ def tile_columns(table, i, first, last, width):
     return int(low) // TILE_COLUMNS, int(high) // TILE_COLUMNS
 
 
-@numba.njit(cache=True)
+@compiled
 def count_tiles(table, i, width, height):
     """The number of tiles that splat i touches."""
     first, last = rows_of(table, i, 0, height - 1)
@@ -62,7 +62,7 @@ def count_tiles(table, i, width, height):
     return count
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@compiled
 def cover(start, stop, table, slots, width, height, tiles):
     """Write the tiles of the splats start..stop into their slots."""
     columns = tile_grid(width, height)[0]
@@ -79,7 +79,7 @@ def cover(start, stop, table, slots, width, height, tiles):
                 slot += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def depth_order(depths, counts):
     """Indices of the drawn splats, front to back; equal depths stay in order. A radix sort: positive floats sort as their bits do."""
     drawn = np.flatnonzero(counts)
@@ -98,7 +98,7 @@ def depth_order(depths, counts):
     return drawn
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def fill_lists(order, slots, tiles, tile_count):
     """Each tile's splats and their slots, front to back: starts [tiles + 1] into members [pairs] and their slots [pairs]."""
     starts = np.zeros(tile_count + 1, np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -71,22 +72,25 @@ def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
     left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
     across, down = FRUSTUM_MARGIN * (left + right) / 2, FRUSTUM_MARGIN * (top + bottom) / 2
-    viewmat = camera.viewmat.numpy()
+    rotation, translation = camera.viewmat[:3, :3].tolist(), camera.viewmat[:3, 3].tolist()
     return View(
-        rotation=np.ascontiguousarray(viewmat[:3, :3]),
-        translation=np.ascontiguousarray(viewmat[:3, 3]),
-        eye=camera.center.numpy(),
+        rotation=tuple(tuple(row) for row in rotation),
+        translation=tuple(translation),
+        eye=tuple(camera.center.tolist()),
         fx=float(camera.fx),
         fy=float(camera.fy),
         cx=float(camera.cx),
         cy=float(camera.cy),
-        slopes=np.array([-left - across, right + across, -top - down, bottom + down]),
+        left=-left - across,
+        right=right + across,
+        top=-top - down,
+        bottom=bottom + down,
         width=camera.width,
         height=camera.height,
         near=float(effects.near_plane),
         eps2d=float(effects.eps2d),
         antialiased=effects.screen_filter == "antialiased",
-        sh_degree=min(effects.sh_degree, int(splats.sh.shape[1] ** 0.5) - 1),
+        sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
     )
 
 

@@ -1,6 +1,6 @@
 """Real spherical harmonics up to degree 4 and their derivative, one direction at a time. Constants and order: PlenOctrees."""
 
-import numba
+from mipmap_plugin.backends.cpu_kernels import compiled
 
 MAX_BANDS = 25
 
@@ -13,7 +13,7 @@ C4 = (2.5033429417967046, -1.7701307697799304, 0.9461746957575601, -0.6690465435
       -0.6690465435572892, 0.47308734787878004, -1.7701307697799304, 0.6258357354491761)  # fmt: skip
 
 
-@numba.njit(cache=True)
+@compiled
 def basis(direction, degree, out):
     """Write the (degree + 1)² basis functions of a unit vector."""
     x, y, z = direction
@@ -35,7 +35,7 @@ def basis(direction, degree, out):
         out[24] = C4[8] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy))
 
 
-@numba.njit(cache=True)
+@compiled
 def slope(direction, degree, w):
     """The gradient of Σ w_j · basis_j with respect to the direction, before it is normalized."""
     x, y, z = direction

@@ -6,12 +6,14 @@ to all lanes. Nothing is reassociated, so that equal inputs give equal bits.
 """
 
 import operator
+from functools import partial
 
-import numba
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
+
+from mipmap_plugin.backends.cpu_kernels import compiled
 
 WIDTH = 16
 
@@ -63,6 +65,12 @@ def _lane_wise(emit, result=LANES):
     return typed
 
 
+def _call(name, builder, *vectors):
+    """LLVM's own function of that name for vectors."""
+    signature = ir.FunctionType(_FLOATS, [_FLOATS] * len(vectors))
+    return builder.call(cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{WIDTH}f32"), vectors)
+
+
 def _operator(symbol, emit, result=LANES):
     """Teach numba `symbol` for two operands of which at least one is lanes."""
     typed = _lane_wise(emit, result)
@@ -93,14 +101,19 @@ def both(_context, first, second):
 
 
 @intrinsic
-def any_of(_context, mask):
-    """Whether some lane of a mask is set."""
+def bits(_context, mask):
+    """A mask as an integer: bit k is lane k."""
 
     def generate(context, builder, signature, values):
-        bits = builder.bitcast(values[0], ir.IntType(WIDTH))
-        return builder.icmp_unsigned("!=", bits, ir.IntType(WIDTH)(0))
+        return builder.zext(builder.bitcast(values[0], ir.IntType(WIDTH)), ir.IntType(64))
 
-    return types.boolean(mask), generate
+    return types.int64(mask), generate
+
+
+@intrinsic
+def lowest(_context, bits):
+    """The place of the lowest bit that is set, for bits other than 0."""
+    return types.int64(bits), lambda context, builder, signature, values: builder.cttz(values[0], ir.IntType(1)(1))
 
 
 @intrinsic
@@ -117,17 +130,32 @@ def select(_context, mask, yes, no):
 @intrinsic
 def fma(_context, a, b, c):
     """a·b + c, rounded once where the processor can."""
-    def emit(builder, a, b, c):
-        signature = ir.FunctionType(_FLOATS, [_FLOATS] * 3)
-        return builder.call(cgutils.get_or_insert_function(builder.module, signature, f"llvm.fmuladd.v{WIDTH}f32"), [a, b, c])
-
-    return _lane_wise(emit)(a, b, c)
+    return _lane_wise(partial(_call, "fmuladd"))(a, b, c)
 
 
 @intrinsic
 def minimum(_context, a, b):
-    typed = _lane_wise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
-    return typed(a, b)
+    return _lane_wise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))(a, b)
+
+
+@intrinsic
+def maximum(_context, a, b):
+    return _lane_wise(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))(a, b)
+
+
+@intrinsic
+def sqrt(_context, a):
+    return _lane_wise(partial(_call, "sqrt"))(a)
+
+
+@intrinsic
+def floor(_context, a):
+    return _lane_wise(partial(_call, "floor"))(a)
+
+
+@intrinsic
+def ceil(_context, a):
+    return _lane_wise(partial(_call, "ceil"))(a)
 
 
 @intrinsic
@@ -172,6 +200,24 @@ def store(_context, array, index, lanes):
 
 
 @intrinsic
+def prefetch(_context, array, row):
+    """Ask for array[row] of a contiguous array [n, m], so that it is at hand a little later."""
+
+    def generate(context, builder, signature, values):
+        kind = signature.args[0]
+        record = context.make_array(kind)(context, builder, values[0])
+        columns = builder.extract_value(record.shape, 1)
+        place = builder.bitcast(builder.gep(record.data, [builder.mul(values[1], columns)]), cgutils.voidptr_t)
+        number = ir.IntType(32)
+        signature = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
+        function = cgutils.get_or_insert_function(builder.module, signature, "llvm.prefetch.p0")
+        builder.call(function, [place, number(0), number(3), number(1)])  # to read, into every cache, as data
+        return context.get_dummy_value()
+
+    return types.void(array, row), generate
+
+
+@intrinsic
 def total(_context, lanes):
     """The sum of all lanes, halves first: the same order on every processor."""
 
@@ -202,7 +248,7 @@ def _add_to_exponent(_context, lanes, rounded):
 _ROUNDER = 12582912.0
 
 
-@numba.njit(cache=True)
+@compiled
 def exp2(power):
     """2^power to 1e-7 for -126 < power < 127; outside, anything. numba's own exponentials are scalar."""
     rounded = power + _ROUNDER

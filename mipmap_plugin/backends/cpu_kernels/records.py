@@ -6,18 +6,24 @@ from typing import NamedTuple
 
 import numpy as np
 
+Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+
 
 class View(NamedTuple):
-    """A camera and the effects that concern a splat. Lengths in px or world units, all float64."""
+    """A camera and the effects that concern a splat. Numbers alone, no arrays."""
 
-    rotation: np.ndarray  # [3, 3] world to camera
-    translation: np.ndarray  # [3]
-    eye: np.ndarray  # [3] world
+    rotation: Matrix  # world to camera
+    translation: Vector
+    eye: Vector  # world
     fx: float
     fy: float
     cx: float
     cy: float
-    slopes: np.ndarray  # [4] least x/z, most x/z, least y/z, most y/z at which the Jacobian is frozen
+    left: float  # least x/z
+    right: float  # most x/z
+    top: float  # least y/z
+    bottom: float  # most y/z at which the Jacobian is not yet frozen
     width: int
     height: int
     near: float
@@ -43,6 +49,7 @@ X, Y, SHEAR, FALL_Y, FALL_X, PEAK = range(6)
 RED, GREEN, BLUE = 6, 7, 8
 REACH_Y = 9  # px from Y to the last row where alpha reaches 1/255
 TIP = 10  # px from Y to the row where the splat reaches furthest right; as far the other way, furthest left
+SPREAD = 11  # 1 / FALL_X
 COLUMNS = 16  # one cache line
 
 # Columns of the gradient table, one row per (splat, tile): sums over the tile's pixels of s = alpha · dLoss/dalpha times 1, u, dy,
