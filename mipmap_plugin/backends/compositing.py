@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from mipmap_plugin.backends.filters import Footprint
 from mipmap_plugin.camera import Camera
 
 # The published constants (diff-gaussian-rasterization, forward.cu).
@@ -41,7 +40,8 @@ def composite(splats: Splats, extents: Tensor, camera: Camera) -> tuple[Tensor, 
     """Front-to-back over black: color [H, W, 3] and transmittance [H, W]. `extents` [M, 2]: half-sizes in px."""
     columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
     starts, members = bin_tiles(splats.means2d, extents, columns, rows)
-    color = splats.colors.new_zeros(rows * columns, TILE * TILE, 3)
+    # The empty sum ties the image to the splats even where none is drawn: its gradient is then 0, not an error.
+    color = splats.colors[:0].sum() + splats.colors.new_zeros(rows * columns, TILE * TILE, 3)
     through = splats.colors.new_ones(rows * columns, TILE * TILE)
     tensors = (splats.means2d, splats.feet, splats.colors)
     for tiles, ids in _batches(starts, members):

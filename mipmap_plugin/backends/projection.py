@@ -30,7 +30,8 @@ class Projected:
 def project(gaussians: Gaussians, camera: Camera, near: float) -> Projected:
     """Means, depths and covariances on the image plane. Splats nearer than `near` get finite values of no meaning."""
     viewmat = camera.viewmat.to(gaussians.means)
-    in_camera = gaussians.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    # Eye first: in a world far from its origin the rounding of rotation · mean + translation is larger than a pixel.
+    in_camera = (gaussians.means - camera.center.to(viewmat)) @ viewmat[:3, :3].T
     depths = in_camera[:, 2]
     safe = depths.clamp_min(near)
     slopes = in_camera[:, :2] / safe[:, None]

@@ -1,0 +1,192 @@
+"""The hard cases, as a table: name -> a builder of Gaussians in float64, a camera and effects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields, replace
+from functools import partial
+from itertools import product
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.backends.projection import rotations
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import DILATION, Effects
+from mipmap_plugin.gaussians import Gaussians
+
+NEAR = 0.25  # world units; unlike 0.2 the same number in float32, so that "on the near plane" means one thing
+
+
+class HardCase(NamedTuple):
+    """What a backend is asked to render."""
+
+    gaussians: Gaussians  # float64
+    camera: Camera
+    effects: Effects
+
+
+Builder = Callable[[], HardCase]
+
+
+def view(width: int = 24, height: int = 18, *, cx: float | None = None, turned: bool = False) -> Camera:
+    """From the origin along +z with fx != fy. Not turned, a splat's depth is its z, bit by bit."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    if turned:
+        viewmat[:3, :3] = rotations(torch.tensor([[1.0, 0.03, -0.06, 0.1]], dtype=torch.float64))[0]
+        viewmat[:3, 3] = torch.tensor([0.1, -0.05, 0.2])
+    return Camera(width, height, 27.0, 25.0, width / 2 if cx is None else cx, height / 2, viewmat)
+
+
+def crowd(n: int = 12, degree: int = 1, seed: int = 0) -> Gaussians:
+    """Ordinary splats in front of `view()`, a few beside it; faint to nearly opaque, no two axes of the same length."""
+    rng = torch.Generator().manual_seed(seed)
+    spread = partial(torch.rand, generator=rng, dtype=torch.float64)
+    means = (spread(n, 3) - 0.5) * torch.tensor([3.0, 2.4, 3.0]) + torch.tensor([0.0, 0.0, 3.0])
+    scales = 0.02 + 0.3 * spread(n, 3) ** 2
+    return Gaussians(means, spread(n, 4) - 0.5, scales, 0.05 + 0.9 * spread(n), spread(n, (degree + 1) ** 2, 3) - 0.3)
+
+
+def covariances(gaussians: Gaussians) -> Tensor:
+    """[N, 3, 3], the same shapes as the quaternions and scales."""
+    factor = rotations(gaussians.quats) * gaussians.scales[:, None, :]
+    return factor @ factor.mT
+
+
+def odd_row(row: dict[str, Tensor], screen_filter: str = "classic") -> HardCase:
+    """A crowd in which one splat is the hard one: what it does to itself, and to the others."""
+    gaussians = crowd()
+    row = {**_row(means=(0.1, 0.05, 2.5)), **row}
+    held = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
+    held = {name: tensor if name not in row else tensor.index_put((torch.tensor(5),), row[name]) for name, tensor in held.items()}
+    return HardCase(Gaussians(**held), view(), Effects(1, screen_filter, near_plane=NEAR))
+
+
+def seen_by(camera: Camera) -> HardCase:
+    return HardCase(crowd(), camera, Effects(1, background=(0.2, 0.5, 0.9)))
+
+
+def of_degree(degree: int, evaluated: int) -> HardCase:
+    return HardCase(crowd(degree=degree), view(turned=True), Effects(evaluated))
+
+
+def random_scene(seed: int, screen_filter: str, eps2d: float, degree: int = 3) -> HardCase:
+    return HardCase(crowd(120, degree, seed), view(40, 32, turned=True), Effects(degree, screen_filter, eps2d, (1.0, 1.0, 1.0)))
+
+
+def covariances_given(screen_filter: str, broken: bool = False) -> HardCase:
+    gaussians = crowd()
+    given = covariances(gaussians)
+    if broken:
+        given[5, 0, 0] = math.nan
+    return HardCase(replace(gaussians, covariances=given), view(turned=True), Effects(1, screen_filter))
+
+
+def none_drawn(n: int) -> HardCase:
+    """No splat at all, or all of them behind the camera: the background, and a gradient that is 0."""
+    gaussians = crowd(max(n, 1))
+    return HardCase(replace(gaussians, means=-gaussians.means)[torch.arange(n)], view(), Effects(1, background=(1.0, 1.0, 1.0)))
+
+
+def first_of_the_crowd(rows: list[int]) -> HardCase:
+    return HardCase(crowd()[torch.tensor(rows)], view(), Effects(1))
+
+
+def at_one_depth(n: int = 2000) -> HardCase:
+    """Ties: the splat with the lower index is in front."""
+    gaussians = crowd(n)
+    gaussians.means[:, 2] = 3
+    return HardCase(replace(gaussians, scales=gaussians.scales / 4), view(), Effects(1))
+
+
+def in_one_pixel(n: int = 2000) -> HardCase:
+    """Opaque specks, one behind the other, each somewhere in the same pixel."""
+    gaussians = crowd(n)
+    camera = view(16, 16)
+    depths = 1 + torch.arange(n, dtype=torch.float64) / n
+    inside = gaussians.means[:, :2] / torch.tensor([3.0, 2.4]) + 0.5  # px, 0..1 from the corner of pixel (8, 8)
+    means = torch.stack([inside[:, 0] / camera.fx * depths, inside[:, 1] / camera.fy * depths, depths], -1)
+    specks = replace(gaussians, means=means, scales=gaussians.scales / 100, opacities=torch.ones_like(gaussians.opacities))
+    return HardCase(specks, camera, Effects(1))
+
+
+def far_from_the_origin(shift: float = 1e6, size: float = 64.0) -> HardCase:
+    """A world so far out that float32 knows its places to 1/16 unit: eye and splats must be subtracted before anything else."""
+    gaussians, camera = crowd(), view(turned=True)
+    eye = torch.full((3,), shift, dtype=torch.float64)
+    viewmat = camera.viewmat.clone()
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    gaussians = replace(gaussians, means=gaussians.means * size + eye, scales=gaussians.scales * size)
+    return HardCase(gaussians, camera.looking_from(viewmat, ""), Effects(1))
+
+
+def _row(**values: tuple[float, ...] | float) -> dict[str, Tensor]:
+    return {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
+
+
+TURN = (0.8, 0.1, -0.3, 0.5)  # an ordinary quaternion, almost of norm 1
+WIDE = (0.9, 0.7, 0.5)  # many pixels lie so near the centre that an opaque splat's alpha is cut off at 0.99 there
+
+# One splat of a crowd. Near plane: NEAR. Eye: the origin.
+ROWS = {
+    "on-the-near-plane": _row(means=(0.02, 0.01, NEAR), scales=(0.05, 0.04, 0.03)),
+    "just-in-front-of-the-near-plane": _row(means=(0.02, 0.01, NEAR + 1e-6), scales=(0.05, 0.04, 0.03)),
+    "just-behind-the-near-plane": _row(means=(0.02, 0.01, NEAR - 1e-6), scales=(0.05, 0.04, 0.03)),
+    "straddling-the-near-plane": _row(means=(0.1, 0.1, 0.4), scales=(0.2, 0.3, 0.4)),
+    "behind-the-camera": _row(means=(0.1, 0.1, -2.0), scales=(0.5, 0.4, 0.3)),
+    "camera-inside-the-splat": _row(means=(0.05, -0.1, 0.3), scales=(2.0, 1.5, 1.0)),
+    "in-the-eye": _row(means=(0.0, 0.0, 0.0)),
+    "center-off-screen-body-on": _row(means=(-1.9, 0.1, 3.0), scales=(0.6, 0.3, 0.2)),
+    "center-beyond-the-frustum-body-on": _row(means=(4.0, 2.5, 3.0), scales=(1.9, 1.4, 1.2)),
+    "1e6-units-ahead": _row(means=(3e4, 2e4, 1e6), scales=(1e5, 7e4, 5e4)),
+    "scale-0-on-one-axis": _row(scales=(0.3, 0.2, 0.0)),
+    "scale-0-on-two-axes": _row(scales=(0.3, 0.0, 0.0)),
+    "scale-0-on-three-axes": _row(scales=(0.0, 0.0, 0.0)),
+    "scale-1e-9": _row(scales=(1e-9, 2e-9, 3e-9)),
+    "scale-1e4": _row(scales=(1e4, 2e4, 3e4)),
+    "needle-1e12": _row(scales=(1e3, 1e-3, 2e-3), quats=TURN),
+    "disc-1e12": _row(scales=(1e3, 2e3, 1e-3), quats=TURN),
+    "quaternion-0": _row(quats=(0.0, 0.0, 0.0, 0.0)),
+    "quaternion-norm-1e-3": _row(quats=tuple(1e-3 * q for q in TURN)),
+    "quaternion-norm-1e3": _row(quats=tuple(1e3 * q for q in TURN)),
+    "opacity-0": _row(opacities=0.0),
+    "opacity-1": _row(opacities=1.0, scales=WIDE),
+    "opacity-1-1e-7": _row(opacities=1 - 1e-7, scales=WIDE),
+    "opacity-logit-80": _row(opacities=1 / (1 + math.exp(-80)), scales=WIDE),
+    "opacity-logit--80": _row(opacities=1 / (1 + math.exp(80))),
+    "negative-color": _row(sh=-1e3),
+    "saturated-color": _row(sh=1e3),
+}
+FIELDS = ("means", "quats", "scales", "opacities", "sh")
+FILTERS = ("classic", "antialiased")
+
+CASES: dict[str, Builder] = {
+    **{f"{name}-{kind}": partial(odd_row, row, kind) for (name, row), kind in product(ROWS.items(), FILTERS)},
+    **{f"{bad}-in-{field}": partial(odd_row, _row(**{field: bad})) for field, bad in product(FIELDS, (math.nan, math.inf))},
+    "no-splat": partial(none_drawn, 0),
+    "no-splat-in-view": partial(none_drawn, 5),
+    "one-splat": partial(first_of_the_crowd, [4]),
+    "identical-splats": partial(first_of_the_crowd, [4, 4, 4]),
+    "2000-at-one-depth": at_one_depth,
+    "2000-opaque-in-one-pixel": in_one_pixel,
+    "1e6-units-from-the-origin": far_from_the_origin,
+    "image-1x1": partial(seen_by, view(1, 1)),
+    "image-1xN": partial(seen_by, view(1, 37)),
+    "image-Nx1": partial(seen_by, view(37, 1)),
+    "image-of-whole-tiles": partial(seen_by, view(32, 16)),
+    "image-not-of-whole-tiles": partial(seen_by, view(33, 17)),
+    "zoom-0.37": partial(seen_by, view().zoomed(0.37)),
+    "zoom-1/64": partial(seen_by, view().zoomed(1 / 64)),
+    "zoom-64": partial(seen_by, view().resized(4, 3).zoomed(64)),
+    "principal-point-outside": partial(seen_by, view(cx=-9.0)),
+    **{f"sh-degree-{degree}": partial(of_degree, degree, degree) for degree in range(5)},
+    "sh-bands-left-out": partial(of_degree, 3, 1),
+    **{f"covariances-{kind}": partial(covariances_given, kind) for kind in FILTERS},
+    "nan-in-covariances": partial(covariances_given, "classic", broken=True),
+    **{
+        f"random-{seed}-{kind}-{eps2d:.2g}": partial(random_scene, seed, kind, eps2d)
+        for seed, kind, eps2d in product((1, 2), FILTERS, (DILATION, DILATION / 64))
+    },
+}

@@ -1,0 +1,33 @@
+"""A pytest suite for the authors of backends. This module alone needs pytest."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mipmap_plugin.backends.base import API_VERSION, Backend
+from mipmap_plugin.backends.conformance.cases import CASES
+from mipmap_plugin.backends.conformance.checks import check_case
+
+
+class BackendSuite:
+    """Subclass it in a test file, and pytest checks your backend against the reference::
+
+        class TestMine(BackendSuite):
+            backend = MyBackend()
+    """
+
+    backend: Backend
+    dtype: torch.dtype = torch.float32
+    device: str = "cpu"
+
+    def test_declares_itself(self):
+        assert self.backend.name and isinstance(self.backend.speed, int)
+        assert self.backend.api_version == API_VERSION
+
+    @pytest.mark.parametrize("case", CASES)
+    def test_equals_the_reference(self, case):
+        outcome = check_case(self.backend, case, CASES[case], dtype=self.dtype, device=self.device)
+        if outcome.skipped:
+            pytest.skip(outcome.message)
+        assert outcome.passed, outcome.message

@@ -1,0 +1,161 @@
+"""Every backend on every hard case, and the suite itself on backends that are wrong on purpose."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import pytest
+import torch
+
+from mipmap_plugin.backends import reference
+from mipmap_plugin.backends.base import Capabilities, Rendered
+from mipmap_plugin.backends.conformance import CASES, TOLERANCE, check_backend
+from mipmap_plugin.backends.conformance.cases import random_scene
+from mipmap_plugin.backends.conformance.suite import BackendSuite
+from mipmap_plugin.backends.conformance.tolerance import PIXEL_BAND, differing_gradients, differing_images
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.errors import SettingsError
+
+CPU = "mipmap_plugin.backends.cpu"
+MISSING = next((name for name in ("numba", CPU) if importlib.util.find_spec(name) is None), None)
+SINGLE = TOLERANCE[torch.float32]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Tensors this small cost more to share out than to compute."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+class TestReference(BackendSuite):
+    backend = ReferenceBackend()
+
+
+@pytest.mark.skipif(MISSING is not None, reason=f"{MISSING} is not there")
+class TestCpu(BackendSuite):
+    if MISSING is None:
+        backend = importlib.import_module(CPU).CpuBackend()
+
+
+class LongGradients(ReferenceBackend):
+    """Right images, gradients 1 % too long: too little for a bound on each entry alone if that had to allow for cut-offs."""
+
+    def render(self, gaussians, camera, effects):
+        rendered = super().render(gaussians, camera, effects)
+        return Rendered(*(1.01 * part - 0.01 * part.detach() for part in (rendered.image, rendered.alpha)))
+
+
+class BackToFront(ReferenceBackend):
+    def render(self, gaussians, camera, effects):
+        right = reference.drawn_rows
+        with mock.patch.object(reference, "drawn_rows", lambda *scene: right(*scene).flip(0)):
+            return super().render(gaussians, camera, effects)
+
+
+class SpreadsNan(ReferenceBackend):
+    """One broken splat blackens the image, as it does in rasterizers that multiply before they test."""
+
+    def render(self, gaussians, camera, effects):
+        rendered = super().render(gaussians, camera, effects)
+        return replace(rendered, image=rendered.image + 0 * gaussians.opacities.sum())
+
+
+class Raises(ReferenceBackend):
+    def render(self, gaussians, camera, effects):
+        if len(gaussians) == 0:
+            raise IndexError("no splats")
+        return super().render(gaussians, camera, effects)
+
+
+class WithoutGradients(ReferenceBackend):
+    capabilities = Capabilities(None, frozenset({torch.float32}), frozenset({"classic"}), gradients=False)
+
+    def render(self, gaussians, camera, effects):
+        with torch.no_grad():
+            return super().render(gaussians, camera, effects)
+
+
+FEW = {name: CASES[name] for name in ("no-splat", "one-splat", "sh-degree-1", "nan-in-opacities", "random-1-antialiased-0.3")}
+
+
+def failed(backend):
+    return {outcome.case: outcome.message for outcome in check_backend(backend, FEW) if not outcome.passed}
+
+
+def test_gradients_one_percent_too_long_are_caught():
+    wrong = failed(LongGradients())
+    assert set(wrong) == set(FEW) - {"no-splat"}
+    assert all("gradient of means" in message and "image" not in message for message in wrong.values())
+
+
+def test_the_wrong_order_is_caught():
+    wrong = failed(BackToFront())
+    assert set(wrong) == {"sh-degree-1", "nan-in-opacities", "random-1-antialiased-0.3"}
+    assert "image, pixels:" in wrong["sh-degree-1"]
+
+
+def test_nan_in_one_case_is_caught():
+    outcomes = {outcome.case: outcome for outcome in check_backend(SpreadsNan(), FEW)}
+    assert [name for name, outcome in outcomes.items() if not outcome.passed] == ["nan-in-opacities"]
+    assert not outcomes["nan-in-opacities"].finite
+    assert "image: 1296 of 1296 values are not finite" in outcomes["nan-in-opacities"].message
+
+
+def test_an_exception_fails_its_case_only():
+    assert failed(Raises()) == {"no-splat": "IndexError: no splats"}
+
+
+def test_what_a_backend_lacks_is_skipped_with_its_reason():
+    outcomes = {outcome.case: outcome for outcome in check_backend(WithoutGradients(), FEW)}
+    skipped = [outcome.case for outcome in outcomes.values() if outcome.skipped]
+    assert skipped == ["random-1-antialiased-0.3"]
+    assert "screen filters classic, not antialiased" in outcomes[skipped[0]].message
+    assert all(outcome.passed for outcome in outcomes.values())
+
+
+def test_a_dtype_without_tolerances_is_refused():
+    with pytest.raises(SettingsError, match=r"no tolerances for torch\.float16"):
+        check_backend(ReferenceBackend(), FEW, dtype=torch.float16)
+
+
+def test_cut_offs_forgive_few_pixels_and_little():
+    expected = torch.full((40, 32, 3), 0.5, dtype=torch.float64)
+    few, many, much = expected.clone(), expected.clone(), expected.clone()
+    few[7, :2, 1] += 1 / 255
+    many[7, :4, 1] += 1 / 255
+    much[7, 3, 1] += 1.1 * PIXEL_BAND
+    assert differing_images("image", few, expected, SINGLE) == []
+    assert "4 of 1280 differ" in differing_images("image", many, expected, SINGLE)[0]
+    assert differing_images("image", much, expected, SINGLE) == [
+        "image, pixels: 1 of 1280 differ, the worst by 1.11e-02 at row 7, column 3: [0.5, 0.51111, 0.5] instead of [0.5, 0.5, 0.5]"
+    ]
+
+
+def test_many_small_faults_do_not_hide_in_a_large_row():
+    expected = torch.ones(200, 3, dtype=torch.float64)
+    expected[0] = 100
+    wrong = expected.clone()
+    wrong[50:60] *= 1.1
+    assert "10 of 200 differ, the worst by 1.00e-01 at 50" in differing_gradients("means", wrong, expected, SINGLE)[0]
+
+
+def test_builders_give_the_same_case_each_time():
+    first, second = random_scene(1, "classic", 0.3), random_scene(1, "classic", 0.3)
+    assert torch.equal(first.gaussians.means, second.gaussians.means) and torch.equal(first.gaussians.sh, second.gaussians.sh)
+
+
+def test_the_example_runs_where_pytest_is_missing():
+    root = Path(__file__).parents[1]
+    run = "import runpy, sys; sys.modules['pytest'] = None; runpy.run_path('examples/register_backend.py', run_name='__main__')"
+    environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", run], cwd=root, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.rstrip().endswith(" 0 failed"), done.stdout + done.stderr
