@@ -8,6 +8,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.filters import SCREEN_FILTERS
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
@@ -23,7 +24,7 @@ class CpuBackend:
     api_version = API_VERSION
     speed = 10
     capabilities = Capabilities(
-        devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased"})
+        devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=SCREEN_FILTERS
     )
 
     def lacking(self, needs: Needs) -> list[str]:
@@ -40,22 +41,30 @@ class CpuBackend:
         return Rendered(image, alpha)
 
 
+def _drawing():
+    """The kernels. Imported at use: without numba this module still tells what is missing."""
+    try:
+        from mipmap_plugin.backends.cpu_kernels import drawing
+    except RuntimeError as error:
+        if "cannot cache" not in str(error):
+            raise
+        raise BackendUnavailable("numba finds no folder to keep compiled code in: set NUMBA_CACHE_DIR to one that can be written") from error
+    return drawing
+
+
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(ctx, camera, effects, *tensors):
-        from mipmap_plugin.backends.cpu_kernels import drawing
-
-        image, ctx.drawing = drawing.draw(drawing.splats_of(tensors), camera, effects)
+        drawing = _drawing()
+        image, ctx.drawing = drawing.draw(drawing.splats_of(*tensors), camera, effects)
         ctx.save_for_backward(*tensors)
         return torch.from_numpy(image), 1 - torch.from_numpy(ctx.drawing.through)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_image, d_alpha):
-        from mipmap_plugin.backends.cpu_kernels import drawing
-
-        splats = drawing.splats_of(ctx.saved_tensors)
-        grads = drawing.draw_back(ctx.drawing, splats, d_image.contiguous().numpy(), d_alpha.contiguous().numpy())
-        # The way of giving a shape that was not taken has no rows: no gradient.
-        known = [torch.from_numpy(grad) if len(grad) == len(splats.means) else None for grad in grads]
-        return None, None, *(known if len(splats.means) else (None,) * len(known))
+        drawing, tensors = _drawing(), ctx.saved_tensors
+        grads = drawing.draw_back(ctx.drawing, drawing.splats_of(*tensors), d_image.contiguous().numpy(), d_alpha.contiguous().numpy())
+        # Of the two ways to give a shape, the one that was not taken has no gradient, and no rows.
+        pairs = zip(tensors, grads, strict=True)
+        return None, None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in pairs)

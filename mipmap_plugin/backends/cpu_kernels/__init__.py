@@ -1,10 +1,31 @@
 """The compiled half of the CPU backend, and the only place that imports numba.
 
-What numba counts references of (arrays, and records that hold some) is taken apart where a kernel begins: a count is an atomic
-operation, and one for each splat costs more than all of its geometry. Inside, numbers travel alone or in tuples.
+numba counts references of arrays, and of records that hold some; each count is an atomic operation, and a few for every splat cost
+more than all of its geometry. So arrays are taken out of their records where a kernel begins, and inside it numbers travel alone or
+in tuples.
 """
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
 import numba
 
-# Division by zero gives infinity as in numpy; the kernels' callers run them side by side in threads.
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+# What Python calls: kept compiled on disk, and run side by side in threads. Division by zero gives infinity, as in numpy.
+kernel: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+# What only kernels call: without a way in from Python it compiles faster, and called from there it crashes.
+inner: Any = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # type: ignore[call-overload]
+
+
+def _forget_stale() -> None:
+    """Drop machine code older than any source here: numba looks only at the file of a kernel itself, not at those that it calls."""
+    folder = Path(__file__).parent
+    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
+    for index in folder.glob("__pycache__/*.nbi"):
+        with suppress(OSError):  # another process may be quicker; in a folder that cannot be written numba keeps none
+            if index.stat().st_mtime < newest:
+                index.unlink()
+
+
+_forget_stale()

@@ -4,53 +4,59 @@ import math
 
 import numpy as np
 
-from mipmap_plugin.backends.cpu_kernels import compiled
-from mipmap_plugin.backends.cpu_kernels.records import FALL_Y, LOG_MIN_ALPHA, PEAK, REACH_Y, SHEAR, SLACK, SPREAD, TIP, X, Y
+from mipmap_plugin.backends.compositing import MIN_ALPHA
+from mipmap_plugin.backends.cpu_kernels import columns as col
+from mipmap_plugin.backends.cpu_kernels import inner, kernel
 
 # px. Wide tiles: a splat is cut into few pieces, and the piece of a row is still exact. A tile's state fits a first-level cache.
 TILE_ROWS = 16
 TILE_COLUMNS = 64
 
+# Rows and columns this close to a splat's edge are visited too: rounding must not lose a pixel that passes the alpha test.
+SLACK = 0.01  # px
+
+LOG_MIN_ALPHA = math.log2(MIN_ALPHA)
+
 # Bits of a depth sorted at a time.
 _DIGIT = 11
 
 
-@compiled
+@kernel
 def tile_grid(width, height):
     """Columns and rows of tiles."""
     return -(-width // TILE_COLUMNS), -(-height // TILE_ROWS)
 
 
-@compiled
+@inner
 def rows_of(table, i, first, last):
     """The pixel rows first..last that splat i touches. Clipped while still a float: no integer could hold every reach."""
-    reach = table[i, REACH_Y] + SLACK
-    low, high = math.ceil(table[i, Y] - 0.5 - reach), math.floor(table[i, Y] - 0.5 + reach)
+    reach = table[i, col.REACH_Y] + SLACK
+    low, high = math.ceil(table[i, col.Y] - 0.5 - reach), math.floor(table[i, col.Y] - 0.5 + reach)
     return int(min(max(low, first), last + 1.0)), int(max(min(high, last), first - 1.0))
 
 
-@compiled
+@inner
 def half_width(table, i, dy):
     """px from the ridge to where alpha falls below 1/255, `dy` px from the center."""
-    room = table[i, PEAK] - LOG_MIN_ALPHA - table[i, FALL_Y] * dy * dy
-    return math.sqrt(max(room, 0.0) * table[i, SPREAD]) + SLACK
+    room = table[i, col.PEAK] - LOG_MIN_ALPHA - table[i, col.FALL_Y] * dy * dy
+    return math.sqrt(max(room, 0.0) * table[i, col.SPREAD]) + SLACK
 
 
-@compiled
+@inner
 def tile_columns(table, i, first, last, width):
     """The columns of tiles that splat i touches between the pixel rows first..last; none: the second is the smaller."""
-    above, below = first + 0.5 - table[i, Y], last + 0.5 - table[i, Y]
-    right_most = min(max(table[i, TIP], above), below)
-    left_most = min(max(-table[i, TIP], above), below)
-    right = table[i, X] + table[i, SHEAR] * right_most + half_width(table, i, right_most) - 0.5
-    left = table[i, X] + table[i, SHEAR] * left_most - half_width(table, i, left_most) - 0.5
+    above, below = first + 0.5 - table[i, col.Y], last + 0.5 - table[i, col.Y]
+    right_most = min(max(table[i, col.TIP], above), below)
+    left_most = min(max(-table[i, col.TIP], above), below)
+    right = table[i, col.X] + table[i, col.SHEAR] * right_most + half_width(table, i, right_most) - 0.5
+    left = table[i, col.X] + table[i, col.SHEAR] * left_most - half_width(table, i, left_most) - 0.5
     low, high = math.ceil(max(left, 0.0)), math.floor(min(right, width - 1.0))
     if low > high:
         return 0, -1
     return int(low) // TILE_COLUMNS, int(high) // TILE_COLUMNS
 
 
-@compiled
+@inner
 def count_tiles(table, i, width, height):
     """The number of tiles that splat i touches."""
     first, last = rows_of(table, i, 0, height - 1)
@@ -62,7 +68,7 @@ def count_tiles(table, i, width, height):
     return count
 
 
-@compiled
+@kernel
 def cover(start, stop, table, slots, width, height, tiles):
     """Write the tiles of the splats start..stop into their slots."""
     columns = tile_grid(width, height)[0]
@@ -79,7 +85,7 @@ def cover(start, stop, table, slots, width, height, tiles):
                 slot += 1
 
 
-@compiled
+@kernel
 def depth_order(depths, counts):
     """Indices of the drawn splats, front to back; equal depths stay in order. A radix sort: positive floats sort as their bits do."""
     drawn = np.flatnonzero(counts)
@@ -98,7 +104,7 @@ def depth_order(depths, counts):
     return drawn
 
 
-@compiled
+@kernel
 def fill_lists(order, slots, tiles, tile_count):
     """Each tile's splats and their slots, front to back: starts [tiles + 1] into members [pairs] and their slots [pairs]."""
     starts = np.zeros(tile_count + 1, np.int64)

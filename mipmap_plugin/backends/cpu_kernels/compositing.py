@@ -3,17 +3,35 @@
 A tile's pixels lie in planes of TILE_ROWS rows, each WIDTH longer than the tile, so that no run of 16 lanes needs an end of its own.
 """
 
+# numba gives calls and operators a meaning of its own.
+# mypy: ignore-errors
+
 import numpy as np
 
-from mipmap_plugin.backends.cpu_kernels import compiled
-from mipmap_plugin.backends.cpu_kernels.binning import TILE_COLUMNS, TILE_ROWS, tile_grid
+from mipmap_plugin.backends.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
+from mipmap_plugin.backends.cpu_kernels import columns as col
+from mipmap_plugin.backends.cpu_kernels import inner, kernel
+from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, SLACK, TILE_COLUMNS, TILE_ROWS, tile_grid
 from mipmap_plugin.backends.cpu_kernels.lanes import (
-    WIDTH, bits, both, ceil, exp2, floor, fma, load, lowest, maximum, minimum, prefetch, ramp, select, spread, sqrt, store, total,
-)  # fmt: skip
-from mipmap_plugin.backends.cpu_kernels.records import (
-    BLUE, FALL_X, FALL_Y, GREEN, LOG_MIN_ALPHA, MAX_ALPHA, MIN_TRANSMITTANCE, PEAK, PULLS, RED, SHEAR, SLACK, SPREAD,
-    SUM, SUM_U, SUM_UU, SUM_UY, SUM_Y, SUM_YY, X, Y,
-)  # fmt: skip
+    WIDTH,
+    bits,
+    both,
+    ceil,
+    exp2,
+    floor,
+    fma,
+    load,
+    lowest,
+    maximum,
+    minimum,
+    prefetch,
+    ramp,
+    select,
+    spread,
+    sqrt,
+    store,
+    total,
+)
 
 STRIDE = TILE_COLUMNS + WIDTH
 PLANE = TILE_ROWS * STRIDE
@@ -35,7 +53,7 @@ PATIENCE = 16
 AHEAD = 4
 
 
-@compiled
+@inner
 def bounds(tile, width, height):
     """Left, top, columns and rows of a tile, px."""
     across, _ = tile_grid(width, height)
@@ -43,15 +61,15 @@ def bounds(tile, width, height):
     return left, top, min(TILE_COLUMNS, width - left), min(TILE_ROWS, height - top)
 
 
-@compiled
+@inner
 def trace(table, i, box, state):
     """Where splat i crosses the rows of a tile: a bit for each row that it lights, and into `state` at row r, from BEGIN on, the
     first column, the last column, the column of the ridge, and log2 alpha on the ridge."""
     left, top, columns, rows = box
-    dy = ramp(top + 0.5 - table[i, Y])
-    ridge = fma(dy, table[i, SHEAR], table[i, X] - left - 0.5)
-    peak = fma(dy * dy, -table[i, FALL_Y], table[i, PEAK])
-    half = sqrt(maximum(peak - LOG_MIN_ALPHA, 0) * table[i, SPREAD]) + SLACK
+    dy = ramp(top + 0.5 - table[i, col.Y])
+    ridge = fma(dy, table[i, col.SHEAR], table[i, col.X] - left - 0.5)
+    peak = fma(dy * dy, -table[i, col.FALL_Y], table[i, col.PEAK])
+    half = sqrt(maximum(peak - LOG_MIN_ALPHA, 0) * table[i, col.SPREAD]) + SLACK
     begin, end = maximum(ceil(ridge - half), 0), minimum(floor(ridge + half), columns - 1)
     store(state, BEGIN, begin)
     store(state, END, end)
@@ -60,7 +78,7 @@ def trace(table, i, box, state):
     return bits(both(peak >= LOG_MIN_ALPHA, end >= begin)) & ((1 << rows) - 1)
 
 
-@compiled
+@kernel
 def composite(start, stop, table, starts, members, background, image, through, stops):
     """Render the tiles start..stop: image [H, W, 3], transmittance [H, W] and, at each pixel, its place in the list when it stopped."""
     height, width = through.shape
@@ -78,7 +96,7 @@ def composite(start, stop, table, starts, members, background, image, through, s
         finish(box, state, background, image, through, stops)
 
 
-@compiled
+@inner
 def begin(box, length, state):
     """An empty tile. Light below 0: a pixel that is finished, as all outside the image are from the start."""
     _, _, columns, rows = box
@@ -89,20 +107,20 @@ def begin(box, length, state):
         state[LIGHT + r * STRIDE : LIGHT + r * STRIDE + columns] = 1
 
 
-@compiled
+@inner
 def finished(state):
-    for at in range(LIGHT, LIGHT + PLANE, WIDTH):
-        if bits(load(state, at) >= 0):
-            return False
-    return True
+    most = load(state, LIGHT)
+    for at in range(LIGHT + WIDTH, ENDS, WIDTH):
+        most = maximum(most, load(state, at))
+    return bits(most >= 0) == 0
 
 
-@compiled
+@inner
 def lay(table, i, n, box, state):
     """Lay splat i, the n-th of its tile, behind what is there."""
-    fall, red, green, blue = table[i, FALL_X], table[i, RED], table[i, GREEN], table[i, BLUE]
+    fall, red, green, blue = table[i, col.FALL_X], table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]
     rows = trace(table, i, box, state)
-    while rows:
+    while rows != 0:
         r = lowest(rows)
         rows &= rows - 1
         column, end, ridge, peak = state[BEGIN + r], state[END + r], state[RIDGE + r], state[CREST + r]
@@ -121,13 +139,13 @@ def lay(table, i, n, box, state):
             store(state, PLANE + at, fma(weight, green, load(state, PLANE + at)))
             store(state, 2 * PLANE + at, fma(weight, blue, load(state, 2 * PLANE + at)))
             store(state, LIGHT + at, select(shown, after, select(stopping, 0 - before, before)))
-            if bits(stopping):
+            if bits(stopping) != 0:
                 store(state, ENDS + at, select(stopping, n, load(state, ENDS + at)))
             column += WIDTH
             at += WIDTH
 
 
-@compiled
+@inner
 def finish(box, state, background, image, through, stops):
     left, top, columns, rows = box
     for r in range(rows):
@@ -140,7 +158,7 @@ def finish(box, state, background, image, through, stops):
             stops[y, x] = state[ENDS + at]
 
 
-@compiled
+@kernel
 def composite_back(start, stop, table, starts, members, slots, background, through, stops, d_image, d_alpha, pulls):
     """Walk the lists of the tiles start..stop back to front and write each splat's pull in each tile into its slot."""
     height, width = through.shape
@@ -149,7 +167,7 @@ def composite_back(start, stop, table, starts, members, slots, background, throu
         box = bounds(tile, width, height)
         used = begin_back(box, background, through, stops, d_image, d_alpha, state)
         for at in range(starts[tile] + used, starts[tile + 1]):
-            for k in range(PULLS):
+            for k in range(col.PULLS):
                 pulls[slots[at], k] = 0
         for n in range(used - 1, -1, -1):
             at = starts[tile] + n
@@ -157,7 +175,7 @@ def composite_back(start, stop, table, starts, members, slots, background, throu
             lift(table, members[at], n, box, state, pulls, slots[at])
 
 
-@compiled
+@inner
 def begin_back(box, background, through, stops, d_image, d_alpha, state):
     """A finished tile, and how many of its splats were used."""
     left, top, columns, rows = box
@@ -176,18 +194,18 @@ def begin_back(box, background, through, stops, d_image, d_alpha, state):
     return used
 
 
-@compiled
+@inner
 def lift(table, i, n, box, state, pulls, slot):
     """Take splat i, the n-th of its tile, off again and write its pull."""
-    fall, red, green, blue = table[i, FALL_X], table[i, RED], table[i, GREEN], table[i, BLUE]
+    fall, red, green, blue = table[i, col.FALL_X], table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]
     sum_1 = sum_u = sum_y = sum_uu = sum_uy = sum_yy = sum_red = sum_green = sum_blue = spread(0)
     rows = trace(table, i, box, state)
-    while rows:
+    while rows != 0:
         r = lowest(rows)
         rows &= rows - 1
         column, end, ridge, peak = state[BEGIN + r], state[END + r], state[RIDGE + r], state[CREST + r]
         at = r * STRIDE + int(column)
-        dy = box[1] + r + 0.5 - table[i, Y]
+        dy = box[1] + r + 0.5 - table[i, col.Y]
         while column <= end:
             u = ramp(column - ridge)
             power = fma(u * u, -fall, peak)
@@ -208,6 +226,6 @@ def lift(table, i, n, box, state, pulls, slot):
             sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
             column += WIDTH
             at += WIDTH
-    pulls[slot, SUM], pulls[slot, SUM_U], pulls[slot, SUM_Y] = total(sum_1), total(sum_u), total(sum_y)
-    pulls[slot, SUM_UU], pulls[slot, SUM_UY], pulls[slot, SUM_YY] = total(sum_uu), total(sum_uy), total(sum_yy)
-    pulls[slot, RED], pulls[slot, GREEN], pulls[slot, BLUE] = total(sum_red), total(sum_green), total(sum_blue)
+    pulls[slot, col.SUM], pulls[slot, col.SUM_U], pulls[slot, col.SUM_Y] = total(sum_1), total(sum_u), total(sum_y)
+    pulls[slot, col.SUM_UU], pulls[slot, col.SUM_UY], pulls[slot, col.SUM_YY] = total(sum_uu), total(sum_uy), total(sum_yy)
+    pulls[slot, col.RED], pulls[slot, col.GREEN], pulls[slot, col.BLUE] = total(sum_red), total(sum_green), total(sum_blue)

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import binning, compositing, projection
-from mipmap_plugin.backends.cpu_kernels.records import COLUMNS, PULLS, Splats, View
+from mipmap_plugin.backends.cpu_kernels import columns as col
+from mipmap_plugin.backends.cpu_kernels.records import Splats, View
+from mipmap_plugin.backends.projection import FRUSTUM_MARGIN
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-
-# The share of the half field of view by which a center may lie outside the image before the Jacobian is frozen there.
-FRUSTUM_MARGIN = 0.3
 
 # Splats and tiles in one range: some hundred microseconds of work, so that handing it out costs nothing.
 SPLATS_AT_ONCE = 4096
@@ -42,7 +41,7 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
     """The image [H, W, 3] and what to remember of it."""
     view = view_of(camera, effects, splats)
     count, (height, width) = len(splats.means), camera.size
-    table, depths, counts = _empty(count, COLUMNS), _empty(count), np.empty(count, np.int64)
+    table, depths, counts = _empty(count, col.COLUMNS), _empty(count), np.empty(count, np.int64)
     _share(projection.project, count, SPLATS_AT_ONCE, view, splats, table, depths, counts)
 
     slots = np.concatenate([[0], np.cumsum(counts)])
@@ -60,7 +59,7 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
 def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np.ndarray) -> Splats:
     """The gradients of the splats from those of the image [H, W, 3] and its alpha [H, W]."""
     d = drawing
-    pulls = _empty(len(d.members), PULLS)
+    pulls = _empty(len(d.members), col.PULLS)
     maps = (d.background, d.through, d.stops, d_image, d_alpha)
     _share(compositing.composite_back, len(d.starts) - 1, TILES_AT_ONCE, d.table, d.starts, d.members, d.member_slots, *maps, pulls)
     grads = Splats(*(_empty(*array.shape) for array in splats))
@@ -72,10 +71,9 @@ def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
     left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
     across, down = FRUSTUM_MARGIN * (left + right) / 2, FRUSTUM_MARGIN * (top + bottom) / 2
-    rotation, translation = camera.viewmat[:3, :3].tolist(), camera.viewmat[:3, 3].tolist()
     return View(
-        rotation=tuple(tuple(row) for row in rotation),
-        translation=tuple(translation),
+        rotation=tuple(tuple(row) for row in camera.viewmat[:3, :3].tolist()),
+        translation=tuple(camera.viewmat[:3, 3].tolist()),
         eye=tuple(camera.center.tolist()),
         fx=float(camera.fx),
         fy=float(camera.fy),
@@ -94,9 +92,8 @@ def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
     )
 
 
-def splats_of(tensors: tuple[Tensor | None, ...]) -> Splats:
-    """Means, quats, scales, opacities, sh and covariances or None as arrays; of the two ways to give a shape, one stays empty."""
-    means, quats, scales, opacities, sh, covariances = tensors
+def splats_of(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, covariances: Tensor | None) -> Splats:
+    """The tensors of `Gaussians` as arrays; of the two ways to give a shape, the one that is not taken is left empty."""
     if covariances is None:
         covariances = means.new_empty(0, 3, 3)
     else:

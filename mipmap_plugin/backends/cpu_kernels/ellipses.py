@@ -6,12 +6,12 @@ xx·yy - xy² cancels for needles.
 
 import math
 
-from mipmap_plugin.backends.cpu_kernels import compiled
-from mipmap_plugin.backends.cpu_kernels.records import MIN_COMPENSATION
+from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, apply_transposed, blend, cross, dot, plus, times
+from mipmap_plugin.backends.filters import MIN_COMPENSATION
 
 
-@compiled
+@inner
 def lens(view, p):
     """The two rows of the projection's Jacobian at a point of camera space, in world axes, px per world unit."""
     u, v = slopes(view, p)
@@ -20,7 +20,7 @@ def lens(view, p):
     return blend(per_x, view.rotation[0], -per_x * u, away), blend(per_y, view.rotation[1], -per_y * v, away)
 
 
-@compiled
+@inner
 def slopes(view, p):
     """x/z and y/z, frozen where the affine approximation of the projection would blow splats up."""
     u = min(max(p[0] / p[2], view.left), view.right)
@@ -28,7 +28,7 @@ def slopes(view, p):
     return u, v
 
 
-@compiled
+@inner
 def pull_point(view, p, axes, d_axes, d_x, d_y):
     """The gradient of a mean in world space from those of its Jacobian's rows and of its place on the image."""
     across, down, away = view.rotation
@@ -43,7 +43,7 @@ def pull_point(view, p, axes, d_axes, d_x, d_y):
     return plus(blend(d_p0, across, d_p1, down), times(d_p2, away))
 
 
-@compiled
+@inner
 def screen_filter(view, flat):
     """The shape after dilation, and the share of its opacity that the splat keeps."""
     xx, xy, yy, det = flat
@@ -52,7 +52,7 @@ def screen_filter(view, flat):
     return (xx + view.eps2d, xy, yy + view.eps2d, dilated), light
 
 
-@compiled
+@inner
 def pull_screen_filter(view, flat, dilated, light, d_dilated, d_light):
     """The gradient of a shape before dilation."""
     d_xx, d_xy, d_yy, d_det = d_dilated
@@ -61,7 +61,7 @@ def pull_screen_filter(view, flat, dilated, light, d_dilated, d_light):
     return d_xx + view.eps2d * d_det, d_xy, d_yy + view.eps2d * d_det, d_det + d_ratio
 
 
-@compiled
+@inner
 def flatten(axes, turn, scales):
     """The shape on the image of a splat with its own axes `turn` and standard deviations `scales`."""
     first, second = factors(axes, turn, scales)
@@ -69,7 +69,7 @@ def flatten(axes, turn, scales):
     return dot(first, first), dot(first, second), dot(second, second), dot(minors, minors)  # det: Cauchy-Binet, never negative
 
 
-@compiled
+@inner
 def factors(axes, turn, scales):
     """The two rows of Jacobian · rotation · scales."""
     first, second = apply(turn, axes[0]), apply(turn, axes[1])
@@ -79,7 +79,7 @@ def factors(axes, turn, scales):
     )
 
 
-@compiled
+@inner
 def pull_flatten(axes, turn, scales, d_flat):
     """Gradients of the Jacobian's rows, of the splat's own axes and of its scales."""
     d_xx, d_xy, d_yy, d_det = d_flat
@@ -103,7 +103,7 @@ def pull_flatten(axes, turn, scales, d_flat):
     return (apply_transposed(turn, d_first), apply_transposed(turn, d_second)), d_turn, d_scales
 
 
-@compiled
+@inner
 def flatten_matrix(axes, covariance):
     """The shape on the image of a splat with a covariance in world space."""
     first, second = apply(covariance, axes[0]), apply(covariance, axes[1])
@@ -111,7 +111,7 @@ def flatten_matrix(axes, covariance):
     return xx, xy, yy, max(xx * yy - xy * xy, 0.0)
 
 
-@compiled
+@inner
 def pull_flatten_matrix(axes, covariance, d_flat):
     """Gradients of the Jacobian's rows and of the covariance, which need not be symmetric."""
     first, second = axes
@@ -131,7 +131,7 @@ def pull_flatten_matrix(axes, covariance, d_flat):
     return (d_first, d_second), d_covariance
 
 
-@compiled
+@inner
 def rotation(quat):
     """The axes of a splat with a quaternion wxyz of any norm, each a row; a zero quaternion does not turn."""
     w, x, y, z = times_quat(per_norm(quat), quat)
@@ -142,7 +142,7 @@ def rotation(quat):
     )
 
 
-@compiled
+@inner
 def pull_rotation(quat, d_turn):
     """The gradient of a quaternion from those of the axes; across its length only."""
     shrink = per_norm(quat)
@@ -156,13 +156,13 @@ def pull_rotation(quat, d_turn):
     return times_quat(shrink, (d_w - along * w, d_x - along * x, d_y - along * y, d_z - along * z))
 
 
-@compiled
+@inner
 def per_norm(quat):
     w, x, y, z = quat
     squared = w * w + x * x + y * y + z * z
     return 0.0 if squared == 0 else 1 / math.sqrt(squared)
 
 
-@compiled
+@inner
 def times_quat(s, quat):
     return s * quat[0], s * quat[1], s * quat[2], s * quat[3]

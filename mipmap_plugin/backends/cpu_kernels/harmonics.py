@@ -1,19 +1,12 @@
-"""Real spherical harmonics up to degree 4 and their derivative, one direction at a time. Constants and order: PlenOctrees."""
+"""Real spherical harmonics up to degree 4 and their derivative, one direction at a time."""
 
-from mipmap_plugin.backends.cpu_kernels import compiled
+from mipmap_plugin.backends.cpu_kernels import inner
+from mipmap_plugin.backends.harmonics import C0, C1, C2, C3, C4
 
 MAX_BANDS = 25
 
-C0 = 0.28209479177387814
-C1 = 0.4886025119029199
-C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-C3 = (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
-      -0.4570457994644658, 1.445305721320277, -0.5900435899266435)  # fmt: skip
-C4 = (2.5033429417967046, -1.7701307697799304, 0.9461746957575601, -0.6690465435572892, 0.10578554691520431,
-      -0.6690465435572892, 0.47308734787878004, -1.7701307697799304, 0.6258357354491761)  # fmt: skip
 
-
-@compiled
+@inner
 def basis(direction, degree, out):
     """Write the (degree + 1)² basis functions of a unit vector."""
     x, y, z = direction
@@ -35,7 +28,7 @@ def basis(direction, degree, out):
         out[24] = C4[8] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy))
 
 
-@compiled
+@inner
 def slope(direction, degree, w):
     """The gradient of Σ w_j · basis_j with respect to the direction, before it is normalized."""
     x, y, z = direction

@@ -5,6 +5,9 @@ there is nothing left to see: `a + b` on `Lanes` is one vector addition on every
 to all lanes. Nothing is reassociated, so that equal inputs give equal bits.
 """
 
+# numba gives calls and operators a meaning of its own.
+# mypy: ignore-errors
+
 import operator
 from functools import partial
 
@@ -13,7 +16,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
-from mipmap_plugin.backends.cpu_kernels import compiled
+from mipmap_plugin.backends.cpu_kernels import inner
 
 WIDTH = 16
 
@@ -248,7 +251,7 @@ def _add_to_exponent(_context, lanes, rounded):
 _ROUNDER = 12582912.0
 
 
-@compiled
+@inner
 def exp2(power):
     """2^power to 1e-7 for -126 < power < 127; outside, anything. numba's own exponentials are scalar."""
     rounded = power + _ROUNDER

@@ -4,42 +4,10 @@ import math
 
 import numpy as np
 
-from mipmap_plugin.backends.cpu_kernels import compiled, harmonics
+from mipmap_plugin.backends.compositing import MIN_ALPHA
+from mipmap_plugin.backends.cpu_kernels import columns as col
+from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, kernel
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
-from mipmap_plugin.backends.cpu_kernels.ellipses import (
-    flatten,
-    flatten_matrix,
-    lens,
-    pull_flatten,
-    pull_flatten_matrix,
-    pull_point,
-    pull_rotation,
-    pull_screen_filter,
-    rotation,
-    screen_filter,
-)  # fmt: skip
-from mipmap_plugin.backends.cpu_kernels.records import (
-    BLUE,
-    FALL_X,
-    FALL_Y,
-    GREEN,
-    MIN_ALPHA,
-    PEAK,
-    PULLS,
-    REACH_Y,
-    RED,
-    SHEAR,
-    SPREAD,
-    SUM,
-    SUM_U,
-    SUM_UU,
-    SUM_UY,
-    SUM_Y,
-    SUM_YY,
-    TIP,
-    X,
-    Y,
-)  # fmt: skip
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, blend, dot, minus, plus, row, set_row, times
 
 # -q/2 = -HALF_LOG2E · q in powers of two.
@@ -49,7 +17,7 @@ HALF_LOG2E = 0.5 / math.log(2)
 FAR = 1e30
 
 
-@compiled
+@kernel
 def project(start, stop, view, splats, table, depths, counts):
     """Fill the rows start..stop of the table, the depths and the numbers of tiles touched; 0 tiles: not drawn."""
     means, quats, scales, opacities, sh, covariances = splats
@@ -62,20 +30,20 @@ def project(start, stop, view, splats, table, depths, counts):
             continue
         depths[i] = p[2]
         if len(covariances) > 0:
-            flat = flatten_matrix(lens(view, p), matrix(covariances, i))
+            flat = ellipses.flatten_matrix(ellipses.lens(view, p), matrix(covariances, i))
         else:
-            flat = flatten(lens(view, p), rotation(quaternion(quats, i)), row(scales, i))
+            flat = ellipses.flatten(ellipses.lens(view, p), ellipses.rotation(quaternion(quats, i)), row(scales, i))
         if fill_shape(view, p, flat, opacities[i], table, i):
             tiles = count_tiles(table, i, view.width, view.height)
             if tiles > 0 and fill_color(view, mean, sh, bands, table, i):
                 counts[i] = tiles
 
 
-@compiled
+@inner
 def fill_shape(view, p, flat, opacity, table, i):
     """Write what a splat's ellipse is on the image; False where there is none to draw."""
     x, y = view.fx * p[0] / p[2] + view.cx, view.fy * p[1] / p[2] + view.cy
-    (xx, xy, yy, det), light = screen_filter(view, flat)
+    (xx, xy, yy, det), light = ellipses.screen_filter(view, flat)
     opacity *= light
     small = abs(x) < FAR and abs(y) < FAR and xx < FAR and yy < FAR and opacity < FAR
     sharp = yy * FAR > 1 and det * FAR > yy
@@ -83,14 +51,14 @@ def fill_shape(view, p, flat, opacity, table, i):
         return False
     peak = math.log2(opacity)
     reach = 2 * math.log(2) * (peak - math.log2(MIN_ALPHA))
-    table[i, X], table[i, Y], table[i, SHEAR] = x, y, xy / yy
-    table[i, FALL_Y], table[i, FALL_X], table[i, PEAK] = HALF_LOG2E / yy, HALF_LOG2E * yy / det, peak
-    table[i, SPREAD] = det / yy / HALF_LOG2E
-    table[i, REACH_Y], table[i, TIP] = math.sqrt(reach * yy), xy * math.sqrt(reach / xx)
+    table[i, col.X], table[i, col.Y], table[i, col.SHEAR] = x, y, xy / yy
+    table[i, col.FALL_Y], table[i, col.FALL_X], table[i, col.PEAK] = HALF_LOG2E / yy, HALF_LOG2E * yy / det, peak
+    table[i, col.SPREAD] = det / yy / HALF_LOG2E
+    table[i, col.REACH_Y], table[i, col.TIP] = math.sqrt(reach * yy), xy * math.sqrt(reach / xx)
     return True
 
 
-@compiled
+@inner
 def fill_color(view, mean, sh, bands, table, i):
     """Write a splat's color in this view's direction; False where it is not finite."""
     direction, _ = sight(view, mean)
@@ -100,16 +68,16 @@ def fill_color(view, mean, sh, bands, table, i):
         red += bands[j] * sh[i, j, 0]
         green += bands[j] * sh[i, j, 1]
         blue += bands[j] * sh[i, j, 2]
-    table[i, RED], table[i, GREEN], table[i, BLUE] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
+    table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
     return abs(red) < FAR and abs(green) < FAR and abs(blue) < FAR
 
 
-@compiled
+@kernel
 def project_back(start, stop, view, splats, table, slots, pulls, grads):
     """Gradients of the splats start..stop from the pulls of their tiles, rows slots[i]..slots[i + 1]."""
     means, quats, scales, opacities, sh, covariances = splats
     d_means, d_quats, d_scales, d_opacities, d_sh, d_covariances = grads
-    bands, along, pull = np.empty(harmonics.MAX_BANDS), np.empty(harmonics.MAX_BANDS), np.empty(PULLS)
+    bands, along, pull = np.empty(harmonics.MAX_BANDS), np.empty(harmonics.MAX_BANDS), np.empty(col.PULLS)
     for i in range(start, stop):
         drawn = slots[i] < slots[i + 1]
         if not drawn:
@@ -118,25 +86,25 @@ def project_back(start, stop, view, splats, table, slots, pulls, grads):
         add_up(pulls, slots[i], slots[i + 1], pull)
         mean = row(means, i)
         p = plus(apply(view.rotation, mean), view.translation)
-        axes = lens(view, p)
+        axes = ellipses.lens(view, p)
         if len(covariances) > 0:
             covariance = matrix(covariances, i)
-            d_flat, d_opacity, d_x, d_y = pull_shape(view, flatten_matrix(axes, covariance), opacities[i], pull)
-            d_axes, d_covariance = pull_flatten_matrix(axes, covariance, d_flat)
+            d_flat, d_opacity, d_x, d_y = pull_shape(view, ellipses.flatten_matrix(axes, covariance), opacities[i], pull)
+            d_axes, d_covariance = ellipses.pull_flatten_matrix(axes, covariance, d_flat)
             set_matrix(d_covariances, i, d_covariance)
         else:
             quat, scale = quaternion(quats, i), row(scales, i)
-            turn = rotation(quat)
-            d_flat, d_opacity, d_x, d_y = pull_shape(view, flatten(axes, turn, scale), opacities[i], pull)
-            d_axes, d_turn, d_scale = pull_flatten(axes, turn, scale, d_flat)
+            turn = ellipses.rotation(quat)
+            d_flat, d_opacity, d_x, d_y = pull_shape(view, ellipses.flatten(axes, turn, scale), opacities[i], pull)
+            d_axes, d_turn, d_scale = ellipses.pull_flatten(axes, turn, scale, d_flat)
             set_row(d_scales, i, d_scale)
-            d_quats[i, 0], d_quats[i, 1], d_quats[i, 2], d_quats[i, 3] = pull_rotation(quat, d_turn)
+            d_quats[i, 0], d_quats[i, 1], d_quats[i, 2], d_quats[i, 3] = ellipses.pull_rotation(quat, d_turn)
         d_opacities[i] = d_opacity
         d_mean = pull_color(view, mean, sh, table, i, pull, bands, along, d_sh)
-        set_row(d_means, i, plus(d_mean, pull_point(view, p, axes, d_axes, d_x, d_y)))
+        set_row(d_means, i, plus(d_mean, ellipses.pull_point(view, p, axes, d_axes, d_x, d_y)))
 
 
-@compiled
+@inner
 def clear(i, d_means, d_quats, d_scales, d_opacities, d_sh, d_covariances):
     zero = 0.0, 0.0, 0.0
     set_row(d_means, i, zero)
@@ -150,43 +118,43 @@ def clear(i, d_means, d_quats, d_scales, d_opacities, d_sh, d_covariances):
         d_quats[i, 0], d_quats[i, 1], d_quats[i, 2], d_quats[i, 3] = 0, 0, 0, 0
 
 
-@compiled
+@inner
 def add_up(pulls, first, last, pull):
     """Sum a splat's pulls, always tile after tile, whatever threads they came from."""
-    for k in range(PULLS):
+    for k in range(col.PULLS):
         pull[k] = pulls[first, k]
     for slot in range(first + 1, last):
-        for k in range(PULLS):
+        for k in range(col.PULLS):
             pull[k] += pulls[slot, k]
 
 
-@compiled
+@inner
 def pull_shape(view, flat, opacity, pull):
     """Gradients of the shape before the screen filter, of the opacity, and of the place on the image."""
-    dilated, light = screen_filter(view, flat)
+    dilated, light = ellipses.screen_filter(view, flat)
     _, xy, yy, det = dilated
     shear, per_yy, per_across = xy / yy, 1 / yy, yy / det
 
-    d_x = per_across * pull[SUM_U]
-    d_y = per_yy * pull[SUM_Y] - shear * d_x
-    d_shear = per_across * pull[SUM_UY]
-    d_per_yy, d_per_across = -0.5 * pull[SUM_YY], -0.5 * pull[SUM_UU]
+    d_x = per_across * pull[col.SUM_U]
+    d_y = per_yy * pull[col.SUM_Y] - shear * d_x
+    d_shear = per_across * pull[col.SUM_UY]
+    d_per_yy, d_per_across = -0.5 * pull[col.SUM_YY], -0.5 * pull[col.SUM_UU]
 
     d_yy = d_per_across / det - per_yy * (d_per_yy * per_yy + d_shear * shear)
     d_dilated = 0.0, d_shear * per_yy, d_yy, -d_per_across * per_across / det
-    d_flat = pull_screen_filter(view, flat, dilated, light, d_dilated, pull[SUM] / light)
-    return d_flat, pull[SUM] / opacity, d_x, d_y
+    d_flat = ellipses.pull_screen_filter(view, flat, dilated, light, d_dilated, pull[col.SUM] / light)
+    return d_flat, pull[col.SUM] / opacity, d_x, d_y
 
 
-@compiled
+@inner
 def pull_color(view, mean, sh, table, i, pull, bands, along, d_sh):
     """Gradients through the color: writes those of the coefficients, returns that of the mean."""
     direction, length = sight(view, mean)
     harmonics.basis(direction, view.sh_degree, bands)
     # A channel that was cut off at black has no gradient.
-    d_red = pull[RED] if table[i, RED] > 0 else 0.0
-    d_green = pull[GREEN] if table[i, GREEN] > 0 else 0.0
-    d_blue = pull[BLUE] if table[i, BLUE] > 0 else 0.0
+    d_red = pull[col.RED] if table[i, col.RED] > 0 else 0.0
+    d_green = pull[col.GREEN] if table[i, col.GREEN] > 0 else 0.0
+    d_blue = pull[col.BLUE] if table[i, col.BLUE] > 0 else 0.0
     used = (view.sh_degree + 1) ** 2
     for j in range(used):
         along[j] = d_red * sh[i, j, 0] + d_green * sh[i, j, 1] + d_blue * sh[i, j, 2]
@@ -199,7 +167,7 @@ def pull_color(view, mean, sh, table, i, pull, bands, along, d_sh):
     return blend(1 / length, d_direction, -dot(d_direction, direction) / length, direction)
 
 
-@compiled
+@inner
 def sight(view, mean):
     """The unit vector from the eye to a mean, and the distance; (0, 0, 1) for a splat in the very eye."""
     ray = minus(mean, view.eye)
@@ -207,12 +175,12 @@ def sight(view, mean):
     return (times(1 / length, ray) if length > 0 else (0.0, 0.0, 1.0)), length
 
 
-@compiled
+@inner
 def quaternion(quats, i):
     return float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
 
 
-@compiled
+@inner
 def matrix(matrices, i):
     m = matrices
     return (
@@ -222,7 +190,7 @@ def matrix(matrices, i):
     )
 
 
-@compiled
+@inner
 def set_matrix(matrices, i, rows):
     for r, values in enumerate(rows):
         matrices[i, r, 0], matrices[i, r, 1], matrices[i, r, 2] = values

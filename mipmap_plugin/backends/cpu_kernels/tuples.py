@@ -1,57 +1,57 @@
 """Vectors of three, and matrices as three rows, in tuples: numba keeps them in registers."""
 
-from mipmap_plugin.backends.cpu_kernels import compiled
+from mipmap_plugin.backends.cpu_kernels import inner
 
 
-@compiled
+@inner
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled
+@inner
 def cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@compiled
+@inner
 def plus(a, b):
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@compiled
+@inner
 def minus(a, b):
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@compiled
+@inner
 def times(s, a):
     return s * a[0], s * a[1], s * a[2]
 
 
-@compiled
+@inner
 def blend(s, a, t, b):
     """s·a + t·b"""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
 
-@compiled
+@inner
 def apply(matrix, v):
     """matrix · v"""
     return dot(matrix[0], v), dot(matrix[1], v), dot(matrix[2], v)
 
 
-@compiled
+@inner
 def apply_transposed(matrix, v):
     """matrixᵀ · v"""
     return plus(blend(v[0], matrix[0], v[1], matrix[1]), times(v[2], matrix[2]))
 
 
-@compiled
+@inner
 def row(array, i):
     """array[i] of [N, 3] in float64."""
     return float(array[i, 0]), float(array[i, 1]), float(array[i, 2])
 
 
-@compiled
+@inner
 def set_row(array, i, v):
     array[i, 0], array[i, 1], array[i, 2] = v

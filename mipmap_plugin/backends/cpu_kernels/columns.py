@@ -1,0 +1,15 @@
+"""Which number is where: the columns of the splat table and of the gradient table."""
+
+# The splat table [N, COLUMNS] float32. With dy = y - Y and u = x - X - SHEAR·dy, in px:
+# log2 alpha = PEAK - FALL_Y·dy² - FALL_X·u². A sum of squares, accurate for needles too.
+X, Y, SHEAR, FALL_Y, FALL_X, PEAK = range(6)
+RED, GREEN, BLUE = 6, 7, 8
+REACH_Y = 9  # px from Y to the last row where alpha reaches 1/255
+TIP = 10  # px from Y to the row where the splat reaches furthest right; as far the other way, furthest left
+SPREAD = 11  # 1 / FALL_X
+COLUMNS = 16  # the rest is air, so that a row is one cache line
+
+# The gradient table [pairs, PULLS] float32, one row per splat and tile. With s = alpha · dLoss/dalpha of a pixel, the sums over the
+# tile of s, s·u, s·dy, s·u², s·u·dy and s·dy², then dLoss/dcolor in RED, GREEN and BLUE.
+SUM, SUM_U, SUM_Y, SUM_UU, SUM_UY, SUM_YY = range(6)
+PULLS = 9

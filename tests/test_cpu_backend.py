@@ -1,0 +1,221 @@
+"""The compiled backend against a brute-force float64 sum, and what only compiled, threaded code can get wrong."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from oracle import brute_force
+from samples import camera, gaussians
+
+from mipmap_plugin.backends import choose_backend
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.cpu import NO_NUMBA, CpuBackend
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.gaussians import Gaussians
+
+needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
+BACKEND = CpuBackend()
+
+# Three tiles across with the last one cut, and three down; off center, fx != fy.
+WIDE = camera(150, 40, 90.0, 70.0, cx=61.3, cy=24.9)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def leaf(g: Gaussians) -> Gaussians:
+    given = {f.name: getattr(g, f.name) for f in fields(g)}
+    return Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in given.items()})
+
+
+def gradients(image: torch.Tensor, alpha: torch.Tensor, g: Gaussians) -> dict[str, torch.Tensor]:
+    """Of a fixed weighting of all pixels, by the name of the tensor."""
+    weights = torch.randn(*alpha.shape, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).to(image)
+    loss = (image * weights[..., :3]).sum() + (alpha * weights[..., 3]).sum()
+    loss.backward()
+    return {f.name: getattr(g, f.name).grad.double() for f in fields(g) if getattr(getattr(g, f.name), "grad", None) is not None}
+
+
+def draw(g: Gaussians, view, effects: Effects):
+    """Image, alpha and gradients of the compiled backend."""
+    g = leaf(g.to(dtype=torch.float32))
+    rendered = BACKEND.render(g, view, effects)
+    return rendered.image.detach(), rendered.alpha.detach(), gradients(rendered.image, rendered.alpha, g)
+
+
+def assert_gradients_close(actual, expected, relative=2e-5):
+    assert set(actual) == set(expected)
+    for name, right in expected.items():
+        assert (actual[name] - right).norm() <= relative * right.norm(), name
+
+
+@needs_numba
+@pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
+@pytest.mark.parametrize("view", [camera(), WIDE], ids=["one-tile", "many-tiles"])
+def test_equals_a_sum_over_every_pixel(view, screen_filter):
+    g = leaf(gaussians(80, dtype=torch.float32).to(dtype=torch.float64))  # the same numbers in both precisions
+    effects = Effects(1, screen_filter, background=(0.2, 0.5, 0.9))
+    right_image, right_alpha = brute_force(g, view, effects.eps2d, effects.background, screen_filter == "antialiased")
+    image, alpha, grads = draw(g, view, effects)
+    torch.testing.assert_close(image.double(), right_image.detach(), atol=5e-6, rtol=0)
+    torch.testing.assert_close(alpha.double(), right_alpha.detach(), atol=5e-6, rtol=0)
+    assert_gradients_close(grads, gradients(right_image, right_alpha, g))
+
+
+@needs_numba
+def test_pixels_stop_where_they_should():
+    g = gaussians(300, dtype=torch.float32)
+    g = leaf(replace(g, opacities=0.9 + 0.1 * g.opacities, scales=3 * g.scales).to(dtype=torch.float64))
+    right_image, right_alpha = brute_force(g, camera())
+    assert (right_alpha > 0.999).double().mean() > 0.5
+    image, _, grads = draw(g, camera(), Effects(1))
+    torch.testing.assert_close(image.double(), right_image.detach(), atol=5e-6, rtol=0)
+    assert_gradients_close(grads, gradients(right_image, right_alpha, g), 1e-4)
+
+
+@needs_numba
+@pytest.mark.parametrize("degree", [2, 3, 4])
+def test_every_harmonic_has_its_gradient(degree):
+    g = leaf(gaussians(30, degree, dtype=torch.float32).to(dtype=torch.float64))
+    right = ReferenceBackend().render(g, camera(), Effects(degree))
+    image, _, grads = draw(g, camera(), Effects(degree))
+    torch.testing.assert_close(image.double(), right.image.detach(), atol=5e-6, rtol=0)
+    assert_gradients_close(grads, gradients(right.image, right.alpha, g))
+
+
+@needs_numba
+def test_bands_left_out_have_no_gradient():
+    grads = draw(gaussians(30, 3), camera(), Effects(1))[2]
+    assert grads["sh"][:, :4].any() and not grads["sh"][:, 4:].any()
+
+
+@needs_numba
+def test_covariances_need_not_be_symmetric_to_have_their_gradient():
+    g = gaussians(40, dtype=torch.float32).to(dtype=torch.float64)
+    factor = torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * g.scales[:, None]
+    g = leaf(replace(g, covariances=(factor @ factor.mT).float().double()))
+    right = ReferenceBackend().render(g, camera(), Effects(1))
+    grads = draw(g, camera(), Effects(1))[2]
+    expected = gradients(right.image, right.alpha, g)
+    assert "scales" not in grads
+    assert_gradients_close(grads, {name: grad for name, grad in expected.items() if name in grads})
+
+
+@needs_numba
+@pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
+def test_the_number_of_threads_changes_no_bit(screen_filter, monkeypatch):
+    from mipmap_plugin.backends.cpu_kernels import drawing
+
+    monkeypatch.setattr(drawing, "SPLATS_AT_ONCE", 64)
+    monkeypatch.setattr(drawing, "TILES_AT_ONCE", 1)
+    g = gaussians(2000)
+    results = []
+    for threads in (1, 2, 5):
+        torch.set_num_threads(threads)
+        results.append(draw(g, WIDE, Effects(1, screen_filter)))
+    for image, alpha, grads in results[1:]:
+        assert torch.equal(image, results[0][0]) and torch.equal(alpha, results[0][1])
+        assert all(torch.equal(grad, results[0][2][name]) for name, grad in grads.items())
+
+
+@needs_numba
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh"])
+def test_a_broken_row_touches_no_other(field):
+    g = gaussians(50, dtype=torch.float32)
+    broken = {f.name: getattr(g, f.name).clone() for f in fields(g) if getattr(g, f.name) is not None}
+    broken[field][20] = math.nan
+    rest = torch.arange(50) != 20
+    image, _, grads = draw(Gaussians(**broken), camera(), Effects(1))
+    right_image, _, right_grads = draw(g[rest], camera(), Effects(1))
+    assert torch.equal(image, right_image)
+    for name, grad in grads.items():
+        assert torch.equal(grad[rest], right_grads[name]) and not grad[20].any()
+
+
+@needs_numba
+@pytest.mark.parametrize("size", [1e4, 1e8, 1e20, 1e38])
+def test_splats_larger_than_an_integer_can_count_are_finite(size):
+    g = gaussians(20, dtype=torch.float32)
+    g.scales[:5] = size
+    g.means[5:10, :2] = size / 10
+    image, alpha, grads = draw(g, camera(33, 17), Effects(1, near_plane=1e-3))
+    assert torch.isfinite(image).all() and torch.isfinite(alpha).all()
+    assert all(torch.isfinite(grad).all() for grad in grads.values())
+
+
+@needs_numba
+def test_an_input_changed_before_the_backward_pass_is_noticed():
+    g = leaf(gaussians(20, dtype=torch.float32))
+    rendered = BACKEND.render(g, camera(), Effects(1))
+    with torch.no_grad():
+        g.scales.mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        rendered.image.sum().backward()
+
+
+@needs_numba
+def test_gradients_reach_only_what_asks_for_them():
+    g = gaussians(20, dtype=torch.float32)
+    g = replace(g, means=g.means.requires_grad_())
+    BACKEND.render(g, camera(), Effects(1)).alpha.sum().backward()
+    assert g.means.grad.any() and g.sh.grad is None
+
+
+@needs_numba
+def test_power_of_two_in_lanes():
+    import numpy as np
+
+    from mipmap_plugin.backends.cpu_kernels import kernel
+    from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, exp2, load, store
+
+    def powers(exponents, out):
+        for at in range(0, len(exponents), WIDTH):
+            store(out, at, exp2(load(exponents, at)))
+
+    exponents = np.linspace(-100, 20, 1 << 16, dtype=np.float32)
+    out = np.empty_like(exponents)
+    kernel(powers)(exponents, out)
+    assert np.abs(out / np.exp2(exponents.astype(np.float64)) - 1).max() < 2e-7
+
+
+@needs_numba
+def test_depths_sort_as_floats_with_ties_in_order():
+    import numpy as np
+
+    from mipmap_plugin.backends.cpu_kernels.binning import depth_order
+
+    depths = np.random.default_rng(0).choice(np.float32([0.25, 1e-30, 3.0, 3.0000002, 1e30]), 3000)
+    counts = np.random.default_rng(1).integers(0, 3, 3000)
+    drawn = np.flatnonzero(counts)
+    assert np.array_equal(depth_order(depths, counts), drawn[np.argsort(depths[drawn], kind="stable")])
+
+
+def test_without_numba_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    g = gaussians(2, dtype=torch.float32)
+    needs = Needs.of(g, Effects(1), gradients=True)
+    assert BACKEND.lacking(needs) == [NO_NUMBA]
+    with pytest.raises(BackendUnavailable, match=r"pip install 'mipmap-plugin\[cpu\]'"):
+        BACKEND.render(g, camera(), Effects(1))
+    assert choose_backend("auto", needs)[0].name == "reference"
+
+
+def test_the_module_loads_no_numba():
+    code = "import sys; import mipmap_plugin.backends.cpu; sys.exit('numba' in sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
