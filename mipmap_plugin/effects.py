@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mipmap_plugin.gaussians import Gaussians
+
 # px²: the variance that every 3DGS rasterizer adds to a projected splat (diff-gaussian-rasterization, forward.cu).
 DILATION = 0.3
 
@@ -24,3 +26,24 @@ class Effects:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear RGB
     supersampling: int = 1  # N: N x N samples per pixel, averaged
     near_plane: float = NEAR_PLANE  # world units
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One thing that a renderer can do, whether this image calls for it, and why."""
+
+    name: str
+    on: bool
+    reason: str
+
+
+def explain(effects: Effects, gaussians: Gaussians) -> list[Effect]:
+    """Every effect that rendering knows, on or off, with its reason."""
+    degree, room, n, given = effects.sh_degree, gaussians.sh_degree, effects.supersampling, gaussians.covariances is not None
+    return [
+        Effect("view-dependent color", degree > 0, f"SH up to degree {degree} of {room}: above it every coefficient is 0"),
+        Effect("screen filter", effects.eps2d > 0, f"{effects.screen_filter}, {effects.eps2d:g} px²"),
+        Effect("compensation", effects.screen_filter == "antialiased", f"the screen filter is {effects.screen_filter}"),
+        Effect("supersampling", n > 1, f"{n * n} sample{'s' if n > 1 else ''} a pixel"),
+        Effect("covariances", given, "the model gives them" if given else "quaternions and scales suffice"),
+    ]

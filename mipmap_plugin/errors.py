@@ -29,5 +29,9 @@ class PluginError(MipmapPluginError, ImportError):
     """A registered name whose target does not import or does not fit."""
 
 
+class OutputError(MipmapPluginError, OSError):
+    """An output that the system refuses to write: a full disk, a missing permission."""
+
+
 class OutputExists(MipmapPluginError, FileExistsError):
     """An output that is already there and was not to be overwritten."""

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from mipmap_plugin.errors import CheckpointError, OutputExists
+from mipmap_plugin.errors import OutputError, OutputExists
 
 
 @contextlib.contextmanager
 def new_file(path: Path, overwrite: bool) -> Iterator[Path]:
-    """A temporary path to write to, which becomes `path` if the block ends well. Raises OutputExists, CheckpointError."""
+    """A temporary path to write to, which becomes `path` if the block ends well. Raises OutputExists, OutputError."""
     refuse_existing(path, overwrite)
     with _temporary(path) as temporary:
         yield temporary
@@ -31,6 +33,12 @@ def new_folder(path: Path, overwrite: bool) -> Iterator[Path]:
         _swap_in(temporary, path)
 
 
+def write_json(path: Path, facts: Any, overwrite: bool) -> None:
+    """Write `facts` as an indented JSON file. Raises OutputExists, OutputError."""
+    with new_file(path, overwrite) as temporary:
+        temporary.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+
+
 def refuse_existing(path: Path, overwrite: bool) -> None:
     """Raise OutputExists when something is at `path` and was not to be replaced."""
     if path.exists() and not overwrite:
@@ -44,7 +52,7 @@ def _temporary(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
     except OSError as error:
-        raise CheckpointError(f"{path} cannot be written: {error.strerror or error}") from error
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
     finally:
         _remove(temporary)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from ply_files import splat_columns, write, write_splats
 
-from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
+from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError
 from mipmap_plugin.models import ply as ply_module
 from mipmap_plugin.models.ply import read_header, read_ply, write_ply
 
@@ -146,7 +146,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(ply_module.os, "fsync", full)
-    with pytest.raises(CheckpointError, match="cannot be written: No space left"):
+    with pytest.raises(OutputError, match="cannot be written: No space left"):
         write_ply(path, {"x": np.ones(1, np.float32)}, overwrite=True)
     assert path.read_bytes() == old
     assert list(tmp_path.iterdir()) == [path]

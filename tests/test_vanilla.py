@@ -9,9 +9,10 @@ import pytest
 import torch
 from ply_files import splat_columns, splat_names, write, write_model_folder, write_splats
 
-from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError, ShapeError
+from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models import atomic, inria_folder, load_model
+from mipmap_plugin import files
+from mipmap_plugin.models import inria_folder, load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.cfg_args import read_cfg_args
 from mipmap_plugin.models.ply import read_ply
@@ -361,9 +362,9 @@ def test_a_failed_save_leaves_the_old_folder_and_nothing_else(tmp_path, monkeypa
     if failing == "copy":
         monkeypatch.setattr(inria_folder.shutil, "copyfile", full)
     else:
-        rename = atomic.Path.rename
-        monkeypatch.setattr(atomic.Path, "rename", lambda self, to: full() if self.suffix == ".tmp" else rename(self, to))
-    with pytest.raises(CheckpointError, match="cannot be written: No space left"):
+        rename = files.Path.rename
+        monkeypatch.setattr(files.Path, "rename", lambda self, to: full() if self.suffix == ".tmp" else rename(self, to))
+    with pytest.raises(OutputError, match="cannot be written: No space left"):
         model.save(tmp_path / "out", provenance={}, overwrite=True)
     assert len(load_model(tmp_path / "out")) == 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m", "out"]

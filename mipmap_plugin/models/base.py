@@ -32,6 +32,10 @@ class SplatModel(Protocol):
 
     family: str  # "3dgs", "scaffold", ...
     trained: TrainedScale
+    notes: list[str]  # what a person should know about how it was read, in sentences
+    source: Path | None  # the file that was read; None: made in memory
+    folder: Path | None  # the model folder around it
+    digest: str  # sha256 of the file, hexadecimal; "" when made in memory
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """The splats that this camera sees, differentiable in `parameters()`."""
@@ -43,10 +47,13 @@ class SplatModel(Protocol):
         """An independent model with leaf parameters of its own that require gradients; this one stays as it is."""
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
-        """Take these tensors, all with the same number of rows, as the model's own leaves. Only ever called on a copy."""
+        """Take these very tensors, all with the same number of rows, as the model's leaves. Only ever called on a copy."""
 
     def reshape(self, scales: Tensor, opacities: Tensor) -> None:
         """Make these activated scales [N, 3] and opacities [N] the model's own. Only ever called on a copy."""
+
+    def row_opacities(self) -> Tensor:
+        """[N], 0..1: how much each row of the parameters can show; rows that show nothing may be pruned."""
 
     def to(self, device: torch.device | str) -> SplatModel:
         """A copy on another device."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.errors import CheckpointError, OutputExists
-from mipmap_plugin.models.atomic import new_folder
+from mipmap_plugin.files import new_folder
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args
 

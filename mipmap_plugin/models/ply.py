@@ -14,7 +14,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from mipmap_plugin.errors import CheckpointError, SettingsError
-from mipmap_plugin.models.atomic import new_file
+from mipmap_plugin.files import new_file
 from mipmap_plugin.models.magic import read_head
 
 # Bytes. The header of a degree-3 splat has 1.5 kB; without a cap, a file without `end_header` would be searched to its end.
@@ -118,7 +118,7 @@ def read_ply(path: str | Path) -> PlyFile:
 def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Iterable[str] = (), *, overwrite: bool = False) -> Path:
     """Write columns [N] as the `vertex` element, binary little endian, each in its own type. Atomic.
 
-    Raises OutputExists; CheckpointError when the disk refuses; SettingsError when the comments do not fit a header.
+    Raises OutputExists; OutputError when the disk refuses; SettingsError when the comments do not fit a header.
     """
     path = Path(path)
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])

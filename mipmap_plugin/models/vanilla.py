@@ -126,7 +126,7 @@ class VanillaModel:
         """Write a PLY where `path` ends in .ply, else a 3DGS model folder, atomically; return the PLY written.
 
         The folder repeats the iteration, cfg_args, cameras and exposures that the model came with. Raises OutputExists,
-        and CheckpointError when the disk refuses.
+        and OutputError when the disk refuses.
         """
         path = Path(path)
         columns = {**to_columns(self._parameters), **self._origin.extras}

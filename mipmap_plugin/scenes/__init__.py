@@ -8,11 +8,11 @@ from typing import Any
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.cameras_json import read_cameras
+from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
 from mipmap_plugin.scenes.trajectories import jittered, orbit
 from mipmap_plugin.scenes.transforms import read_transforms
 
-__all__ = ["Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_transforms"]
+__all__ = ["Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_transforms", "write_cameras"]
 
 
 def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:

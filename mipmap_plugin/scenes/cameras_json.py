@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.files import write_json
 from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
 
 # INRIA's reader holds out every eighth photograph of a COLMAP scene.
@@ -43,6 +45,22 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
         camera = _camera(entry, name, "test" if index < tests else "train", f"{path}, entry {index} ({name})")
         cameras.append(camera.resized(*trained_size(camera.width, camera.height, cfg)))
     return cameras
+
+
+def write_cameras(path: str | Path, cameras: Sequence[Camera], *, overwrite: bool = False) -> Path:
+    """Write `cameras` as INRIA does, test views first; return the path. Raises OutputExists.
+
+    The format has no principal point: every view's is taken to be its centre.
+    """
+    ordered = sorted(cameras, key=lambda camera: camera.split != "test")
+    write_json(Path(path), [_entry(index, camera) for index, camera in enumerate(ordered)], overwrite)
+    return Path(path)
+
+
+def _entry(index: int, camera: Camera) -> dict[str, Any]:
+    to_world = camera.viewmat[:3, :3].T.tolist()
+    where = {"position": camera.center.tolist(), "rotation": to_world}
+    return {"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height, **where, "fy": camera.fy, "fx": camera.fx}
 
 
 def count_test_cameras(names: list[str]) -> int:

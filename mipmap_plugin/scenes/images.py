@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +10,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from mipmap_plugin.errors import OutputExists, SceneError, ShapeError
+from mipmap_plugin.errors import SceneError, ShapeError
+from mipmap_plugin.files import new_file
 
 # What Pillow calls 16-bit gray; 16-bit color it reads to 8 bits by itself, keeping the high byte.
 GRAY_16_BIT = ("I;16", "I;16B", "I;16L", "I;16N", "I")
@@ -66,16 +66,9 @@ def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> 
         raise ShapeError(f"image for {path}: expected shape [H, W, 3], got {list(image.shape)}")
     if not image.isfinite().all():
         raise SceneError(f"{path}: the image holds NaN or infinity and is not written; check the render that it came from")
-    if path.exists() and not overwrite:
-        raise OutputExists(f"{path} is already there; pass --overwrite (overwrite=True) or another path")
     pixels = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with new_file(path, overwrite) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return path
 
 

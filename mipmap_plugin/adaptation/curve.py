@@ -1,0 +1,57 @@
+"""What was gained by when: the clock, the curve, and the reasons to stop."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import torch
+from pydantic import BaseModel, ConfigDict
+
+from mipmap_plugin.config import AdaptConfig
+
+
+class CurvePoint(BaseModel):
+    """One point of accuracy against time."""
+
+    model_config = ConfigDict(frozen=True)
+
+    step: int
+    seconds: float  # of adapting; measuring is not billed
+    psnr_db: float  # against the pseudo truth, over the views since the last point
+    gaussians: int
+
+
+class Stopwatch:
+    """Seconds spent inside `with`, so that measuring quality is not billed as adapting. Devices finish their work first."""
+
+    def __init__(self, device: torch.device, seconds: float = 0.0) -> None:
+        self.seconds, self._device = seconds, device
+
+    def __enter__(self) -> Stopwatch:
+        self._start = self._now()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.seconds += self._now() - self._start
+
+    def _now(self) -> float:
+        if self._device.type == "cuda":
+            torch.cuda.synchronize(self._device)
+        return time.perf_counter()
+
+
+def decibel(mean_square: float) -> float:
+    """PSNR of images in 0..1."""
+    return -10 * math.log10(max(mean_square, 1e-12))  # 120 dB: beyond single precision
+
+
+def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig) -> str | None:
+    """Why adapting ends before its last step: the budget is spent, or the knee is passed."""
+    if config.time_budget_s is not None and seconds >= config.time_budget_s:
+        return f"time budget of {config.time_budget_s:g} s"
+    if config.patience is not None and len(curve) > config.patience:
+        best_before = max(point.psnr_db for point in curve[: -config.patience])
+        if max(point.psnr_db for point in curve[-config.patience :]) < best_before + config.min_gain_db:
+            return f"knee: {config.patience} checks in a row gained less than {config.min_gain_db:g} dB"
+    return None

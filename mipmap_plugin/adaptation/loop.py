@@ -1,0 +1,109 @@
+"""Algorithm 1 of Mipmap-GS: optimise the splats against what the frozen base shows, resized to the new scale."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from mipmap_plugin.adaptation import density
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, reason_to_stop
+from mipmap_plugin.adaptation.interrupt import interruptible
+from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
+from mipmap_plugin.adaptation.views import Rounds, extent
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.models.base import SplatModel
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be optimised against what."""
+
+    views: Sequence[Camera]  # at the base scale
+    scale: float
+    truth: Callable[[Camera], Tensor]  # a view of the base scale -> [h, w, 3] at the new scale
+    render: Callable[[SplatModel, Camera], Tensor]  # a model and a camera of the new scale -> [h, w, 3]
+    white_background: bool
+
+
+@dataclass
+class Run:
+    """Where a run stands: all that is needed to go on with it."""
+
+    student: SplatModel
+    optimizer: torch.optim.Adam
+    watch: Stopwatch
+    gradients: density.ScreenGradients
+    step: int = 0
+    curve: list[CurvePoint] = field(default_factory=list)
+    square_error: float = 0.0  # summed over the views since the last point of the curve
+
+    @classmethod
+    def start(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
+        means = student.parameters()["means"]
+        optimizer = make_optimizer(student, config, extent(task.views))
+        return cls(student, optimizer, Stopwatch(means.device), density.ScreenGradients(len(means), means.device))
+
+
+def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None]) -> str:
+    """Optimise `run.student` in place until its steps, its budget or its patience end; return which of them did.
+
+    `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise.
+    """
+    rounds = Rounds(task.views, config.seed)
+    bar = tqdm(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step")
+    with bar, interruptible() as interrupted:
+        while run.step < config.steps:
+            with run.watch:
+                _step(run, task, config, [rounds(run.step * config.views_per_step + nth) for nth in range(config.views_per_step)])
+            bar.update()
+            if run.step % config.check_every == 0:
+                _mark(run, config)
+                bar.set_postfix_str(f"{run.curve[-1].psnr_db:.2f} dB, {run.curve[-1].gaussians} splats")
+            if interrupted():
+                on_interrupt(run)
+            if reason := reason_to_stop(run.curve, run.watch.seconds, config):
+                return reason
+    return f"{config.steps} steps"
+
+
+def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) -> None:
+    if run.step == config.reset_opacity_at and task.white_background:
+        density.reset_opacities(run.student, run.optimizer)
+    set_rates(run.optimizer, config, run.step)
+    for view in views:
+        camera = view.zoomed(task.scale)
+        target = task.truth(view)  # r(x̂): the frozen base, resized
+        image = task.render(run.student, camera)  # x: the student at the new scale
+        loss = (image - target).square().mean()
+        loss.backward()
+        run.square_error += float(loss.detach()) / len(views)
+        if config.densify_gradient is not None:
+            run.gradients.add(run.student.parameters()["means"], camera)
+    run.optimizer.step()
+    run.optimizer.zero_grad()
+    run.step += 1
+    if run.step % config.prune_every == 0 and run.step < config.steps:
+        _control_density(run, task, config)
+
+
+@torch.no_grad()
+def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
+    if config.densify_gradient is not None:
+        shown = run.student.gaussians(task.views[0]).detach()
+        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
+        density.densify(run.student, run.optimizer, run.gradients.mean() >= config.densify_gradient, extent(task.views), shown, generator)
+    density.prune(run.student, run.optimizer, run.student.row_opacities() >= config.min_opacity)
+    means = run.student.parameters()["means"]
+    run.gradients = density.ScreenGradients(len(means), means.device)
+
+
+def _mark(run: Run, config: AdaptConfig) -> None:
+    """A new point of the curve, from the losses of the steps since the last one."""
+    mean = run.square_error / config.check_every
+    run.curve.append(CurvePoint(step=run.step, seconds=run.watch.seconds, psnr_db=decibel(mean), gaussians=len(run.student.row_opacities())))
+    run.square_error = 0.0

@@ -1,0 +1,44 @@
+"""Adam over a model's parameters by name, and the surgery that keeps moments and rows together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.models.base import SplatModel
+
+# INRIA's: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
+ADAM_EPS = 1e-15
+
+
+def make_optimizer(model: SplatModel, config: AdaptConfig, extent: float) -> torch.optim.Adam:
+    """One group per parameter that moves; the means' rate is times `extent`, in world units."""
+    rates = config.rates.model_dump()
+    rates["means"] *= extent
+    groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]
+    return torch.optim.Adam(groups, eps=ADAM_EPS, fused=True)
+
+
+def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, step: int) -> None:
+    """Each rate at `step` of its exponential decay."""
+    share = config.decay ** (step / max(1, config.steps))
+    for group in optimizer.param_groups:
+        group["lr"] = group["base_lr"] * share
+
+
+def change_rows(
+    model: SplatModel, optimizer: torch.optim.Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
+) -> None:
+    """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in model and optimizer alike."""
+    fresh = {}
+    for group in optimizer.param_groups:
+        old = group["params"][0]
+        new = parameter(group["name"], old.detach()).clone().requires_grad_()
+        state = optimizer.state.pop(old, {})
+        optimizer.state[new] = {k: moment(v) if torch.is_tensor(v) and v.shape == old.shape else v for k, v in state.items()}
+        group["params"] = [new]
+        fresh[group["name"]] = new
+    model.replace_parameters(fresh)

@@ -1,0 +1,54 @@
+"""The frozen teacher: what each camera should see at the new scale, made once per view from the base model and kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.models.base import SplatModel
+
+
+class PseudoTruth:
+    """The base model's view of a camera, resized to the wanted scale, [H, W, 3] float, cached by camera."""
+
+    def __init__(self, base: SplatModel, backend: Backend, effects: Effects, scale: float, config: AdaptConfig) -> None:
+        """`effects`: how the base is rendered at the scale that it was trained at."""
+        self._base, self._backend, self._effects, self._scale, self._config = base, backend, effects, scale, config
+        self._made: dict[Camera, Tensor] = {}
+
+    def __call__(self, view: Camera) -> Tensor:
+        """The pseudo truth of a camera of the base scale."""
+        if view not in self._made:
+            self._made[view] = self._make(view)
+        return self._made[view]
+
+    @torch.no_grad()
+    def _make(self, view: Camera) -> Tensor:
+        size = view.zoomed(self._scale).size
+        if self._scale > 1:
+            target = UPSAMPLERS.get(self._config.upsampler)(self._render(view, 1.0), size)
+        else:
+            target = resize(self._render(view, self._finest()), size, self._config.resize)
+        return target.clamp(0, 1).mul(255).round().div(255) if self._config.quantize_truth else target
+
+    def _finest(self) -> float:
+        """The share of the base scale that is rendered: a filter that reads many samples a pixel gains nothing from more."""
+        oversampling = self._config.truth_oversampling
+        return 1.0 if oversampling is None else min(1.0, oversampling * self._scale)
+
+    def _render(self, view: Camera, share: float) -> Tensor:
+        """The base at `share` of its own scale; its dilation keeps the size that it had in the world.
+
+        Clamped before any resizing, as a display does: unclamped highlights would bleed into their neighbors (-3 dB at x1/8).
+        """
+        camera = view if share == 1 else view.zoomed(share)
+        effects = replace(self._effects, eps2d=self._effects.eps2d * share**2)
+        return self._backend.render(self._base.gaussians(camera), camera, effects).image.clamp(0, 1)

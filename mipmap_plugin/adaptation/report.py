@@ -1,0 +1,44 @@
+"""What an adaptation did, gained and cost: the record that travels with the file."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import torch
+from pydantic import BaseModel, ConfigDict
+
+from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.config import AdaptConfig
+
+
+class Report(BaseModel):
+    """Everything needed to judge an adapted model, or to make it again."""
+
+    model_config = ConfigDict(frozen=True)
+
+    scale: float
+    base: str  # sha256 of the base checkpoint
+    settings: AdaptConfig
+    backend: str  # which, and why
+    views: str  # which, in a sentence
+    filters: str  # of the pseudo truth, the base and the adapted file
+    effects: list[str]
+    gaussians_before: int
+    gaussians_after: int
+    seconds: dict[str, float]  # "closed form", "optimization" (pseudo truth included), "total"
+    ended_by: str
+    curve: list[CurvePoint]
+    versions: dict[str, str]
+
+    def provenance(self) -> dict[str, Any]:
+        """What fits into a file's header: base, scale, settings, versions. Nothing in it depends on the clock."""
+        return {"scale": self.scale, "base": self.base, "settings": self.settings.model_dump(), "versions": self.versions}
+
+
+def versions() -> dict[str, str]:
+    try:
+        own = version("mipmap-plugin")
+    except PackageNotFoundError:  # run from a source tree that was not installed
+        own = "source"
+    return {"mipmap_plugin": own, "torch": torch.__version__}

@@ -1,0 +1,62 @@
+"""Which views are adapted to, and in which order: a shuffled round through all of them, then another, from one seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.scenes.trajectories import jittered, orbit
+
+# A checkpoint without cameras does not say how finely it was trained: this many px across 50 degrees is NeRF-Synthetic's density.
+ORBIT_PIXELS = 800
+ORBIT_VIEWS = 50
+
+
+class Rounds:
+    """Every view once per round, in an order that follows from (seed, round) alone, so that any step can be resumed."""
+
+    def __init__(self, views: Sequence[Camera], seed: int) -> None:
+        self.views, self._seed = list(views), seed
+        self._round, self._order = -1, []
+
+    def __call__(self, draw: int) -> Camera:
+        """The `draw`-th view since the beginning."""
+        turn, place = divmod(draw, len(self.views))
+        if turn != self._round:
+            generator = torch.Generator().manual_seed(self._seed * 1_000_003 + turn)  # a prime, so that seeds and rounds do not meet
+            self._round, self._order = turn, torch.randperm(len(self.views), generator=generator).tolist()
+        return self.views[self._order[place]]
+
+
+def extent(views: Sequence[Camera]) -> float:
+    """World units: 1.1 times the largest distance of a camera from their mean, INRIA's `spatial_lr_scale`.
+
+    A single camera, or several in one place, say nothing about size: then it is 1.
+    """
+    centers = torch.stack([view.center for view in views])
+    radius = 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
+    return radius if radius > 0 else 1.0
+
+
+def choose_views(cameras: Sequence[Camera], gaussians: Gaussians, config: AdaptConfig) -> tuple[list[Camera], str]:
+    """The base-scale cameras to adapt on, and a sentence that says which. Raises SettingsError when the policy finds none."""
+    generator = torch.Generator().manual_seed(config.seed)
+    if config.views == "orbit" or not cameras:
+        views = orbit(gaussians, (ORBIT_PIXELS, ORBIT_PIXELS), config.extra_views or ORBIT_VIEWS, generator)
+        why = "asked for" if cameras else "the checkpoint came without cameras"
+        return views, f"{len(views)} views of a generated orbit at {ORBIT_PIXELS} px ({why})"
+    if config.views == "given":
+        return list(cameras), f"the {len(cameras)} given views"
+    split = "test" if config.views == "test" else "train"
+    views = [camera for camera in cameras if camera.split == split]
+    if not views:
+        raise SettingsError(f"there are no {split} views among the {len(cameras)} cameras; ask for the views 'given'")
+    if config.views == "jittered":
+        extra = jittered(views, config.extra_views, generator)
+        return views + extra, f"{len(views)} train views and {len(extra)} around them"
+    return views, f"the {len(views)} {split} views"

@@ -1,0 +1,89 @@
+"""Settings: frozen, closed, documented in place. A recipe is a set of them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mipmap_plugin.errors import SettingsError
+
+ResizeFilter = Literal["box", "area", "bilinear", "pil-bicubic", "lanczos"]
+ViewPolicy = Literal["given", "train", "test", "orbit", "jittered"]
+Recipe = Literal["default", "paper", "instant"]
+
+
+class LearningRates(BaseModel):
+    """Adam's step for each raw parameter, named as in a gsplat checkpoint. 0 keeps a parameter where it is."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    means: float = Field(0.0, ge=0, description="Times the extent of the cameras, as INRIA's spatial_lr_scale.")
+    scales: float = Field(0.005, ge=0, description="Of the log scales.")
+    quats: float = Field(0.001, ge=0)
+    opacities: float = Field(0.05, ge=0, description="Of the logits.")
+    sh0: float = Field(0.0025, ge=0)
+    shN: float = Field(0.0025 / 20, ge=0)
+
+
+class AdaptConfig(BaseModel):
+    """How one checkpoint is adapted to one scale."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recipe: Recipe = Field("default", description="The name of the set that these settings started from.")
+    steps: int = Field(1000, ge=0, description="Optimizer steps at most.")
+    time_budget_s: float | None = Field(None, gt=0, description="Seconds after which adapting ends, whatever the step.")
+    patience: int | None = Field(None, gt=0, description="Stop at the knee: after this many checks in a row that gained less than `min_gain_db`.")
+    min_gain_db: float = Field(0.05, ge=0, description="Gain in dB between two checks that still pays.")
+    check_every: int = Field(50, gt=0, description="Steps between two points of the curve.")
+    seed: int = Field(0, ge=0, description="Everything random follows from it.")
+
+    resize: ResizeFilter = Field("pil-bicubic", description="How the base image is made smaller; the filter of the protocol that is aimed at.")
+    upsampler: str = Field("bicubic", description="How the base image is made larger, by name in the registry.")
+    quantize_truth: bool = Field(False, description="Round the pseudo truth to 8 bits, as files of PNG do.")
+    truth_oversampling: int | None = Field(None, gt=0, description="Render the base at most this many times finer than the target; None: at its own.")
+
+    views: ViewPolicy = Field("jittered", description="Which views are adapted to; `jittered`: the train views and others around them.")
+    extra_views: int = Field(100, ge=0, description="How many views `jittered` adds, or an orbit has.")
+
+    closed_form: bool = Field(True, description="Start from the closed form instead of from the base.")
+    rates: LearningRates = LearningRates()
+    decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling exponentially.")
+    views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
+    prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
+    min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")
+    densify_gradient: float | None = Field(None, gt=0, description="Screen gradient, NDC units, above which a splat is cloned or split; None: never.")
+    reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
+
+
+# The published code (METHODS.md §1): every quirk a named setting. Its centres never move, because its loader leaves the
+# rate's factor at 0; its zoom-out target is a bilinear resize without a prefilter, stored in 8 bits; on white it resets
+# all opacities at step 2; its zoom-in and zoom-out both take 1000 steps.
+_PAPER = dict(
+    views="given", steps=1000, resize="bilinear", upsampler="bicubic", quantize_truth=True, closed_form=False, rates=LearningRates(),
+    densify_gradient=2e-4, reset_opacity_at=2,
+)  # fmt: skip
+
+_INSTANT = dict(steps=0)
+
+_DEFAULT_OUT = dict(
+    steps=1000, patience=3, decay=0.05, truth_oversampling=4, views_per_step=2,
+    rates=LearningRates(means=1.6e-4, scales=0.01, quats=0.002, opacities=0.05, sh0=0.005, shN=0.005 / 10),
+)  # fmt: skip
+
+# Towards a bicubic or Lanczos target every step loses real dB against the closed form: the target knows nothing that the
+# base does not, and adds the kernel's ringing.
+_DEFAULT_IN = dict(steps=0)
+
+
+def recipe(name: Recipe, scale: float, **overrides: Any) -> AdaptConfig:
+    """The settings of a recipe at `scale`, with `overrides`. Raises SettingsError for an unknown name or a value out of range."""
+    default = _DEFAULT_OUT if scale < 1 else _DEFAULT_IN
+    known = {"default": default, "paper": _PAPER, "instant": _INSTANT}
+    if name not in known:
+        raise SettingsError(f"there is no recipe {name!r}; known are {', '.join(known)}")
+    try:
+        return AdaptConfig(**{"recipe": name, **known[name], **overrides})
+    except ValidationError as error:
+        raise SettingsError("; ".join(f"setting {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())) from None

@@ -1,0 +1,45 @@
+"""The backends of this machine as a table: what each lacks, or how it conforms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from mipmap_plugin.backends import get_backend, survey
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.conformance import Outcome, check_backend
+from mipmap_plugin.evaluation.report import markdown
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One backend, and why it cannot do the usual work of one device; empty when it can."""
+
+    name: str
+    device: str
+    reasons: tuple[str, ...]
+
+
+def listing() -> list[Listed]:
+    """Every known backend, asked for what adapting a 3DGS checkpoint needs on the devices that are here."""
+    devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
+    needs = [Needs(device, torch.float32, gradients=True, sh_degree=3, screen_filter="classic") for device in devices]
+    return [Listed(name, need.device, tuple(reasons)) for need in needs for name, reasons in survey(need).items()]
+
+
+def check(name: str) -> list[Outcome]:
+    """The conformance suite's outcome for each hard case. Raises SettingsError for an unknown backend."""
+    return check_backend(get_backend(name))
+
+
+def listing_table(rows: Sequence[Listed]) -> str:
+    return markdown(["backend", "device", "adapts 3DGS?"], [[r.name, r.device, "no: " + "; ".join(r.reasons) if r.reasons else "yes"] for r in rows])
+
+
+def check_table(rows: Sequence[Outcome]) -> str:
+    def verdict(row: Outcome) -> str:
+        return "skipped: " + row.message if row.skipped else "pass" if row.passed else "FAIL: " + row.message
+
+    return markdown(["case", "max error", "finite", "result"], [[r.case, f"{r.max_error:.1e}", "yes" if r.finite else "NO", verdict(r)] for r in rows])

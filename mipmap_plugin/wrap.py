@@ -1,0 +1,214 @@
+"""wrap_model(model).adapt(scale): test-time adaptation as a wrapper. What is wrapped never changes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.closed_form import closed_form
+from mipmap_plugin.adaptation.loop import Run, Task, adapt
+from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.report import Report, versions
+from mipmap_plugin.adaptation.resume import load_run, save_run
+from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.backends import choose_backend, supersample
+from mipmap_plugin.backends.base import Backend, Needs, Rendered
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig, Recipe
+from mipmap_plugin.config import recipe as make_config
+from mipmap_plugin.effects import DILATION, Effects, explain
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.files import write_json
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.inria_folder import read_options
+from mipmap_plugin.scenes import model_cameras
+
+# px² of a target pixel: the variance that the resize filter gives to a sample. A box has 1/12; the cubic of `pil-bicubic`
+# and Lanczos reproduce parabolas, so theirs is 0; two bilinear taps average like a box of the base's pixels.
+FILTER_VARIANCE = {"box": 1 / 12, "area": 1 / 12, "bilinear": 0.0, "pil-bicubic": 0.0, "lanczos": 0.0}
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during adaptation; the text says where the run can be resumed from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adapted:
+    """A model that looks right at its scale, and the report of how it came to."""
+
+    model: SplatModel
+    report: Report
+    backend: Backend
+    effects: Effects
+
+    def render(self, camera: Camera) -> Rendered:
+        """The view of a camera of the new scale."""
+        with torch.no_grad():
+            return supersample.render(self.backend, self.model.gaussians(camera), camera, self.effects)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
+        saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
+        write_json(saved.with_name(saved.name + ".adaptation.json"), self.report.model_dump(), overwrite=True)
+        return saved
+
+
+class Wrapped:
+    """A frozen base model with its cameras, ready to be adapted to any scale."""
+
+    def __init__(self, model: SplatModel, cameras: Sequence[Camera], backend: str, background: tuple[float, float, float] | None) -> None:
+        self.model, self.cameras, self._backend = model, list(cameras), backend
+        self.background = background or model.trained.background or (0.0, 0.0, 0.0)
+
+    def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1) -> Effects:
+        """How this model is rendered at `scale`.
+
+        `screen_filter`: None for what it was trained with, a filter's name, or "scaled" for the training-free filter
+        whose dilation keeps its size in the world.
+        """
+        trained = self.model.trained
+        degree = self.model.gaussians(self.any_camera()).used_sh_degree()
+        if screen_filter in (None, "scaled"):
+            eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
+            return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling)
+        return Effects(degree, screen_filter, DILATION, self.background, supersampling)
+
+    def backend(self, *, gradients: bool = False, screen_filter: str | None = None) -> tuple[Backend, str]:
+        """The backend that serves this model, and why it was taken."""
+        gaussians = self.model.gaussians(self.any_camera())
+        return choose_backend(self._backend, Needs.of(gaussians, self.effects(screen_filter=screen_filter), gradients=gradients))
+
+    def render(self, camera: Camera, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1) -> Rendered:
+        """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did."""
+        effects = self.effects(scale, screen_filter, supersampling)
+        with torch.no_grad():
+            return supersample.render(self.backend(screen_filter=screen_filter)[0], self.model.gaussians(camera), camera, effects)
+
+    def adapt(
+        self,
+        scale: float,
+        *,
+        recipe: Recipe = "default",
+        cameras: Sequence[Camera] | None = None,
+        resume: str | Path | None = None,
+        **settings: Any,
+    ) -> Adapted:
+        """A new model for `scale` (target focal length in px over base focal length in px); the base stays as it is.
+
+        `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override the recipe's, by the names
+        of AdaptConfig: steps, time_budget_s, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
+        and raises Interrupted, and a finished run removes it. Raises SettingsError and BackendUnavailable.
+        """
+        if not 0 < scale < float("inf"):
+            raise SettingsError(f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4")
+        config = make_config(recipe, scale, **settings)
+        return _Adaptation(self, scale, config, self.cameras if cameras is None else list(cameras)).run(resume and Path(resume))
+
+    def views(self) -> list[Camera]:
+        """The checkpoint's cameras, or a generated orbit where it came without any."""
+        return self.cameras or choose_views([], self.model.gaussians(self.any_camera()), AdaptConfig())[0]
+
+    def any_camera(self) -> Camera:
+        return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
+
+
+def wrap_model(
+    model: SplatModel | str | Path,
+    *,
+    cameras: Sequence[Camera] | None = None,
+    backend: str = "auto",
+    background: tuple[float, float, float] | None = None,
+) -> Wrapped:
+    """Wrap a loaded model, or the checkpoint at a path. `cameras`: views of the scale it was trained at; by default those
+    beside the checkpoint. `background`: linear RGB; by default what the checkpoint says, else black."""
+    if isinstance(model, (str, Path)):
+        model = load_model(model)
+    return Wrapped(model, own_cameras(model) if cameras is None else cameras, backend, background)
+
+
+def own_cameras(model: SplatModel) -> list[Camera]:
+    """The cameras beside the model's file, at the size that it was trained at; empty where there are none."""
+    return model_cameras(model.folder, read_options(model.folder)[0])
+
+
+class _Adaptation:
+    """One call of adapt: the pieces, made once, and the order they run in."""
+
+    def __init__(self, wrapped: Wrapped, scale: float, config: AdaptConfig, cameras: list[Camera]) -> None:
+        self.base, self.scale, self.config = wrapped.model, scale, config
+        self.backend, self.why = wrapped.backend(gradients=config.steps > 0)
+        self.trained = wrapped.effects()
+        self.effects = replace(self.trained, screen_filter="classic", eps2d=DILATION)
+        self.views, self.which = choose_views(cameras, self.base.gaussians(wrapped.any_camera()).detach(), config)
+        self.seconds: dict[str, float] = {}
+
+    def run(self, resume: Path | None) -> Adapted:
+        began = time.perf_counter()
+        student = self.base.copy()
+        student.trained = replace(student.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
+        if self.config.closed_form:
+            self._start_closed_form(student)
+        task = Task(self.views, self.scale, PseudoTruth(self.base, self.backend, self.trained, self.scale, self.config), self._render, self._white)
+        fingerprint = self._fingerprint()
+        run = load_run(resume, student, task, self.config, fingerprint) if resume and resume.exists() else Run.start(student, task, self.config)
+        before = run.watch.seconds
+        ended_by = adapt(run, task, self.config, lambda run: _stop(run, resume, fingerprint))
+        if resume:
+            resume.unlink(missing_ok=True)
+        self.seconds |= {"optimization": run.watch.seconds, "total": time.perf_counter() - began + before}
+        return Adapted(student, self._report(run, ended_by), self.backend, self.effects)
+
+    @torch.no_grad()
+    def _start_closed_form(self, student: SplatModel) -> None:
+        began = time.perf_counter()
+        variance = FILTER_VARIANCE[self.config.resize] if self.scale < 1 else 0.0
+        student.reshape(*closed_form(self.base.gaussians(self.views[0]), self.views, self.scale, self.trained, variance))
+        self.seconds["closed form"] = time.perf_counter() - began
+
+    def _render(self, model: SplatModel, camera: Camera) -> Tensor:
+        return self.backend.render(model.gaussians(camera), camera, self.effects).image
+
+    @property
+    def _white(self) -> bool:
+        return self.effects.background == (1.0, 1.0, 1.0)
+
+    def _fingerprint(self) -> str:
+        """Names what a run depends on, so that a state is never resumed as another run."""
+        poses = [[view.width, view.height, view.fx, view.fy, *view.viewmat.flatten().tolist()] for view in self.views]
+        facts = [self.base.digest, self.scale, self.config.model_dump(), self.backend.name, self.trained.background, poses]
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+    def _report(self, run: Run, ended_by: str) -> Report:
+        truth = self.config.resize if self.scale < 1 else self.config.upsampler
+        before = self.base.gaussians(self.views[0])
+        return Report(
+            scale=self.scale,
+            base=self.base.digest,
+            settings=self.config,
+            backend=self.why,
+            views=self.which,
+            filters=f"pseudo truth {truth}; base {self.trained.screen_filter} {self.trained.eps2d:g} px²; file classic {DILATION:g} px²",
+            effects=[f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(self.effects, before)],
+            gaussians_before=len(before),
+            gaussians_after=len(run.student.row_opacities()),
+            seconds=self.seconds,
+            ended_by=ended_by,
+            curve=run.curve,
+            versions=versions(),
+        )
+
+
+def _stop(run: Run, resume: Path | None, fingerprint: str) -> None:
+    if resume is None:
+        raise Interrupted(f"interrupted at step {run.step}; nothing was written, for no file to resume from was named")
+    save_run(run, resume, fingerprint)
+    raise Interrupted(f"interrupted at step {run.step}; run the same command again to go on from {resume}")
