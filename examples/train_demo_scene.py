@@ -41,7 +41,8 @@ def first_guess(count: int) -> VanillaModel:
     sh = torch.zeros(count, (DEGREE + 1) ** 2, 3)
     sh[:, 0] = (colors - 0.5) / C0
     unturned = torch.tensor([1.0, 0, 0, 0]).expand(count, 4)
-    return VanillaModel.from_gaussians(Gaussians(points, unturned, spacing.expand(count, 3), torch.full((count,), 0.3), sh), TRAINED)
+    round_splats = Gaussians(points, unturned, spacing.expand(count, 3), torch.full((count,), 0.3), sh)
+    return VanillaModel.from_gaussians(round_splats, TRAINED)
 
 
 def train(model: VanillaModel, views: list[Camera], truth: dict[Camera, Tensor], config: AdaptConfig) -> VanillaModel:

@@ -137,7 +137,7 @@ def render(
     checkpoint: Checkpoint,
     output: Path,
     scale: Scale = 1.0,
-    view: tyro.conf.UseAppendAction[list[str]] | None = None,
+    view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     screen_filter: Literal["trained", "scaled", "classic", "antialiased"] = "trained",
     supersampling: int = 1,
     cameras: Path | None = None,
@@ -175,8 +175,8 @@ def evaluate(
     checkpoint: Checkpoint,
     images: Path,
     scale: Scales,
-    recipe: tyro.conf.UseAppendAction[list[Recipe]] | None = None,
-    views: tyro.conf.UseAppendAction[list[ViewPolicy]] | None = None,
+    recipe: tyro.conf.UseAppendAction[tuple[Recipe, ...]] = (),
+    views: tyro.conf.UseAppendAction[tuple[ViewPolicy, ...]] = (),
     protocol: Literal["P1", "P2", "P3"] = "P3",
     steps: int | None = None,
     background: Background | None = None,
@@ -210,7 +210,7 @@ def evaluate(
         refuse_existing(output, overwrite)
     wrapped = _wrap(checkpoint, None, background, backend)
     overrides: dict[str, Any] = {"seed": seed} | ({} if steps is None else {"steps": steps})
-    rows = rows_of(wrapped, load_scene(images), scale, recipe or [], views or ["train"], protocol, overrides)
+    rows = rows_of(wrapped, load_scene(images), scale, recipe, views or ("train",), protocol, overrides)
     if output:
         write_json(output, records(rows), overwrite)
     if json:
@@ -268,7 +268,7 @@ def _summary(cameras: Sequence[Camera]) -> str:
     return f"{len(cameras)}, {cameras[0].width} x {cameras[0].height} px, {sum(c.split == 'test' for c in cameras)} of them test views"
 
 
-def _named(wrapped: Wrapped, names: Sequence[str] | None) -> list[Camera]:
+def _named(wrapped: Wrapped, names: Sequence[str]) -> list[Camera]:
     cameras = wrapped.views()
     if not names:
         return [c for c in cameras if c.split == "test"] or cameras
@@ -294,7 +294,7 @@ def _tell(facts: Any, as_json: bool) -> None:
     for name, value in facts.items():
         lines = value if isinstance(value, list) else [value]
         for line in lines:
-            print(f"{name + ':':14}{line}")
+            print(f"{name + ':' if name else '':14}{line}")
             name = ""
 
 

@@ -35,7 +35,8 @@ def check(name: str) -> list[Outcome]:
 
 
 def listing_table(rows: Sequence[Listed]) -> str:
-    return markdown(["backend", "device", "adapts 3DGS?"], [[r.name, r.device, "no: " + "; ".join(r.reasons) if r.reasons else "yes"] for r in rows])
+    body = [[row.name, row.device, "no: " + "; ".join(row.reasons) if row.reasons else "yes"] for row in rows]
+    return markdown(["backend", "device", "adapts 3DGS?"], body)
 
 
 def check_table(rows: Sequence[Outcome]) -> str:
