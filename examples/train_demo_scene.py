@@ -63,7 +63,9 @@ def best_rows(model: VanillaModel, count: int) -> VanillaModel:
     return model.keep_rows(keep)
 
 
-def main(output: tyro.conf.Positional[Path], size: int = 160, views: int = 105, points: int = 9_000, splats: int = 12_000, steps: int = 6_000) -> None:
+def main(
+    output: tyro.conf.Positional[Path], size: int = 160, views: int = 105, points: int = 9_000, splats: int = 12_000, steps: int = 5_000
+) -> None:
     """Ray-trace, train, prune to `splats`, train on, save.
 
     Args:

@@ -68,8 +68,8 @@ _PAPER = dict(
 _INSTANT = dict(steps=0)
 
 _DEFAULT_OUT = dict(
-    steps=1000, patience=3, decay=0.05, truth_oversampling=4, views_per_step=2,
-    rates=LearningRates(means=1.6e-4, scales=0.01, quats=0.002, opacities=0.05, sh0=0.005, shN=0.005 / 10),
+    steps=400, patience=2, decay=0.3, truth_oversampling=4, views_per_step=2,
+    rates=LearningRates(means=3.2e-4, scales=0.01, quats=0.002, opacities=0.05, sh0=0.01, shN=0.001),
 )  # fmt: skip
 
 # Towards a bicubic or Lanczos target every step loses real dB against the closed form: the target knows nothing that the

@@ -30,7 +30,7 @@ THINNEST = 0.01
 AREA_POWER = 1.25
 
 # Views that the distance and the area of a splat are averaged over; more change a result of this accuracy by nothing.
-ENOUGH_VIEWS = 24
+ENOUGH_VIEWS = 12
 
 
 def closed_form(
@@ -40,7 +40,7 @@ def closed_form(
 
     `views` are cameras of the base scale, `effects` is how the base was trained, `filter_variance` is k in target px².
     """
-    views = views[:: max(1, len(views) // ENOUGH_VIEWS)]
+    views = views[:: -(-len(views) // ENOUGH_VIEWS)]
     base_pixel = pixel_size(gaussians.means, views)
     target_pixel = base_pixel / scale
     change = effects.eps2d * base_pixel**2 - (effects.eps2d - filter_variance) * target_pixel**2

@@ -35,7 +35,7 @@ def check(name: str) -> list[Outcome]:
 
 
 def listing_table(rows: Sequence[Listed]) -> str:
-    body = [[row.name, row.device, "no: " + "; ".join(row.reasons) if row.reasons else "yes"] for row in rows]
+    body = [[row.name, row.device, f"no: {'; '.join(row.reasons)}" if row.reasons else "yes"] for row in rows]
     return markdown(["backend", "device", "adapts 3DGS?"], body)
 
 
@@ -43,4 +43,5 @@ def check_table(rows: Sequence[Outcome]) -> str:
     def verdict(row: Outcome) -> str:
         return "skipped: " + row.message if row.skipped else "pass" if row.passed else "FAIL: " + row.message
 
-    return markdown(["case", "max error", "finite", "result"], [[r.case, f"{r.max_error:.1e}", "yes" if r.finite else "NO", verdict(r)] for r in rows])
+    body = [[row.case, f"{row.max_error:.1e}", "yes" if row.finite else "NO", verdict(row)] for row in rows]
+    return markdown(["case", "max error", "finite", "result"], body)

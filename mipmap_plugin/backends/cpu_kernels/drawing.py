@@ -18,9 +18,8 @@ from mipmap_plugin.backends.projection import FRUSTUM_MARGIN
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 
-# Splats and tiles in one range: some hundred microseconds of work, so that handing it out costs nothing.
-SPLATS_AT_ONCE = 4096
-TILES_AT_ONCE = 4
+# Work is cut finer than there are threads: crowded tiles take longer than others. Much finer, and handing it out would take time.
+RANGES_PER_THREAD = 16
 
 
 class Drawing(NamedTuple):
@@ -42,17 +41,17 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
     view = view_of(camera, effects, splats)
     count, (height, width) = len(splats.means), camera.size
     table, depths, counts = _empty(count, col.COLUMNS), _empty(count), np.empty(count, np.int64)
-    _share(projection.project, count, SPLATS_AT_ONCE, view, splats, table, depths, counts)
+    _share(projection.project, count, view, splats, table, depths, counts)
 
     slots = np.concatenate([[0], np.cumsum(counts)])
     tiles = np.empty(slots[-1], np.int32)
-    _share(binning.cover, count, SPLATS_AT_ONCE, table, slots, width, height, tiles)
+    _share(binning.cover, count, table, slots, width, height, tiles)
     columns, rows = binning.tile_grid(width, height)
     starts, members, member_slots = binning.fill_lists(binning.depth_order(depths, counts), slots, tiles, columns * rows)
 
     background = np.array(effects.background, np.float32)
     image, through, stops = _empty(height, width, 3), _empty(height, width), _empty(height, width)
-    _share(compositing.composite, columns * rows, TILES_AT_ONCE, table, starts, members, background, image, through, stops)
+    _share(compositing.composite, columns * rows, table, starts, members, background, image, through, stops)
     return image, Drawing(view, background, table, slots, starts, members, member_slots, through, stops)
 
 
@@ -61,9 +60,9 @@ def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np
     d = drawing
     pulls = _empty(len(d.members), col.PULLS)
     maps = (d.background, d.through, d.stops, d_image, d_alpha)
-    _share(compositing.composite_back, len(d.starts) - 1, TILES_AT_ONCE, d.table, d.starts, d.members, d.member_slots, *maps, pulls)
+    _share(compositing.composite_back, len(d.starts) - 1, d.table, d.starts, d.members, d.member_slots, *maps, pulls)
     grads = Splats(*(_empty(*array.shape) for array in splats))
-    _share(projection.project_back, len(splats.means), SPLATS_AT_ONCE, d.view, splats, d.table, d.slots, pulls, grads)
+    _share(projection.project_back, len(splats.means), d.view, splats, d.table, d.slots, pulls, grads)
     return grads
 
 
@@ -105,16 +104,24 @@ def _empty(*shape: int) -> np.ndarray:
     return torch.empty(shape).numpy()  # aligned to cache lines, which numpy's own memory is not
 
 
-def _share(kernel: Callable[..., None], count: int, at_once: int, *arguments) -> None:
+def _share(kernel: Callable[..., None], count: int, *arguments) -> None:
     """Run `kernel(start, stop, *arguments)` over 0..count on torch's number of threads.
 
     Threads live as long as the call: an idle pool would not survive a fork, and two callers would get in each other's way.
     """
-    ranges = [(start, min(start + at_once, count)) for start in range(0, count, at_once)]
-    threads = min(torch.get_num_threads(), len(ranges))
+    threads = min(torch.get_num_threads(), count)
     if threads < 2:
         kernel(0, count, *arguments)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(kernel, *each, *arguments) for each in ranges]:
-            done.result()
+    step = -(-count // (threads * RANGES_PER_THREAD))
+    starts = iter(range(0, count, step))
+
+    def work() -> None:
+        for start in starts:
+            kernel(start, min(start + step, count), *arguments)
+
+    with ThreadPoolExecutor(threads - 1) as pool:
+        others = [pool.submit(work) for _ in range(threads - 1)]
+        work()
+        for other in others:
+            other.result()

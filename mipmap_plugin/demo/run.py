@@ -1,0 +1,86 @@
+"""`mipmap-plugin demo`: the main job on the embedded scene, judged against its ray-traced truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.demo.world import render_world
+from mipmap_plugin.evaluation.evaluate import Row, adapted_row, training_free_rows
+from mipmap_plugin.evaluation.protocols import Protocol
+from mipmap_plugin.evaluation.report import table
+from mipmap_plugin.files import refuse_existing
+from mipmap_plugin.scenes import read_cameras
+from mipmap_plugin.scenes.images import write_image
+from mipmap_plugin.wrap import Wrapped, wrap_model
+
+PROTOCOL = Protocol("demo", "box", truncate=False)
+
+# Views judged on: each costs a ray-traced image of 640 x 640 px at x4.
+JUDGED = 3
+
+# Samples per pixel of the truth: many where pixels are large and few.
+SAMPLES = {True: 64, False: 4}  # zoomed out, zoomed in
+
+# Pictures are shown at this many px, so that a small image is enlarged pixel by pixel and the eye sees what a screen shows.
+SHOWN = 480
+
+# Seconds for each scale; the demo should end within three minutes, whichever backend it finds.
+BUDGET_S = 30.0
+
+
+class WorldView:
+    """A view whose truth can be had at any scale, because the world is ray-traced."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+
+    @cache  # noqa: B019  views live as long as the demo
+    def truth(self, scale: float, protocol: Protocol) -> Tensor:
+        """[h, w, 3] at `scale` times the base scale."""
+        return protocol.quantized(render_world(self.camera.zoomed(scale), samples=SAMPLES[scale < 1]))
+
+
+def embedded() -> Wrapped:
+    """The demo's base checkpoint with its cameras."""
+    home = Path(str(files("mipmap_plugin.demo")))
+    return wrap_model(home / "base.ply", cameras=read_cameras(home / "cameras.json", {"eval": True}), background=(1.0, 1.0, 1.0))
+
+
+def run_demo(output: Path, scales: Sequence[float], *, overwrite: bool = False) -> str:
+    """Adapt to each scale, write checkpoints and pictures into `output`, and return the table. Raises OutputExists."""
+    base = embedded()
+    for scale in scales:
+        refuse_existing(output / f"x{scale:g}.ply", overwrite)
+    views = [WorldView(camera) for camera in base.cameras if camera.split == "test"]
+    views = views[:: len(views) // JUDGED][:JUDGED]
+    rows: list[Row] = []
+    for scale in scales:
+        adapted = base.adapt(scale, resize="box", time_budget_s=BUDGET_S)
+        rows += [*training_free_rows(base, views, scale, PROTOCOL), adapted_row("adapted", adapted, views, PROTOCOL)]
+        adapted.save(output / f"x{scale:g}.ply", overwrite=overwrite)
+        camera = views[0].camera.zoomed(scale)
+        pictures = [base.render(camera).image, adapted.render(camera).image, views[0].truth(scale, PROTOCOL)]
+        write_image(output / f"x{scale:g}_base_adapted_truth.png", side_by_side(pictures), overwrite=overwrite)
+    return (
+        f"{table(rows)}\n\nReal dB, against the ray-traced world, over {JUDGED} views that nothing was trained or adapted on.\n"
+        f"Pictures (base | adapted | truth) and checkpoints for any viewer: {output.resolve()}"
+    )
+
+
+def side_by_side(pictures: Sequence[Tensor]) -> Tensor:
+    """Pictures [h, w, 3] of one size beside each other, each about SHOWN px high: small ones enlarged by whole pixels."""
+    height, width = pictures[0].shape[:2]
+    times = max(1, SHOWN // height)
+    shown = [picture.repeat_interleave(times, 0).repeat_interleave(times, 1) for picture in pictures]
+    if height > SHOWN:
+        shown = [resize(picture, (SHOWN, round(width * SHOWN / height)), "pil-bicubic") for picture in pictures]
+    gap = torch.ones(shown[0].shape[0], SHOWN // 40, 3)
+    return torch.cat([shown[0], *(part for picture in shown[1:] for part in (gap, picture))], dim=1)
