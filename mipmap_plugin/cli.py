@@ -176,7 +176,6 @@ def evaluate(
     images: Path,
     scale: Scales,
     recipe: tyro.conf.UseAppendAction[tuple[Recipe, ...]] = (),
-    views: tyro.conf.UseAppendAction[tuple[ViewPolicy, ...]] = (),
     protocol: Literal["P1", "P2", "P3"] = "P3",
     steps: int | None = None,
     background: Background | None = None,
@@ -192,8 +191,7 @@ def evaluate(
         checkpoint: A PLY or a model folder; its cameras tell the base scale.
         images: Folder of the scene (transforms_*.json and the images).
         scale: Target over base, such as 1/4 or 4; 1 is the base itself. May be given several times.
-        recipe: Adapt with this recipe and judge the result; may be given several times.
-        views: Adapt on these views, for each recipe; may be given several times. "test" are the very views that are judged on.
+        recipe: Adapt with this recipe, once on views that are not judged on and once on those that are; may be given several times.
         protocol: How a photograph becomes the truth at another scale: P1 box, truncated; P2, P3 Pillow's bicubic.
         steps: Optimizer steps at most, instead of the recipe's.
         background: Of the scene; by default what the checkpoint says, else black.
@@ -209,8 +207,8 @@ def evaluate(
     if output:
         refuse_existing(output, overwrite)
     wrapped = _wrap(checkpoint, None, background, backend)
-    overrides: dict[str, Any] = {"seed": seed} | ({} if steps is None else {"steps": steps})
-    rows = rows_of(wrapped, load_scene(images), scale, recipe, views or ("train",), protocol, overrides)
+    overrides = {"seed": seed} | ({} if steps is None else {"steps": steps})
+    rows = rows_of(wrapped, load_scene(images), scale, recipe, protocol, **overrides)
     if output:
         write_json(output, records(rows), overwrite)
     if json:

@@ -11,12 +11,13 @@ axis cannot become narrower than nothing: what is left too wide is paid for in o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.backends.filters import footprint
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -46,10 +47,11 @@ def closed_form(
     change = effects.eps2d * base_pixel**2 - (effects.eps2d - filter_variance) * target_pixel**2
     thinnest = (THINNEST * target_pixel)[:, None]
     scales = (gaussians.scales.square() + change[:, None]).clamp_min(0).sqrt().maximum(thinnest)
+    opacities = gaussians.opacities * _compensation(gaussians, views, effects)
     if scale > 1:
-        return scales, gaussians.opacities
+        return scales, opacities
     kept = _area_ratio(gaussians, replace(gaussians, scales=scales), views, scale, effects, filter_variance)
-    return scales, gaussians.opacities * kept**AREA_POWER
+    return scales, opacities * kept**AREA_POWER
 
 
 def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
@@ -65,16 +67,31 @@ def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
     return torch.where(seen > 0, total / seen.clamp_min(1), anywhere / len(views))
 
 
+def _compensation(gaussians: Gaussians, views: Sequence[Camera], effects: Effects) -> Tensor | float:
+    """[N], at most 1: the share of its opacity that the base shows of a splat, which a classic renderer would not take off."""
+    if effects.screen_filter != "antialiased":
+        return 1.0
+    ones = torch.ones_like(gaussians.opacities)
+    return _mean_in_front(gaussians, views, effects.near_plane, lambda _, shown: footprint(shown, ones, "antialiased", effects.eps2d).opacities)
+
+
 def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: float, effects: Effects, variance: float) -> Tensor:
-    """[N], at most 1: the area that the target shows of a splat over the area that a classic renderer will draw, averaged over the views."""
-    total, seen = (torch.zeros_like(old.opacities) for _ in range(2))
-    for view in views:
-        camera = view.zoomed(scale)
-        shown = project(old, camera, effects.near_plane)
+    """[N], at most 1: the area that the target shows of a splat over the area that a classic renderer will draw."""
+
+    def ratio(camera: Camera, shown: Projected) -> Tensor:
         drawn = project(new, camera, effects.near_plane)
-        ratio = (_det(shown, effects.eps2d * scale**2 + variance) / _det(drawn, effects.eps2d)).sqrt().clamp_max(1)
-        in_front = (shown.depths > effects.near_plane).to(ratio)
-        total, seen = total + in_front * ratio, seen + in_front
+        return (_det(shown, effects.eps2d * scale**2 + variance) / _det(drawn, effects.eps2d)).sqrt().clamp_max(1)
+
+    return _mean_in_front(old, [view.zoomed(scale) for view in views], effects.near_plane, ratio)
+
+
+def _mean_in_front(gaussians: Gaussians, views: Sequence[Camera], near: float, of: Callable[[Camera, Projected], Tensor]) -> Tensor:
+    """[N]: the mean of `of(view, its projection)` over the views that a splat lies in front of; 1 where there is none."""
+    total, seen = (torch.zeros_like(gaussians.opacities) for _ in range(2))
+    for view in views:
+        projected = project(gaussians, view, near)
+        in_front = (projected.depths > near).to(total)
+        total, seen = total + in_front * of(view, projected), seen + in_front
     return torch.where(seen > 0, total / seen.clamp_min(1), 1.0)
 
 

@@ -1,0 +1,51 @@
+"""Every recipe on real base checkpoints against real test images (protocol P3).
+
+    python benchmarks/real_bases.py DATA --only lego_200 --output benchmarks/results
+
+DATA holds `checkpoints/bases/<scene>_<px>` (3DGS model folders) and `images/<scene>` (NeRF-Synthetic folders). Writes
+<base>.json, as `mipmap-plugin evaluate --json` does, for each base, and real_bases.md from all that lie in the output folder.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import tyro
+
+from mipmap_plugin import load_scene, wrap_model
+from mipmap_plugin.evaluation.evaluate import Row, evaluate
+from mipmap_plugin.evaluation.report import records, table
+from mipmap_plugin.files import write_json
+
+# The scales that each base was trained for the study of; see its own page.
+SCALES = {"lego_200": (1, 1 / 2, 1 / 4, 1 / 8), "chair_400": (1, 1 / 2, 1 / 4, 1 / 8), "lego_100": (1, 2, 4, 8), "chair_100": (1, 2, 4, 8)}
+RECIPES = ("instant", "paper", "default")
+
+
+def main(
+    data: tyro.conf.Positional[Path],
+    output: Path = Path("benchmarks/results"),
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    backend: str = "auto",
+) -> None:
+    """Measure, and write the tables.
+
+    Args:
+        data: The folder with checkpoints/ and images/.
+        output: Where the results go; rows of bases that were measured before are replaced.
+        only: Which bases; all by default.
+        backend: A backend's name.
+    """
+    for base in only or SCALES:
+        wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
+        rows = evaluate(wrapped, load_scene(data / "images" / base.split("_")[0]), SCALES[base], RECIPES, "P3")
+        write_json(output / f"{base}.json", records(rows), overwrite=True)
+        print(f"{base}\n{table(rows)}\n", flush=True)
+    parts = [f"## {file.stem}\n\n{table([Row(**row) for row in json.loads(file.read_text())])}\n" for file in sorted(output.glob("*_[0-9]*.json"))]
+    intro = "# Real bases against real test images\n\nMade by `python benchmarks/real_bases.py DATA`. Protocol P3, mean of 25 test views.\n\n"
+    (output / "real_bases.md").write_text(intro + "\n".join(parts))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
