@@ -86,12 +86,12 @@ def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: 
 
 
 def _mean_in_front(gaussians: Gaussians, views: Sequence[Camera], near: float, of: Callable[[Camera, Projected], Tensor]) -> Tensor:
-    """[N]: the mean of `of(view, its projection)` over the views that a splat lies in front of; 1 where there is none."""
+    """[N]: the mean of `of(view, its projection)` over the views in front of which a splat lies; 1 where there is none."""
     total, seen = (torch.zeros_like(gaussians.opacities) for _ in range(2))
     for view in views:
         projected = project(gaussians, view, near)
-        in_front = (projected.depths > near).to(total)
-        total, seen = total + in_front * of(view, projected), seen + in_front
+        in_front = projected.depths > near
+        total, seen = total + torch.where(in_front, of(view, projected), 0.0), seen + in_front
     return torch.where(seen > 0, total / seen.clamp_min(1), 1.0)
 
 

@@ -31,11 +31,11 @@ class ScreenGradients:
         self.total = torch.zeros(count, device=device)
         self.seen = torch.zeros(count, device=device)
 
-    def add(self, means: Tensor, camera: Camera) -> None:
-        """Take the gradient that `means` [N, 3] hold after one view's backward pass."""
+    def add(self, means: Tensor, gradient: Tensor, camera: Camera) -> None:
+        """Take one view's `gradient` [N, 3] of the `means` [N, 3]."""
         viewmat = camera.viewmat.to(means)
         depths = (means.detach() @ viewmat[2, :3] + viewmat[2, 3]).abs()
-        across = means.grad @ viewmat[:2, :3].T
+        across = gradient @ viewmat[:2, :3].T
         per_ndc = across * depths[:, None] * across.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2
         norm = per_ndc.norm(dim=1)
         self.total += norm
@@ -80,14 +80,11 @@ def densify(model: SplatModel, optimizer: torch.optim.Adam, grown: Tensor, exten
     change_rows(model, optimizer, rebuild, lambda old: old[rows].masked_fill(fresh.view(-1, *[1] * (old.dim() - 1)), 0.0))
 
 
-def reset_opacities(model: SplatModel, optimizer: torch.optim.Adam) -> None:
+def reset_opacities(optimizer: torch.optim.Adam) -> None:
     """Cut every opacity logit to at most that of 0.01, and forget its moments."""
-    most = torch.logit(torch.tensor(RESET_OPACITY)).item()
-
-    def cut(name: str, old: Tensor) -> Tensor:
-        return old.clamp_max(most) if name == "opacities" else old
-
-    change_rows(model, optimizer, cut, lambda old: old)
     for group in optimizer.param_groups:
         if group["name"] == "opacities":
-            optimizer.state[group["params"][0]] = {}
+            logits = group["params"][0]
+            with torch.no_grad():
+                logits.clamp_(max=torch.logit(torch.tensor(RESET_OPACITY)).item())
+            optimizer.state[logits] = {}

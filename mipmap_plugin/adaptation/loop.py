@@ -41,6 +41,7 @@ class Run:
     step: int = 0
     curve: list[CurvePoint] = field(default_factory=list)
     square_error: float = 0.0  # summed over the views since the last point of the curve
+    rows_changed: bool = False  # splats were added or removed
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
@@ -73,8 +74,10 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
 
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
-        density.reset_opacities(run.student, run.optimizer)
+        density.reset_opacities(run.optimizer)
     set_rates(run.optimizer, config, run.step)
+    means = run.student.parameters()["means"]
+    before = torch.zeros_like(means)  # their gradient from the views before this one
     for view in views:
         camera = view.zoomed(task.scale)
         target = task.truth(view)  # r(x̂): the frozen base, resized
@@ -83,7 +86,8 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         loss.backward()
         run.square_error += float(loss.detach()) / len(views)
         if config.densify_gradient is not None:
-            run.gradients.add(run.student.parameters()["means"], camera)
+            run.gradients.add(means, means.grad - before, camera)
+            before = means.grad.clone()
     run.optimizer.step()
     run.optimizer.zero_grad()
     run.step += 1
@@ -93,6 +97,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
 
 @torch.no_grad()
 def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
+    before = run.student.parameters()["means"]
     if config.densify_gradient is not None:
         shown = run.student.gaussians(task.views[0]).detach()
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
@@ -100,6 +105,7 @@ def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     density.prune(run.student, run.optimizer, run.student.row_opacities() >= config.min_opacity)
     means = run.student.parameters()["means"]
     run.gradients = density.ScreenGradients(len(means), means.device)
+    run.rows_changed |= means is not before
 
 
 def _mark(run: Run, config: AdaptConfig) -> None:

@@ -25,6 +25,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "step": run.step,
         "seconds": run.watch.seconds,
         "square_error": run.square_error,
+        "rows_changed": run.rows_changed,
         "curve": [point.model_dump() for point in run.curve],
         "parameters": {name: tensor.detach() for name, tensor in run.student.parameters().items()},
         "optimizer": run.optimizer.state_dict(),
@@ -40,13 +41,18 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
     if state.get("fingerprint") != fingerprint:
         raise SettingsError(f"{path}: it belongs to another base, other settings or other views; repeat those, or delete the file to start anew")
     device = student.parameters()["means"].device
-    student.replace_parameters({name: tensor.to(device).requires_grad_() for name, tensor in state["parameters"].items()})
+    if state["rows_changed"]:
+        student.replace_parameters({name: tensor.to(device).requires_grad_() for name, tensor in state["parameters"].items()})
+    else:  # the rows are those of the base, and so are whatever the model carries along by row
+        with torch.no_grad():
+            for name, tensor in student.parameters().items():
+                tensor.copy_(state["parameters"][name])
     optimizer = make_optimizer(student, config, extent(task.views))
     optimizer.load_state_dict(state["optimizer"])
     gradients = ScreenGradients(0, device)
     gradients.total, gradients.seen = (tensor.to(device) for tensor in state["gradients"])
     curve = [CurvePoint(**point) for point in state["curve"]]
-    return Run(student, optimizer, Stopwatch(device, state["seconds"]), gradients, state["step"], curve, state["square_error"])
+    return Run(student, optimizer, Stopwatch(device, state["seconds"]), gradients, state["step"], curve, state["square_error"], state["rows_changed"])
 
 
 def _read(path: Path) -> dict[str, Any]:

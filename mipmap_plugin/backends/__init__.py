@@ -24,7 +24,11 @@ def register_backend(name: str, target: Any, *, replace: bool = False) -> None:
 
 def get_backend(name: str) -> Backend:
     """The backend `name`. Raises SettingsError when unknown, PluginError when it does not load or is of another API version."""
-    backend = BACKENDS.get(name)()
+    maker = BACKENDS.get(name)
+    try:
+        backend = maker()
+    except Exception as error:  # a stranger's constructor may fail in any way; one broken plugin must not break the others
+        raise PluginError(f"backend {name!r} cannot be made: {type(error).__name__}: {error}") from error
     if getattr(backend, "api_version", None) != API_VERSION:
         raise PluginError(f"backend {name!r} is written for API version {getattr(backend, 'api_version', 'unknown')}, this package has {API_VERSION}")
     return backend

@@ -1,0 +1,229 @@
+"""Density control: rows, moments and statistics stay together, and an empty model never comes about."""
+
+import math
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.density import SPLIT_SHRINK, ScreenGradients, densify, prune, reset_opacities
+from mipmap_plugin.adaptation.loop import Run, Task
+from mipmap_plugin.adaptation.loop import adapt as optimise
+from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
+from mipmap_plugin.backends.projection import project
+from mipmap_plugin.config import AdaptConfig, LearningRates
+from mipmap_plugin.gaussians import Gaussians
+
+COUNT = 6
+
+
+@pytest.fixture
+def student():
+    return tiny.model(COUNT).copy()
+
+
+@pytest.fixture
+def optimizer(student):
+    """Adam whose moments tell which row they belong to: row i holds i + 1 everywhere."""
+    adam = make_optimizer(student, AdaptConfig(), extent=1.0)
+    for tensor in student.parameters().values():
+        tensor.grad = torch.zeros_like(tensor)
+    adam.step()
+    adam.zero_grad()
+    for tensor in student.parameters().values():
+        for moment in ("exp_avg", "exp_avg_sq"):
+            adam.state[tensor][moment] += torch.arange(1.0, COUNT + 1).view(-1, *[1] * (tensor.dim() - 1))
+    return adam
+
+
+def moments(student, optimizer) -> list[float]:
+    """The row numbers that the moments tell, after checking that all parameters tell the same ones."""
+    told = set()
+    for name, tensor in student.parameters().items():
+        for moment in ("exp_avg", "exp_avg_sq"):
+            held = optimizer.state[tensor][moment]
+            assert held.shape == tensor.shape, name
+            told.add(tuple(held.flatten(1)[:, 0].tolist() if held.dim() > 1 else held.tolist()))
+    assert len(told) == 1
+    return list(told.pop())
+
+
+def mask(*rows: int) -> torch.Tensor:
+    return torch.zeros(COUNT, dtype=torch.bool).index_fill(0, torch.tensor(rows, dtype=torch.long), True)
+
+
+def grow(student, optimizer, grown, extent):
+    densify(student, optimizer, grown, extent, student.gaussians().detach(), torch.Generator().manual_seed(0))
+
+
+# Pruning
+
+
+def test_pruning_keeps_rows_and_their_moments(student, optimizer):
+    means = student.parameters()["means"].detach().clone()
+    prune(student, optimizer, mask(1, 4))
+    assert torch.equal(student.parameters()["means"], means[[1, 4]])
+    assert moments(student, optimizer) == [2, 5]
+
+
+def test_the_optimizer_moves_the_models_own_leaves_after_pruning(student, optimizer):
+    prune(student, optimizer, mask(0, 2))
+    before = {name: tensor.detach().clone() for name, tensor in student.parameters().items()}
+    student.gaussians().sh.sum().backward()
+    optimizer.step()
+    assert not torch.equal(student.parameters()["sh0"], before["sh0"])
+    assert all(tensor.is_leaf and tensor.requires_grad for tensor in student.parameters().values())
+
+
+def test_pruning_nothing_leaves_the_leaves_as_they_are(student, optimizer):
+    before = student.parameters()["means"]
+    prune(student, optimizer, torch.ones(COUNT, dtype=torch.bool))
+    assert student.parameters()["means"] is before
+
+
+def test_pruning_everything_keeps_one(student, optimizer):
+    prune(student, optimizer, mask())
+    assert len(student) == 1 and moments(student, optimizer) == [1]
+
+
+# Densifying
+
+
+def test_small_splats_are_cloned(student, optimizer):
+    before = student.gaussians().detach()
+    grow(student, optimizer, mask(1, 3), extent=1e6)
+    after = student.gaussians()
+    assert len(student) == COUNT + 2
+    torch.testing.assert_close(after.means, before.means[[0, 1, 2, 3, 4, 5, 1, 3]])
+    torch.testing.assert_close(after.scales, before.scales[[0, 1, 2, 3, 4, 5, 1, 3]])
+    assert moments(student, optimizer) == [1, 2, 3, 4, 5, 6, 0, 0]
+
+
+def test_large_splats_are_split_into_two_smaller_ones(student, optimizer):
+    before = student.gaussians().detach()
+    grow(student, optimizer, mask(1, 3), extent=1e-6)
+    after, halves = student.gaussians(), [1, 3, 1, 3]
+    assert len(student) == COUNT + 2
+    torch.testing.assert_close(after.means[:4], before.means[[0, 2, 4, 5]])
+    torch.testing.assert_close(after.scales[4:], before.scales[halves] / SPLIT_SHRINK)
+    torch.testing.assert_close(after.opacities[4:], before.opacities[halves])
+    assert moments(student, optimizer) == [1, 3, 5, 6, 0, 0, 0, 0]
+    moved = (after.means[4:] - before.means[halves]).norm(dim=1)
+    assert (moved > 0).all() and (moved < 4 * before.scales[halves].max(dim=1).values).all()
+
+
+def test_the_halves_of_a_flat_splat_stay_in_its_plane():
+    """They are drawn from the splat itself: a pancake turned a quarter about x is flat along world y."""
+    turned, scales = torch.tensor([[math.sqrt(0.5), math.sqrt(0.5), 0, 0]]), torch.tensor([[1.0, 1.0, 1e-9]])
+    flat = Gaussians(torch.zeros(1, 3), turned, scales, torch.ones(1) / 2, torch.ones(1, 1, 3))
+    student = type(tiny.model(1)).from_gaussians(flat).copy()
+    grow(student, make_optimizer(student, AdaptConfig(), 1.0), torch.tensor([True]), extent=1e-6)
+    means = student.gaussians().means.detach()
+    assert (means[:, 1].abs() < 1e-6).all() and (means[:, [0, 2]].abs() > 1e-3).all()
+
+
+def test_large_and_small_together(student, optimizer):
+    largest = student.gaussians().scales.detach().max(dim=1).values
+    grow(student, optimizer, torch.ones(COUNT, dtype=torch.bool), extent=100 * float(largest.median()))
+    split = int((largest > largest.median()).sum())
+    assert 0 < split < COUNT and len(student) == 2 * COUNT
+    assert moments(student, optimizer).count(0) == COUNT + split
+
+
+def test_densifying_nothing_keeps_every_row(student, optimizer):
+    before = student.gaussians().detach()
+    grow(student, optimizer, mask(), extent=1.0)
+    assert torch.equal(student.gaussians().means, before.means)
+    assert moments(student, optimizer) == [1, 2, 3, 4, 5, 6]
+
+
+# Resetting
+
+
+def test_a_reset_cuts_opacities_and_forgets_only_their_moments(student, optimizer):
+    with torch.no_grad():
+        student.parameters()["opacities"][0] = -9.0  # already fainter
+    reset_opacities(optimizer)
+    opacities = student.row_opacities()
+    assert opacities[0] < 0.001
+    torch.testing.assert_close(opacities[1:], torch.full((COUNT - 1,), 0.01))
+    assert optimizer.state[student.parameters()["opacities"]] == {}
+    assert optimizer.state[student.parameters()["means"]]["exp_avg"][3, 0] == 4
+
+
+# Screen gradients
+
+
+def by_differences(camera, means, pull):
+    """d loss / d NDC of one splat, loss = pull · mean2d, by moving its image with central differences in world space."""
+
+    def pixels(point):
+        one = Gaussians(point[None], torch.ones(1, 4).double(), torch.ones(1, 3).double(), torch.ones(1).double(), torch.ones(1, 1, 3).double())
+        return project(one, camera, 0.2).means2d[0]
+
+    axes = torch.linalg.inv(camera.viewmat)[:3, :2].T * 1e-5  # a step to the right and one downwards
+    per_step = torch.stack([pixels(means[0] + axis) - pixels(means[0] - axis) for axis in axes])  # px per step: [axis, pixel axis]
+    loss_per_step = per_step @ pull
+    pixels_per_step = per_step.diagonal()
+    return loss_per_step / pixels_per_step * torch.tensor([camera.width, camera.height]) / 2
+
+
+def test_screen_gradients_equal_finite_differences():
+    camera = tiny.cameras(3)[2].resized(50, 21)  # fx is not fy
+    means = torch.tensor([[0.1, -0.2, 0.15]], dtype=torch.float64, requires_grad=True)
+    pull = torch.tensor([0.3, -0.7], dtype=torch.float64)
+    one = Gaussians(means, torch.ones(1, 4).double(), torch.ones(1, 3).double(), torch.ones(1).double(), torch.ones(1, 1, 3).double())
+    (project(one, camera, 0.2).means2d[0] @ pull).backward()
+    gradients = ScreenGradients(1, means.device)
+    gradients.add(means, means.grad, camera)
+    torch.testing.assert_close(gradients.mean().double(), by_differences(camera, means.detach(), pull).norm()[None], atol=0, rtol=1e-6)
+
+
+def test_screen_gradients_are_averaged_over_the_views_that_gave_any():
+    camera = tiny.cameras(1)[0]
+    means = torch.zeros(2, 3)
+    gradients = ScreenGradients(2, means.device)
+    for second in (0.0, 4.0, 2.0):
+        gradients.add(means, torch.tensor([[0.0, 0, 0], [second, 0, 0]]), camera)
+    three, one = gradients.mean(), ScreenGradients(2, means.device)
+    one.add(means, torch.tensor([[0.0, 0, 0], [3.0, 0, 0]]), camera)
+    torch.testing.assert_close(three, one.mean())
+    assert three[0] == 0 < three[1]
+
+
+def test_two_views_in_one_step_count_as_two_views_each_with_its_own_gradient():
+    """Gradients of a step's views add up in `.grad`; the statistics want them one by one."""
+    views = tiny.cameras(2)
+    pull = {view: torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(i)) for i, view in enumerate(views)}
+    student = tiny.model(COUNT).copy()
+
+    def render(model, camera):
+        here = next(view for view in views if view.name == camera.name)
+        return (model.parameters()["means"] * pull[here]).sum().sqrt().expand(1, 1, 1)
+
+    with torch.no_grad():
+        student.parameters()["means"].fill_(1.0)
+        for each in pull.values():
+            each.abs_()
+    config = AdaptConfig(steps=1, views_per_step=2, densify_gradient=1.0, rates=LearningRates())
+    task = Task(views, 1.0, lambda view: torch.zeros(1, 1, 1), render, white_background=False)
+    run = Run.start(student, task, config)
+    optimise(run, task, config, lambda run: None)
+    expected = ScreenGradients(COUNT, torch.device("cpu"))
+    for view in views:
+        expected.add(torch.ones(COUNT, 3), pull[view], view)  # the loss is the pull itself, whose gradient is `pull`
+    torch.testing.assert_close(run.gradients.mean(), expected.mean(), atol=1e-5, rtol=1e-4)
+
+
+# Rates
+
+
+def test_rates_fall_to_their_share_and_the_means_scale_with_the_scene(student):
+    config = AdaptConfig(steps=10, decay=0.01, rates=LearningRates(means=0.1, sh0=0.5, quats=0))
+    adam = make_optimizer(student, config, extent=3.0)
+    rate = lambda name: next(group["lr"] for group in adam.param_groups if group["name"] == name)  # noqa: E731
+    assert (rate("means"), rate("sh0"), rate("quats")) == (pytest.approx(0.3), 0.5, 0)
+    set_rates(adam, config, 5)
+    assert (rate("means"), rate("sh0")) == (pytest.approx(0.03), pytest.approx(0.05))
+    set_rates(adam, config, 10)
+    assert rate("sh0") == pytest.approx(0.005)

@@ -1,0 +1,112 @@
+"""r(x): every filter against the library that it says it equals, and upsamplers by name."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from mipmap_plugin.adaptation import upsamplers
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
+from mipmap_plugin.errors import PluginError, SettingsError
+
+SMALLER, LARGER = (7, 10), (50, 45)
+
+
+@pytest.fixture
+def image():
+    return torch.rand(24, 30, 3, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(autouse=True)
+def forget_new_names(monkeypatch):
+    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
+
+
+def pillow(image, size, method):
+    """Pillow's own resize, plane by plane in 32-bit floats."""
+    planes = [Image.fromarray(image[..., c].numpy()).resize((size[1], size[0]), method) for c in range(3)]
+    return torch.from_numpy(np.stack(planes, -1))
+
+
+def two_taps(image, size):
+    """Bilinear between the four nearest pixel centers, one pixel at a time; the border is repeated."""
+    out = torch.empty(*size, 3)
+    for row in range(size[0]):
+        for column in range(size[1]):
+            y = min(max((row + 0.5) * image.shape[0] / size[0] - 0.5, 0), image.shape[0] - 1)
+            x = min(max((column + 0.5) * image.shape[1] / size[1] - 0.5, 0), image.shape[1] - 1)
+            top, left = int(y), int(x)
+            bottom, right = min(top + 1, image.shape[0] - 1), min(left + 1, image.shape[1] - 1)
+            upper = torch.lerp(image[top, left], image[top, right], x - left)
+            out[row, column] = torch.lerp(upper, torch.lerp(image[bottom, left], image[bottom, right], x - left), y - top)
+    return out
+
+
+@pytest.mark.parametrize("size", [SMALLER, LARGER, (8, 45)])
+@pytest.mark.parametrize(("method", "pillows"), [("pil-bicubic", Image.Resampling.BICUBIC), ("lanczos", Image.Resampling.LANCZOS)])
+def test_cubic_and_lanczos_equal_pillow(image, method, pillows, size):
+    torch.testing.assert_close(resize(image, size, method), pillow(image, size, pillows), atol=2e-6, rtol=0)
+
+
+def test_box_is_the_mean_of_whole_blocks(image):
+    expected = image.view(6, 4, 10, 3, 3).mean(dim=(1, 3))
+    torch.testing.assert_close(resize(image, (6, 10), "box"), expected)
+
+
+@pytest.mark.parametrize("size", [SMALLER, (24, 7), LARGER])
+def test_box_refuses_what_is_not_a_whole_multiple(image, size):
+    with pytest.raises(SettingsError, match=rf"box: \[24, 30\] px is not a whole multiple of \[{size[0]}, {size[1]}\] px; use area"):
+        resize(image, size, "box")
+
+
+def test_area_equals_box_where_the_ratio_is_whole(image):
+    torch.testing.assert_close(resize(image, (6, 10), "area"), resize(image, (6, 10), "box"))
+
+
+@pytest.mark.parametrize("size", [SMALLER, LARGER])
+def test_bilinear_has_two_taps_and_no_prefilter(image, size):
+    torch.testing.assert_close(resize(image, size, "bilinear"), two_taps(image, size), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("method", ["box", "area", "bilinear", "pil-bicubic", "lanczos"])
+def test_a_constant_stays_and_the_same_size_is_the_same_image(image, method):
+    torch.testing.assert_close(resize(torch.full((24, 30, 3), 0.7), (6, 10), method), torch.full((6, 10, 3), 0.7))
+    assert resize(image, (24, 30), method) is image
+
+
+def test_gradients_flow(image):
+    image.requires_grad_()
+    resize(image, SMALLER, "lanczos").square().sum().backward()
+    assert image.grad.isfinite().all() and (image.grad != 0).all()
+
+
+@pytest.mark.parametrize(("name", "pillows"), [("bicubic", Image.Resampling.BICUBIC), ("lanczos", Image.Resampling.LANCZOS)])
+def test_built_in_upsamplers_equal_pillow(image, name, pillows):
+    torch.testing.assert_close(UPSAMPLERS.get(name)(image, LARGER), pillow(image, LARGER, pillows), atol=2e-6, rtol=0)
+
+
+def test_an_upsampler_is_registered_as_a_function_or_as_a_string(image):
+    register_upsampler("mine", lambda image, size: image.new_zeros(*size, 3))
+    register_upsampler("also-mine", "mipmap_plugin.adaptation.upsamplers:lanczos")
+    assert UPSAMPLERS.get("mine")(image, LARGER).shape == (*LARGER, 3)
+    assert UPSAMPLERS.get("also-mine") is upsamplers.lanczos
+    assert {"mine", "also-mine"} <= set(UPSAMPLERS.names())
+
+
+def test_a_name_that_is_taken_is_refused_unless_replaced(image):
+    with pytest.raises(SettingsError, match="the name 'bicubic' is taken; pass replace=True"):
+        register_upsampler("bicubic", upsamplers.lanczos)
+    register_upsampler("bicubic", upsamplers.lanczos, replace=True)
+    assert UPSAMPLERS.get("bicubic") is upsamplers.lanczos
+
+
+def test_an_unknown_upsampler_is_refused_with_the_known_ones():
+    with pytest.raises(SettingsError, match=r"there is no 'swin'; known are bicubic, lanczos"):
+        UPSAMPLERS.get("swin")
+
+
+def test_an_upsampler_that_does_not_import_says_why():
+    register_upsampler("broken", "no_such_package.module:function")
+    with pytest.raises(PluginError, match=r"'broken' .* cannot be loaded: ModuleNotFoundError: No module named 'no_such_package'"):
+        UPSAMPLERS.get("broken")

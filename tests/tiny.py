@@ -1,0 +1,48 @@
+"""A scene that adapts in a moment: a ball of splats, the cameras around it, and the checkpoint that holds both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.scenes import orbit, write_cameras
+
+WIDTH, HEIGHT = 32, 24  # px
+
+
+def gaussians(count: int = 60, degree: int = 1, seed: int = 0, spread: float = 0.5) -> Gaussians:
+    """Thin, bright, half-opaque splats around the origin, float32. `spread`: world units."""
+    rng = torch.Generator().manual_seed(seed)
+    scales = 0.015 + 0.15 * torch.rand(count, 3, generator=rng) ** 3
+    opacities = 0.3 + 0.65 * torch.rand(count, generator=rng)
+    sh = 1.5 * torch.rand(count, (degree + 1) ** 2, 3, generator=rng)
+    sh[:, 1:] *= 0.1
+    return Gaussians(spread * torch.randn(count, 3, generator=rng), torch.randn(count, 4, generator=rng), scales, opacities, sh)
+
+
+def model(count: int = 60, trained: TrainedScale = TrainedScale(), **options) -> VanillaModel:  # noqa: B008
+    return VanillaModel.from_gaussians(gaussians(count, **options), trained)
+
+
+def cameras(count: int = 4, seed: int = 1, split: str = "train", width: int = WIDTH, height: int = HEIGHT) -> list[Camera]:
+    """Views of the ball from all around."""
+    views = orbit(gaussians(), (height, width), count, torch.Generator().manual_seed(seed), up=(0, 0, 1))
+    return [replace(view, name=f"view_{index}", split=split) for index, view in enumerate(views)]
+
+
+def ply(path: Path, **options) -> Path:
+    """A bare PLY, without cameras."""
+    return model(**options).save(path, provenance={})
+
+
+def folder(path: Path, views: list[Camera] | None = None, **options) -> Path:
+    """A model folder, with the cameras beside the splats."""
+    model(**options).save(path, provenance={})
+    write_cameras(path / "cameras.json", views or cameras())
+    return path
