@@ -113,7 +113,7 @@ def adapt(
         json: Print the reports as JSON.
     """
     wrapped = _wrap(checkpoint, cameras, background, backend)
-    chosen = dict(views=views, steps=steps, time_budget_s=time_budget_s, resize=resize, upsampler=upsampler)
+    chosen: dict[str, Any] = dict(views=views, steps=steps, time_budget_s=time_budget_s, resize=resize, upsampler=upsampler)
     settings = {name: value for name, value in chosen.items() if value is not None}
     targets = [_output(checkpoint, output, each, len(scale) > 1) for each in scale]
     for target in targets:
@@ -207,7 +207,7 @@ def evaluate(
     if output:
         refuse_existing(output, overwrite)
     wrapped = _wrap(checkpoint, None, background, backend)
-    overrides = {"seed": seed} | ({} if steps is None else {"steps": steps})
+    overrides: dict[str, Any] = {"seed": seed} | ({} if steps is None else {"steps": steps})
     rows = rows_of(wrapped, load_scene(images), scale, recipe, protocol, **overrides)
     if output:
         write_json(output, records(rows), overwrite)
@@ -305,7 +305,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mipmap-plugin: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
-        print(f"\nmipmap-plugin: {interrupt or 'interrupted'}", file=sys.stderr)
+        print(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}", file=sys.stderr)
         return 130
     return 0
 

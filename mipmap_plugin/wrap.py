@@ -111,7 +111,7 @@ class Wrapped:
         if not 0 < scale < float("inf"):
             raise SettingsError(f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4")
         config = make_config(recipe, scale, **settings)
-        return _Adaptation(self, scale, config, self.cameras if cameras is None else list(cameras)).run(resume and Path(resume))
+        return _Adaptation(self, scale, config, self.cameras if cameras is None else list(cameras)).run(None if resume is None else Path(resume))
 
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit where it came without any."""

@@ -22,7 +22,8 @@ class Rounds:
 
     def __init__(self, views: Sequence[Camera], seed: int) -> None:
         self.views, self._seed = list(views), seed
-        self._round, self._order = -1, []
+        self._round = -1
+        self._order: list[int] = []
 
     def __call__(self, draw: int) -> Camera:
         """The `draw`-th view since the beginning."""

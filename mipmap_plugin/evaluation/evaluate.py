@@ -17,7 +17,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr, ssim
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView, resized_base, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, resized_base, test_views
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.wrap import Adapted, Wrapped
 
@@ -36,7 +36,7 @@ class Row:
     adapted_on: str = "-"  # what it was adapted on
 
 
-def judge(name: str, show: Callable[[Camera], Tensor], views: Sequence[TestView], scale: float, protocol: Protocol, **facts) -> Row:
+def judge(name: str, show: Callable[[Camera], Tensor], views: Sequence[Judged], scale: float, protocol: Protocol, **facts) -> Row:
     """The mean quality of `show(camera at the base scale)` over the views. PSNR per view, then the mean, as the literature does."""
     decibels, similarities, seconds = [], [], []
     for view in tqdm(views, disable=None, desc=f"{name} x{scale:g}", leave=False):
@@ -47,11 +47,12 @@ def judge(name: str, show: Callable[[Camera], Tensor], views: Sequence[TestView]
         truth = view.truth(scale, protocol).to(image)
         decibels.append(psnr(image, truth))
         similarities.append(ssim(image, truth))
-    similarity = None if None in similarities else fmean(similarities)
+    known = [value for value in similarities if value is not None]
+    similarity = fmean(known) if len(known) == len(views) else None
     return Row(name, scale, fmean(decibels), similarity, facts.pop("adapt_seconds", 0.0), 1000 * fmean(seconds), **facts)
 
 
-def training_free_rows(model: Wrapped, views: Sequence[TestView], scale: float, protocol: Protocol) -> list[Row]:
+def training_free_rows(model: Wrapped, views: Sequence[Judged], scale: float, protocol: Protocol) -> list[Row]:
     """The base as it is, each screen filter that needs no training, and the base's own render resized (for zoom-out, supersampling)."""
     count = len(model.model.row_opacities())
 
@@ -67,7 +68,7 @@ def training_free_rows(model: Wrapped, views: Sequence[TestView], scale: float, 
     return [judge(name, show, views, scale, protocol, gaussians=count) for name, show in shows.items()]
 
 
-def adapted_row(name: str, adapted: Adapted, views: Sequence[TestView], protocol: Protocol) -> Row:
+def adapted_row(name: str, adapted: Adapted, views: Sequence[Judged], protocol: Protocol) -> Row:
     """An adapted model, rendered as any classic viewer renders its file."""
     report = adapted.report
     facts = dict(adapt_seconds=report.seconds["total"], gaussians=report.gaussians_after, adapted_on=report.views)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol as TypingProtocol
 
 from torch import Tensor
 
@@ -33,7 +34,16 @@ PROTOCOLS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+class Judged(TypingProtocol):
+    """A view with a truth to be judged by."""
+
+    camera: Camera  # of the base scale
+
+    def truth(self, scale: float, protocol: Protocol) -> Tensor:
+        """[h, w, 3] at `scale` times the base scale."""
+
+
+@dataclass(eq=False)
 class TestView:
     """One photograph to be judged by, and its camera at the base scale."""
 
