@@ -118,11 +118,7 @@ def test_covariances_need_not_be_symmetric_to_have_their_gradient():
 
 @needs_numba
 @pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
-def test_the_number_of_threads_changes_no_bit(screen_filter, monkeypatch):
-    from mipmap_plugin.backends.cpu_kernels import drawing
-
-    monkeypatch.setattr(drawing, "SPLATS_AT_ONCE", 64)
-    monkeypatch.setattr(drawing, "TILES_AT_ONCE", 1)
+def test_the_number_of_threads_changes_no_bit(screen_filter):
     g = gaussians(2000)
     results = []
     for threads in (1, 2, 5):
