@@ -58,7 +58,7 @@ class _Draw(torch.autograd.Function):
         drawing = _drawing()
         image, ctx.drawing = drawing.draw(drawing.splats_of(*tensors), camera, effects)
         ctx.save_for_backward(*tensors)
-        return torch.from_numpy(image), 1 - torch.from_numpy(ctx.drawing.through)
+        return torch.from_numpy(image), 1 - torch.from_numpy(ctx.drawing.frame.through)
 
     @staticmethod
     @once_differentiable

@@ -22,10 +22,10 @@ def _forget_stale() -> None:
     """Drop machine code older than any source here: numba looks only at the file of a kernel itself, not at those that it calls."""
     folder = Path(__file__).parent
     newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
-    for index in folder.glob("__pycache__/*.nbi"):
+    for compiled in folder.glob("__pycache__/*.nb[ci]"):
         with suppress(OSError):  # another process may be quicker; in a folder that cannot be written numba keeps none
-            if index.stat().st_mtime < newest:
-                index.unlink()
+            if compiled.stat().st_mtime < newest:
+                compiled.unlink()
 
 
 _forget_stale()

@@ -7,9 +7,11 @@ import numpy as np
 from mipmap_plugin.backends.compositing import MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner, kernel
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 
-# px. Wide tiles: a splat is cut into few pieces, and the piece of a row is still exact. A tile's state fits a first-level cache.
-TILE_ROWS = 16
+# px. A row for each lane, to trace a splat through all of them at once; and wide: a splat is cut into few pieces, and where it
+# crosses a row is exact anyway. A tile's state fits a first-level cache.
+TILE_ROWS = WIDTH
 TILE_COLUMNS = 64
 
 # Rows and columns this close to a splat's edge are visited too: rounding must not lose a pixel that passes the alpha test.
@@ -60,6 +62,8 @@ def tile_columns(table, i, first, last, width):
 def count_tiles(table, i, width, height):
     """The number of tiles that splat i touches."""
     first, last = rows_of(table, i, 0, height - 1)
+    if first > last:
+        return 0
     count = 0
     for tile_row in range(first // TILE_ROWS, last // TILE_ROWS + 1):
         top, bottom = max(first, tile_row * TILE_ROWS), min(last, tile_row * TILE_ROWS + TILE_ROWS - 1)

@@ -79,26 +79,28 @@ def trace(table, i, box, state):
 
 
 @kernel
-def composite(start, stop, table, starts, members, background, image, through, stops):
-    """Render the tiles start..stop: image [H, W, 3], transmittance [H, W] and, at each pixel, its place in the list when it stopped."""
+def composite(start, stop, table, lists, frame, image):
+    """Render the tiles start..stop: fill the frame and the image [H, W, 3]."""
+    starts, members, _ = lists
+    background, through, stops = frame
     height, width = through.shape
     state = np.empty(STATE, np.float32)
     for tile in range(start, stop):
         box = bounds(tile, width, height)
         length = starts[tile + 1] - starts[tile]
-        begin(box, length, state)
+        open_tile(box, length, state)
         for n in range(length):
             if n % PATIENCE == 0 and finished(state):
                 break
             at = starts[tile] + n
             prefetch(table, members[min(at + AHEAD, len(members) - 1)])
             lay(table, members[at], n, box, state)
-        finish(box, state, background, image, through, stops)
+        close_tile(box, state, background, image, through, stops)
 
 
 @inner
-def begin(box, length, state):
-    """An empty tile. Light below 0: a pixel that is finished, as all outside the image are from the start."""
+def open_tile(box, length, state):
+    """Begin with an empty tile. Light below 0: a pixel that is finished, as all outside the image are from the start."""
     _, _, columns, rows = box
     state[:LIGHT] = 0
     state[LIGHT:ENDS] = -1
@@ -109,6 +111,7 @@ def begin(box, length, state):
 
 @inner
 def finished(state):
+    """Whether no pixel of the tile lets any light through."""
     most = load(state, LIGHT)
     for at in range(LIGHT + WIDTH, ENDS, WIDTH):
         most = maximum(most, load(state, at))
@@ -146,7 +149,8 @@ def lay(table, i, n, box, state):
 
 
 @inner
-def finish(box, state, background, image, through, stops):
+def close_tile(box, state, background, image, through, stops):
+    """Write a tile's pixels."""
     left, top, columns, rows = box
     for r in range(rows):
         for c in range(columns):
@@ -159,13 +163,19 @@ def finish(box, state, background, image, through, stops):
 
 
 @kernel
-def composite_back(start, stop, table, starts, members, slots, background, through, stops, d_image, d_alpha, pulls):
-    """Walk the lists of the tiles start..stop back to front and write each splat's pull in each tile into its slot."""
+def composite_back(start, stop, table, lists, frame, d_frame, pulls):
+    """Walk the lists of the tiles start..stop back to front and write each splat's pull in each tile into its slot.
+
+    d_frame: the gradients of the image [H, W, 3] and of its alpha [H, W].
+    """
+    starts, members, slots = lists
+    background, through, stops = frame
+    d_image, d_alpha = d_frame
     height, width = through.shape
     state = np.empty(STATE, np.float32)
     for tile in range(start, stop):
         box = bounds(tile, width, height)
-        used = begin_back(box, background, through, stops, d_image, d_alpha, state)
+        used = reopen_tile(box, background, through, stops, d_image, d_alpha, state)
         for at in range(starts[tile] + used, starts[tile + 1]):
             for k in range(col.PULLS):
                 pulls[slots[at], k] = 0
@@ -176,8 +186,8 @@ def composite_back(start, stop, table, starts, members, slots, background, throu
 
 
 @inner
-def begin_back(box, background, through, stops, d_image, d_alpha, state):
-    """A finished tile, and how many of its splats were used."""
+def reopen_tile(box, background, through, stops, d_image, d_alpha, state):
+    """Begin with a finished tile; returns how many of its splats were used."""
     left, top, columns, rows = box
     state[:] = 0
     state[LIGHT:ENDS] = 1

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import binning, compositing, projection
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels.records import Splats, View
+from mipmap_plugin.backends.cpu_kernels.records import Frame, Lists, Splats, View
 from mipmap_plugin.backends.projection import FRUSTUM_MARGIN
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -26,14 +26,10 @@ class Drawing(NamedTuple):
     """What the backward pass needs to know of a forward pass."""
 
     view: View
-    background: np.ndarray  # [3]
     table: np.ndarray  # [N, COLUMNS]
     slots: np.ndarray  # [N + 1] where each splat's tiles begin
-    starts: np.ndarray  # [tiles + 1] where each tile's members begin
-    members: np.ndarray  # [pairs] splats, tile by tile, front to back
-    member_slots: np.ndarray  # [pairs]
-    through: np.ndarray  # [H, W]
-    stops: np.ndarray  # [H, W] place in the tile's list at which a pixel stopped
+    lists: Lists
+    frame: Frame
 
 
 def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, Drawing]:
@@ -47,22 +43,20 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
     tiles = np.empty(slots[-1], np.int32)
     _share(binning.cover, count, table, slots, width, height, tiles)
     columns, rows = binning.tile_grid(width, height)
-    starts, members, member_slots = binning.fill_lists(binning.depth_order(depths, counts), slots, tiles, columns * rows)
+    lists = Lists(*binning.fill_lists(binning.depth_order(depths, counts), slots, tiles, columns * rows))
 
-    background = np.array(effects.background, np.float32)
-    image, through, stops = _empty(height, width, 3), _empty(height, width), _empty(height, width)
-    _share(compositing.composite, columns * rows, table, starts, members, background, image, through, stops)
-    return image, Drawing(view, background, table, slots, starts, members, member_slots, through, stops)
+    image, frame = _empty(height, width, 3), Frame(np.array(effects.background, np.float32), _empty(height, width), _empty(height, width))
+    _share(compositing.composite, columns * rows, table, lists, frame, image)
+    return image, Drawing(view, table, slots, lists, frame)
 
 
 def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np.ndarray) -> Splats:
     """The gradients of the splats from those of the image [H, W, 3] and its alpha [H, W]."""
-    d = drawing
-    pulls = _empty(len(d.members), col.PULLS)
-    maps = (d.background, d.through, d.stops, d_image, d_alpha)
-    _share(compositing.composite_back, len(d.starts) - 1, d.table, d.starts, d.members, d.member_slots, *maps, pulls)
+    view, table, slots, lists, frame = drawing
+    pulls = _empty(len(lists.members), col.PULLS)
+    _share(compositing.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), pulls)
     grads = Splats(*(_empty(*array.shape) for array in splats))
-    _share(projection.project_back, len(splats.means), d.view, splats, d.table, d.slots, pulls, grads)
+    _share(projection.project_back, len(splats.means), view, splats, table, slots, pulls, grads)
     return grads
 
 

@@ -56,9 +56,10 @@ def screen_filter(view, flat):
 def pull_screen_filter(view, flat, dilated, light, d_dilated, d_light):
     """The gradient of a shape before dilation."""
     d_xx, d_xy, d_yy, d_det = d_dilated
-    d_ratio = 0.5 * d_light / light / dilated[3] if view.antialiased and light > MIN_COMPENSATION else 0.0
-    d_det -= d_ratio * flat[3] / dilated[3]
-    return d_xx + view.eps2d * d_det, d_xy, d_yy + view.eps2d * d_det, d_det + d_ratio
+    det, det_dilated = flat[3], dilated[3]
+    d_ratio = 0.5 * d_light / light if view.antialiased and light > MIN_COMPENSATION else 0.0
+    d_det -= d_ratio * det / det_dilated**2
+    return d_xx + view.eps2d * d_det, d_xy, d_yy + view.eps2d * d_det, d_det + d_ratio / det_dilated
 
 
 @inner

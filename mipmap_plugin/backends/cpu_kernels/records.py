@@ -38,3 +38,19 @@ class Splats(NamedTuple):
     opacities: np.ndarray  # [N]
     sh: np.ndarray  # [N, K, 3]
     covariances: np.ndarray  # [N, 3, 3] or [0, 3, 3]
+
+
+class Lists(NamedTuple):
+    """Which splats each tile shows, front to back."""
+
+    starts: np.ndarray  # [tiles + 1] where each tile's members begin
+    members: np.ndarray  # [pairs] splats
+    slots: np.ndarray  # [pairs] where each keeps what it has to do with this tile, splat after splat
+
+
+class Frame(NamedTuple):
+    """What the backward pass needs to know of an image."""
+
+    background: np.ndarray  # [3]
+    through: np.ndarray  # [H, W] transmittance in the end
+    stops: np.ndarray  # [H, W] place in the tile's list at which the pixel was finished
