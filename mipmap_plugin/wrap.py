@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +31,6 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import model_cameras
-
-# px² of a target pixel: the variance that the resize filter gives to a sample. A box has 1/12; the cubic of `pil-bicubic`
-# and Lanczos reproduce parabolas, so theirs is 0; two bilinear taps average like a box of the base's pixels.
-FILTER_VARIANCE = {"box": 1 / 12, "area": 1 / 12, "bilinear": 0.0, "pil-bicubic": 0.0, "lanczos": 0.0}
 
 
 class Interrupted(KeyboardInterrupt):
@@ -170,8 +166,7 @@ class _Adaptation:
     @torch.no_grad()
     def _start_closed_form(self, student: SplatModel) -> None:
         began = time.perf_counter()
-        variance = FILTER_VARIANCE[self.config.resize] if self.scale < 1 else 0.0
-        student.reshape(*closed_form(self.base.gaussians(self.views[0]), self.views, self.scale, self.trained, variance))
+        student.reshape(*closed_form(self.base.gaussians(self.views[0]), self.views, self.scale, self.trained))
         self.seconds["closed form"] = time.perf_counter() - began
 
     def _render(self, model: SplatModel, camera: Camera) -> Tensor:
@@ -184,7 +179,8 @@ class _Adaptation:
     def _fingerprint(self) -> str:
         """Names what a run depends on, so that a state is never resumed as another run."""
         poses = [[view.width, view.height, view.fx, view.fy, *view.viewmat.flatten().tolist()] for view in self.views]
-        facts = [self.base.digest, self.scale, self.config.model_dump(), self.backend.name, self.trained.background, poses]
+        base = self.base.digest or _digest(self.base)
+        facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.trained), poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _report(self, run: Run, ended_by: str) -> Report:
@@ -205,6 +201,14 @@ class _Adaptation:
             curve=run.curve,
             versions=versions(),
         )
+
+
+def _digest(model: SplatModel) -> str:
+    """The sha256 of a model that was made in memory."""
+    digest = hashlib.sha256()
+    for tensor in model.parameters().values():
+        digest.update(tensor.detach().cpu().contiguous().numpy())
+    return digest.hexdigest()
 
 
 def _stop(run: Run, resume: Path | None, fingerprint: str) -> None:

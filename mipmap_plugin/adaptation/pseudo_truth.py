@@ -20,8 +20,9 @@ class PseudoTruth:
     """The base model's view of a camera, resized to the wanted scale, [H, W, 3] float, cached by camera."""
 
     def __init__(self, base: SplatModel, backend: Backend, effects: Effects, scale: float, config: AdaptConfig) -> None:
-        """`effects`: how the base is rendered at the scale that it was trained at."""
+        """`effects`: how the base is rendered at the scale that it was trained at. Raises SettingsError for an unknown upsampler."""
         self._base, self._backend, self._effects, self._scale, self._config = base, backend, effects, scale, config
+        self._enlarge = UPSAMPLERS.get(config.upsampler)
         self._made: dict[Camera, Tensor] = {}
 
     def __call__(self, view: Camera) -> Tensor:
@@ -34,7 +35,7 @@ class PseudoTruth:
     def _make(self, view: Camera) -> Tensor:
         size = view.zoomed(self._scale).size
         if self._scale > 1:
-            target = UPSAMPLERS.get(self._config.upsampler)(self._render(view, 1.0), size)
+            target = self._enlarge(self._render(view, 1.0), size)
         else:
             target = resize(self._render(view, self._finest()), size, self._config.resize)
         return target.clamp(0, 1).mul(255).round().div(255) if self._config.quantize_truth else target

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -10,7 +11,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.scenes.trajectories import jittered, orbit
+from mipmap_plugin.scenes.trajectories import ORBIT_FOV, jittered, orbit
 
 # A checkpoint without cameras does not say how finely it was trained: this many px across 50 degrees is NeRF-Synthetic's density.
 ORBIT_PIXELS = 800
@@ -48,9 +49,10 @@ def choose_views(cameras: Sequence[Camera], gaussians: Gaussians, config: AdaptC
     """The base-scale cameras to adapt on, and a sentence that says which. Raises SettingsError when the policy finds none."""
     generator = torch.Generator().manual_seed(config.seed)
     if config.views == "orbit" or not cameras:
-        views = orbit(gaussians, (ORBIT_PIXELS, ORBIT_PIXELS), config.extra_views or ORBIT_VIEWS, generator)
+        pixels = math.ceil(2 * math.tan(ORBIT_FOV / 2) * cameras[0].fx) if cameras else ORBIT_PIXELS  # the cameras' own focal length
+        views = orbit(gaussians, (pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
         why = "asked for" if cameras else "the checkpoint came without cameras"
-        return views, f"{len(views)} views of a generated orbit at {ORBIT_PIXELS} px ({why})"
+        return views, f"{len(views)} views of a generated orbit at {pixels} px ({why})"
     if config.views == "given":
         return list(cameras), f"the {len(cameras)} given views"
     split = "test" if config.views == "test" else "train"

@@ -1,0 +1,452 @@
+"""wrap_model(...).adapt(...): the base stays, the same seed gives the same bytes, and every recipe ends well in every hard case."""
+
+import hashlib
+import json
+import signal
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.interrupt import interruptible
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.tags import provenance_of, render_mode
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.wrap import Interrupted, wrap_model
+
+WHITE = (1.0, 1.0, 1.0)
+
+# A few steps in which everything happens: both ways to choose views, two views a step, points of the curve, and splats that are dropped.
+BRIEF = dict(steps=7, extra_views=2, check_every=2, prune_every=3, min_opacity=0.4, patience=None)
+BRIEF_PAPER = dict(steps=7, check_every=2, prune_every=3, densify_gradient=1e-9)
+
+
+def wrapped(count=40, cameras=None, **trained):
+    return wrap_model(tiny.model(count, TrainedScale(**trained)), cameras=tiny.cameras() if cameras is None else cameras, backend="reference")
+
+
+def is_finite(model) -> bool:
+    return all(bool(tensor.isfinite().all()) for tensor in model.parameters().values())
+
+
+def shown(adapted):
+    """What the adapted model shows of the first camera, at its scale."""
+    return adapted.render(tiny.cameras()[0].zoomed(adapted.report.scale)).image
+
+
+# Recipes
+
+
+@pytest.mark.parametrize("scale", [1 / 4, 4])
+@pytest.mark.parametrize(("recipe", "settings"), [("default", BRIEF), ("paper", BRIEF_PAPER), ("instant", {})])
+def test_every_recipe_runs_and_its_report_is_whole(recipe, settings, scale):
+    adapted = wrapped().adapt(scale, recipe=recipe, **settings)
+    report = json.loads(json.dumps(adapted.report.model_dump()))
+    steps = settings.get("steps", 0)
+    assert (report["scale"], report["settings"]["recipe"], report["ended_by"]) == (scale, recipe, f"{steps} steps")
+    assert report["backend"] == "reference: asked for"
+    assert (report["gaussians_before"], report["gaussians_after"]) == (40, len(adapted.model))
+    assert [point["step"] for point in report["curve"]] == list(range(2, steps + 1, 2))
+    assert report["seconds"]["total"] >= report["seconds"]["optimization"] >= 0
+    assert ("closed form" in report["seconds"]) == (recipe != "paper")
+    assert {"torch", "mipmap_plugin"} <= report["versions"].keys()
+    assert is_finite(adapted.model) and shown(adapted).isfinite().all()
+
+
+def test_zooming_in_takes_no_steps_unless_asked_to():
+    assert wrapped().adapt(4).report.ended_by == "0 steps"
+    assert wrapped().adapt(4, steps=1).report.ended_by == "1 steps"
+
+
+def test_optimising_comes_closer_to_the_pseudo_truth():
+    curve = wrapped().adapt(1 / 4, views="given", steps=24, check_every=8).report.curve
+    assert curve[0].psnr_db < curve[1].psnr_db < curve[2].psnr_db
+    assert curve[0].seconds < curve[2].seconds
+
+
+@pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
+def test_zoomed_out_views_that_nobody_adapted_to_are_closer_to_the_supersampled_base(screen_filter):
+    model = wrapped(60, screen_filter=screen_filter)
+    started, adapted = model.adapt(1 / 4, recipe="instant"), model.adapt(1 / 4, steps=40, extra_views=8)
+    for camera in tiny.cameras(2, seed=9):
+        small = camera.zoomed(1 / 4)
+        truth = model.render(small, 1 / 4, "scaled", supersampling=4).image
+        images = model.render(small, 1 / 4, "classic").image, started.render(small).image, adapted.render(small).image
+        naive, first, final = (psnr(image, truth) for image in images)
+        assert naive + 6 < first + 3 < final
+
+
+def test_the_paper_leaves_the_centers_bit_for_bit():
+    model = wrapped()
+    adapted = model.adapt(1 / 4, recipe="paper", steps=3)
+    before, after = model.model.parameters(), adapted.model.parameters()
+    assert torch.equal(after["means"], before["means"])
+    assert not torch.equal(after["scales"], before["scales"])
+
+
+def test_the_default_moves_the_centers():
+    model = wrapped()
+    assert not torch.equal(model.adapt(1 / 4, steps=1, extra_views=0).model.parameters()["means"], model.model.parameters()["means"])
+
+
+def test_the_paper_resets_opacities_on_white_only():
+    white, black = (wrapped(background=color).adapt(1 / 4, recipe="paper", steps=3).model.row_opacities() for color in (WHITE, (0.0, 0.0, 0.0)))
+    assert white.max() < 0.012 < 0.2 < black.min()
+
+
+def test_densifying_adds_splats_and_pruning_takes_them_away():
+    assert wrapped().adapt(1 / 4, recipe="paper", **BRIEF_PAPER).report.gaussians_after > 40
+    assert 0 < wrapped().adapt(1 / 4, **BRIEF).report.gaussians_after < 40
+
+
+def test_the_file_is_classic_whatever_the_base_was_trained_with():
+    adapted = wrapped(screen_filter="antialiased").adapt(4)
+    assert (adapted.effects.screen_filter, adapted.effects.eps2d) == ("classic", 0.3)
+    assert adapted.model.trained.screen_filter == "classic"
+    assert "base antialiased 0.3 px²; file classic 0.3 px²" in adapted.report.filters
+
+
+# Purity
+
+
+def test_the_base_stays_bit_for_bit(tmp_path):
+    path = tiny.folder(tmp_path / "base")
+    model = wrap_model(path, backend="reference")
+    file = model.model.source
+    digest, before = hashlib.sha256(file.read_bytes()).hexdigest(), {name: tensor.clone() for name, tensor in model.model.parameters().items()}
+    trained = model.model.trained
+    model.adapt(1 / 4, **BRIEF).save(tmp_path / "new.ply")
+    model.adapt(1 / 4, recipe="paper", **BRIEF_PAPER)
+    assert hashlib.sha256(file.read_bytes()).hexdigest() == digest == model.model.digest
+    for name, tensor in model.model.parameters().items():
+        assert torch.equal(tensor, before[name]) and not tensor.requires_grad and tensor.grad is None
+    assert model.model.trained == trained
+
+
+@pytest.mark.parametrize(("recipe", "settings"), [("default", BRIEF), ("paper", BRIEF_PAPER)])
+def test_the_same_seed_gives_the_same_bytes(tmp_path, recipe, settings):
+    first, again, other = (wrapped().adapt(1 / 4, recipe=recipe, seed=seed, **settings).model for seed in (3, 3, 4))
+    files = [model.save(tmp_path / f"{i}.ply", provenance={}).read_bytes() for i, model in enumerate((first, again, other))]
+    assert files[0] == files[1] != files[2]
+
+
+def test_the_global_generator_is_neither_used_nor_disturbed():
+    torch.manual_seed(5)
+    state = torch.get_rng_state()
+    wrapped().adapt(1 / 4, recipe="paper", **BRIEF_PAPER)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+# Ctrl-C and resuming
+
+
+@pytest.fixture
+def ctrl_c(monkeypatch):
+    """Calling it makes Ctrl-C be pressed while the student is rendered for the nth time from then on."""
+    render, waiting = ReferenceBackend.render, []
+
+    def interrupting(self, gaussians, camera, effects):
+        if torch.is_grad_enabled() and waiting:
+            waiting[0] -= 1
+            if waiting[0] == 0:
+                waiting.clear()
+                signal.raise_signal(signal.SIGINT)
+        return render(self, gaussians, camera, effects)
+
+    monkeypatch.setattr(ReferenceBackend, "render", interrupting)
+    return lambda nth: waiting.append(nth)
+
+
+def with_extras(path):
+    """A checkpoint with a column that 3DGS does not know."""
+    model = tiny.model(40)
+    return VanillaModel(model.parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)})).save(path, provenance={})
+
+
+@pytest.mark.parametrize("nth", [1, 4, 9, 14])  # in the first step; before and after a pruning; in the last step
+def test_a_resumed_default_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth):
+    whole = wrapped().adapt(1 / 4, **BRIEF)
+    ctrl_c(nth)
+    state = tmp_path / "run.resume"
+    with pytest.raises(Interrupted, match=rf"interrupted at step {(nth + 1) // 2}; run the same command again to go on from .*run.resume"):
+        wrapped().adapt(1 / 4, resume=state, **BRIEF)
+    resumed = wrapped().adapt(1 / 4, resume=state, **BRIEF)
+    assert not state.exists()
+    files = [adapted.save(tmp_path / f"{i}.ply").read_bytes() for i, adapted in enumerate((whole, resumed))]
+    assert files[0] == files[1]
+    assert [(p.step, p.psnr_db, p.gaussians) for p in resumed.report.curve] == [(p.step, p.psnr_db, p.gaussians) for p in whole.report.curve]
+
+
+@pytest.mark.parametrize("nth", [2, 5])  # before and after splats were cloned
+def test_a_resumed_paper_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth):
+    whole = wrapped(background=WHITE).adapt(1 / 4, recipe="paper", **BRIEF_PAPER).model
+    ctrl_c(nth)
+    with pytest.raises(Interrupted):
+        wrapped(background=WHITE).adapt(1 / 4, recipe="paper", resume=tmp_path / "state", **BRIEF_PAPER)
+    resumed = wrapped(background=WHITE).adapt(1 / 4, recipe="paper", resume=tmp_path / "state", **BRIEF_PAPER).model
+    files = [model.save(tmp_path / f"{i}.ply", provenance={}).read_bytes() for i, model in enumerate((whole, resumed))]
+    assert files[0] == files[1]
+
+
+def test_a_run_interrupted_twice_equals_an_uninterrupted_one(tmp_path, ctrl_c):
+    whole = wrapped().adapt(1 / 4, **BRIEF)
+    for nth in (3, 4):
+        ctrl_c(nth)
+        with pytest.raises(Interrupted):
+            wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
+    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
+    assert torch.equal(shown(resumed), shown(whole))
+
+
+def test_extra_columns_outlive_a_resumption_unless_splats_were_dropped(tmp_path, ctrl_c):
+    path = with_extras(tmp_path / "base.ply")
+    for name, settings, kept in [("all", {**BRIEF, "min_opacity": 0.0}, True), ("some", BRIEF, False)]:
+        ctrl_c(9)
+        with pytest.raises(Interrupted):
+            wrap_model(path, cameras=tiny.cameras(), backend="reference").adapt(1 / 4, resume=tmp_path / "state", **settings)
+        resumed = wrap_model(path, cameras=tiny.cameras(), backend="reference").adapt(1 / 4, resume=tmp_path / "state", **settings)
+        assert ("confidence" in read_ply(resumed.save(tmp_path / f"{name}.ply")).columns) == kept
+
+
+def test_a_reset_of_opacities_keeps_extra_columns(tmp_path):
+    model = wrap_model(with_extras(tmp_path / "base.ply"), cameras=tiny.cameras(), backend="reference", background=WHITE)
+    saved = model.adapt(1 / 4, recipe="paper", steps=3).save(tmp_path / "new.ply")
+    assert "confidence" in read_ply(saved).columns
+
+
+def test_a_state_is_refused_with_anything_else_than_its_own_run(tmp_path, ctrl_c):
+    ctrl_c(2)
+    state = tmp_path / "state"
+    with pytest.raises(Interrupted):
+        wrapped().adapt(1 / 4, resume=state, **BRIEF)
+    others = [
+        (wrapped(), 1 / 4, {**BRIEF, "seed": 1}),
+        (wrapped(), 1 / 2, BRIEF),
+        (wrapped(cameras=tiny.cameras(3)), 1 / 4, BRIEF),
+        (wrapped(background=WHITE), 1 / 4, BRIEF),
+        (wrapped(screen_filter="antialiased"), 1 / 4, BRIEF),
+        (wrapped(41), 1 / 4, BRIEF),
+    ]
+    for model, scale, settings in others:
+        with pytest.raises(SettingsError, match="belongs to another base, other settings or other views; repeat those, or delete the file"):
+            model.adapt(scale, resume=state, **settings)
+    assert state.exists()
+
+
+def test_a_file_that_is_no_state_is_refused(tmp_path):
+    (tmp_path / "state").write_text("no state")
+    with pytest.raises(SettingsError, match=r"state: this is not the state of an interrupted run \(\w+\); delete it to start anew"):
+        wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
+
+
+def test_ctrl_c_without_a_file_to_resume_from_says_so(ctrl_c):
+    ctrl_c(2)
+    with pytest.raises(Interrupted, match="interrupted at step 1; nothing was written, for no file to resume from was named"):
+        wrapped().adapt(1 / 4, **BRIEF)
+
+
+def test_a_second_ctrl_c_is_immediate_and_the_old_handler_comes_back():
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), interruptible() as interrupted:
+        signal.raise_signal(signal.SIGINT)
+        assert interrupted()
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_adapting_in_a_thread():
+    done = []
+    thread = threading.Thread(target=lambda: done.append(wrapped().adapt(1 / 4, steps=1, extra_views=0)))
+    thread.start()
+    thread.join()
+    assert done[0].report.ended_by == "1 steps"
+
+
+# Ending early
+
+
+def test_the_time_budget_ends_the_run():
+    assert wrapped().adapt(1 / 4, time_budget_s=1e-6, **BRIEF).report.ended_by == "time budget of 1e-06 s"
+
+
+def test_the_knee_ends_the_run():
+    report = wrapped().adapt(1 / 4, **{**BRIEF, "steps": 50, "check_every": 1, "patience": 2, "min_gain_db": 1000}).report
+    assert report.ended_by == "knee: 2 checks in a row gained less than 1000 dB"
+    assert report.curve[-1].step == 3
+
+
+# Hard cases
+
+
+def behind_every_camera() -> VanillaModel:
+    """One camera looks along +z; the splats are behind it."""
+    splats = tiny.gaussians(5)
+    return VanillaModel.from_gaussians(replace(splats, means=splats.means - torch.tensor([0.0, 0.0, 9.0])))
+
+
+AHEAD = tiny.cameras(1)[0].looking_from(torch.eye(4), "ahead")
+
+
+@pytest.mark.parametrize("recipe", ["default", "paper"])
+def test_no_gradient_at_all_leaves_finite_splats(recipe):
+    model = wrap_model(behind_every_camera(), cameras=[AHEAD], backend="reference")
+    adapted = model.adapt(1 / 4, recipe=recipe, views="given", steps=3, prune_every=2)
+    assert is_finite(adapted.model) and len(adapted.model) == 5
+
+
+@pytest.mark.parametrize("settings", [dict(min_opacity=0.99), dict(min_opacity=0.99, recipe="paper", densify_gradient=1e-9)])
+def test_everything_pruned_leaves_one_splat(settings):
+    adapted = wrapped().adapt(1 / 4, **{"views": "given", "steps": 5, "prune_every": 1, **settings})
+    assert is_finite(adapted.model) and adapted.report.gaussians_after == 1
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("views", ["given", "jittered"])
+def test_one_view_and_the_same_view_twice(views, count):
+    adapted = wrapped(cameras=tiny.cameras(1) * count).adapt(1 / 4, views=views, steps=3, extra_views=2, check_every=3)
+    assert is_finite(adapted.model) and adapted.report.curve[-1].psnr_db > 20
+
+
+@pytest.mark.parametrize(("recipe", "settings"), [("default", dict(steps=2)), ("paper", dict(steps=2)), ("instant", {})])
+def test_scale_one_is_a_zoom_too(recipe, settings):
+    model, camera = wrapped(), tiny.cameras()[0]
+    adapted = model.adapt(1, recipe=recipe, **settings)
+    assert psnr(adapted.render(camera).image, model.render(camera).image) > 35
+
+
+@pytest.mark.parametrize(("scale", "size"), [(64, (4, 3)), (1 / 64, (32, 24)), (0.3, (31, 23)), (1e-9, (32, 24))])
+@pytest.mark.parametrize("recipe", ["default", "paper"])
+def test_extreme_and_crooked_scales(recipe, scale, size):
+    views = tiny.cameras(1, width=size[0], height=size[1])
+    adapted = wrapped(10, cameras=views).adapt(scale, recipe=recipe, views="given", steps=2)
+    image = adapted.render(views[0].zoomed(scale)).image
+    assert image.shape == (*views[0].zoomed(scale).size, 3)
+    assert is_finite(adapted.model) and image.isfinite().all()
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_every_sh_degree_adapts(degree):
+    model = wrap_model(tiny.model(10, degree=degree), cameras=tiny.cameras(), backend="reference")
+    adapted = model.adapt(1 / 4, steps=2, extra_views=0)
+    assert adapted.model.sh_degree == degree and is_finite(adapted.model)
+
+
+def test_double_precision_adapts_in_double_precision():
+    splats = tiny.gaussians(10).to(dtype=torch.float64)
+    adapted = wrap_model(VanillaModel.from_gaussians(splats), cameras=tiny.cameras(), backend="reference").adapt(1 / 4, steps=2, extra_views=0)
+    assert adapted.model.parameters()["means"].dtype == torch.float64
+
+
+def test_splats_with_ends_of_every_range_stay_finite():
+    splats = tiny.gaussians(8)
+    scales = splats.scales.clone()
+    scales[0], scales[1], scales[2] = 0.0, torch.tensor([1e3, 1e-9, 1e-9]), 1e4
+    opacities = splats.opacities.clone()
+    opacities[3], opacities[4] = 0.0, 1.0
+    hostile = Gaussians(splats.means, splats.quats.clone().index_fill_(0, torch.tensor([5]), 0.0), scales, opacities, splats.sh)
+    model = wrap_model(VanillaModel.from_gaussians(hostile), cameras=tiny.cameras(2, width=8, height=6), backend="reference")
+    for scale in (1 / 8, 8):
+        assert is_finite(model.adapt(scale, steps=2).model)
+
+
+# What is refused
+
+
+@pytest.mark.parametrize("scale", [0, -1, float("inf"), float("nan")])
+def test_a_scale_that_is_no_zoom_is_refused(scale):
+    with pytest.raises(SettingsError, match=f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4"):
+        wrapped().adapt(scale)
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        (dict(recipe="best"), "there is no recipe 'best'; known are default, paper, instant"),
+        (dict(stepz=3), "setting stepz: Extra inputs are not permitted"),
+        (dict(steps=-1), "setting steps: Input should be greater than or equal to 0"),
+        (dict(resize="nearest"), "setting resize: Input should be 'box'"),
+        (dict(views="some"), "setting views: Input should be 'given'"),
+        (dict(time_budget_s=0), "setting time_budget_s: Input should be greater than 0"),
+        (dict(rates={"means": -1}), "setting rates.means: Input should be greater than or equal to 0"),
+        (dict(upsampler="swin"), "there is no 'swin'; known are bicubic, lanczos"),
+        (dict(views="test"), "there are no test views among the 4 cameras; ask for the views 'given'"),
+        (dict(resize="box", scale=0.3, steps=1), "is not a whole multiple of"),
+    ],
+)
+def test_settings_that_cannot_be_served_are_refused_in_a_sentence(settings, sentence):
+    with pytest.raises(SettingsError, match=sentence):
+        wrapped().adapt(**{"scale": 4, **settings})
+
+
+def test_an_unknown_backend_and_one_that_cannot(monkeypatch):
+    with pytest.raises(SettingsError, match="there is no 'gpu'; known are"):
+        wrap_model(tiny.model(5), cameras=tiny.cameras(), backend="gpu").adapt(4)
+    monkeypatch.setattr(ReferenceBackend, "lacking", lambda self, needs: ["it has no gradients"] if needs.gradients else [])
+    assert wrapped().adapt(4).report.ended_by == "0 steps"  # which needs none
+    with pytest.raises(BackendUnavailable, match="backend 'reference' cannot do this: it has no gradients"):
+        wrapped().adapt(1 / 4)
+
+
+# Saving
+
+
+def test_saving_writes_the_splats_the_tag_the_provenance_and_the_report(tmp_path):
+    adapted = wrap_model(tiny.ply(tmp_path / "base.ply"), cameras=tiny.cameras(), backend="reference").adapt(1 / 4, **BRIEF)
+    saved = adapted.save(tmp_path / "new.ply")
+    comments = read_ply(saved).comments
+    assert saved == tmp_path / "new.ply" and "SplatRenderMode: default" in comments and render_mode(comments) == "classic"
+    provenance = provenance_of(comments)
+    assert (provenance["scale"], provenance["base"]) == (0.25, hashlib.sha256((tmp_path / "base.ply").read_bytes()).hexdigest())
+    assert provenance["settings"]["steps"] == 7 and "seconds" not in json.dumps(provenance)
+    sidecar = json.loads((tmp_path / "new.ply.adaptation.json").read_text())
+    assert sidecar == json.loads(json.dumps(adapted.report.model_dump()))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply", "new.ply.adaptation.json"]
+
+
+def test_any_classic_viewer_shows_the_file_as_the_adapted_model_shows_itself(tmp_path):
+    model = wrap_model(tiny.model(40, TrainedScale(screen_filter="antialiased")), cameras=tiny.cameras(), backend="reference")
+    adapted = model.adapt(1 / 4, **BRIEF)
+    loaded = wrap_model(adapted.save(tmp_path / "new.ply"), backend="reference")
+    small = tiny.cameras()[0].zoomed(1 / 4)
+    torch.testing.assert_close(loaded.render(small, screen_filter="classic").image, adapted.render(small).image, atol=1e-5, rtol=0)
+
+
+def test_a_model_folder_becomes_a_model_folder(tmp_path):
+    saved = wrap_model(tiny.folder(tmp_path / "base"), backend="reference").adapt(4).save(tmp_path / "new")
+    assert saved == tmp_path / "new/point_cloud/iteration_30000/point_cloud.ply"
+    assert saved.with_name("point_cloud.ply.adaptation.json").is_file()
+    assert len(wrap_model(tmp_path / "new").cameras) == 4
+
+
+def test_an_output_that_exists_is_not_overwritten_unless_asked(tmp_path):
+    adapted = wrapped().adapt(4)
+    (tmp_path / "new.ply").write_text("precious")
+    with pytest.raises(OutputExists, match=r"new\.ply exists already; pass --overwrite"):
+        adapted.save(tmp_path / "new.ply")
+    assert (tmp_path / "new.ply").read_text() == "precious"
+    assert not (tmp_path / "new.ply.adaptation.json").exists()
+    adapted.save(tmp_path / "new.ply", overwrite=True)
+    assert len(load_model(tmp_path / "new.ply")) == 40
+
+
+def test_a_bare_file_without_cameras_adapts_on_an_orbit(tmp_path, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+    adapted = wrap_model(tiny.ply(tmp_path / "base.ply"), backend="reference").adapt(1 / 4, steps=2, extra_views=3)
+    assert adapted.report.views == "3 views of a generated orbit at 24 px (the checkpoint came without cameras)"
+    assert is_finite(adapted.model)
+
+
+def test_an_adapted_model_can_be_adapted_again():
+    first = wrapped().adapt(1 / 2, steps=1, extra_views=0)
+    half = [camera.zoomed(1 / 2) for camera in tiny.cameras()]
+    again = wrap_model(first.model, cameras=half, backend="reference").adapt(1 / 2, steps=1, extra_views=0)
+    assert is_finite(again.model) and again.model is not first.model
