@@ -71,7 +71,7 @@ def test_hostile_splats_stay_finite(scale):
     splats = disc(1.0, 1.0, count=6)
     means = splats.means + torch.tensor([[0, 0, -8.0], [0, 0, -DEPTH], [1e6, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
     scales = torch.tensor([[1.0] * 3, [1.0] * 3, [1.0] * 3, [0.0] * 3, [1e4] * 3, [1e3, 1e-9, 1e-9]], dtype=torch.float64)
-    new = adapted(replace(splats, means=means, scales=scales), scale, 1 / 12)
+    new = adapted(replace(splats, means=means, scales=scales), scale)
     assert new.scales.isfinite().all() and (new.scales >= 0).all()
     assert new.opacities.isfinite().all() and ((new.opacities >= 0) & (new.opacities <= splats.opacities)).all()
 
@@ -79,7 +79,7 @@ def test_hostile_splats_stay_finite(scale):
 @pytest.mark.parametrize("scale", [1 / 4, 4])
 def test_views_that_see_nothing_give_finite_splats(scale):
     away = VIEW.looking_from(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])), "away")
-    scales, opacities = closed_form(disc(1.0, 1.0), [away], scale, Effects(0), 0.0)
+    scales, opacities = closed_form(disc(1.0, 1.0), [away], scale, Effects(0))
     assert scales.isfinite().all() and opacities.isfinite().all()
 
 
