@@ -1,0 +1,174 @@
+"""The teacher and its views: rendered once per view at the base scale, resized, and seen from where the policy says."""
+
+import math
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation import views as views_module
+from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
+from mipmap_plugin.adaptation.views import Rounds, choose_views, extent
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.config import AdaptConfig, recipe
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation.metrics import psnr
+
+TRAINED = Effects(sh_degree=1)
+
+
+class Recorder(ReferenceBackend):
+    """Notes the size and the filter of every image that it renders."""
+
+    def __init__(self):
+        self.seen = []
+
+    def render(self, gaussians, camera, effects):
+        self.seen.append((camera.width, camera.height, effects.eps2d, torch.is_grad_enabled()))
+        return super().render(gaussians, camera, effects)
+
+
+def teacher(scale, backend=None, model=None, **settings):
+    return PseudoTruth(model or tiny.model(), backend or ReferenceBackend(), TRAINED, scale, AdaptConfig(**settings))
+
+
+def base(view, model=None):
+    return ReferenceBackend().render((model or tiny.model()).gaussians(view), view, TRAINED).image
+
+
+def bright():
+    """Splats whose colors go far beyond 1."""
+    model = tiny.model()
+    model.parameters()["sh0"].add_(3.0)
+    return model
+
+
+# The teacher
+
+
+def test_each_view_is_rendered_once_at_its_own_scale_without_gradients():
+    recorder, views = Recorder(), tiny.cameras(3)
+    truth = teacher(1 / 4, recorder)
+    first = [truth(view) for view in views]
+    again = [truth(view) for view in views]
+    assert all(a is b for a, b in zip(first, again, strict=True))
+    assert recorder.seen == [(32, 24, 0.3, False)] * 3
+
+
+def test_zoomed_out_it_is_the_clamped_base_resized():
+    view = tiny.cameras(1)[0]
+    truth = teacher(1 / 4, model=bright(), resize="area")(view)
+    image = base(view, bright())
+    assert image.max() > 1.5
+    torch.testing.assert_close(truth, resize(image.clamp(0, 1), (6, 8), "area"))
+
+
+def test_zoomed_in_it_is_the_clamped_base_upsampled(monkeypatch):
+    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
+    given = []
+    register_upsampler("mine", lambda image, size: given.append((image, size)) or image.new_zeros(*size, 3))
+    view = tiny.cameras(1)[0]
+    truth = teacher(4, model=bright(), upsampler="mine")(view)
+    assert truth.shape == (96, 128, 3) and given[0][1] == (96, 128)
+    torch.testing.assert_close(given[0][0], base(view, bright()).clamp(0, 1))
+
+
+def test_the_papers_is_in_eight_bits_and_ours_is_not():
+    view = tiny.cameras(1)[0]
+    levels = PseudoTruth(tiny.model(), ReferenceBackend(), TRAINED, 1 / 4, recipe("paper", 1 / 4))(view) * 255
+    ours = PseudoTruth(tiny.model(), ReferenceBackend(), TRAINED, 1 / 4, recipe("default", 1 / 4))(view) * 255
+    torch.testing.assert_close(levels, levels.round(), atol=1e-4, rtol=0)
+    assert (ours - ours.round()).abs().max() > 0.1
+
+
+def test_a_coarser_render_costs_less_and_is_nearly_the_same():
+    recorder, view = Recorder(), tiny.cameras(1, width=128, height=96)[0]
+    coarse = teacher(1 / 16, recorder, truth_oversampling=4)(view)
+    assert recorder.seen == [(32, 24, 0.3 / 16, False)]
+    assert psnr(coarse, teacher(1 / 16)(view)) > 40
+
+
+@pytest.mark.parametrize("scale", [1 / 2, 1 / 4])
+def test_a_render_is_never_finer_than_the_base(scale):
+    recorder = Recorder()
+    teacher(scale, recorder, truth_oversampling=4)(tiny.cameras(1)[0])
+    assert recorder.seen == [(32, 24, 0.3, False)]
+
+
+def test_an_unknown_upsampler_is_refused_before_anything_is_rendered():
+    with pytest.raises(SettingsError, match="there is no 'swin'"):
+        teacher(1 / 4, upsampler="swin")
+
+
+# Which views
+
+
+def chosen(views, cameras=None, **settings):
+    cameras = tiny.cameras(4) + tiny.cameras(2, seed=5, split="test") if cameras is None else cameras
+    return choose_views(cameras, tiny.gaussians(), AdaptConfig(views=views, **settings)), cameras
+
+
+@pytest.mark.parametrize(
+    ("policy", "picked", "sentence"),
+    [
+        ("given", slice(0, 6), "the 6 given views"),
+        ("train", slice(0, 4), "the 4 train views"),
+        ("test", slice(4, 6), "the 2 test views"),
+    ],
+)
+def test_given_views(policy, picked, sentence):
+    (views, which), cameras = chosen(policy)
+    assert views == cameras[picked] and which == sentence
+
+
+def test_jittered_views_are_the_training_views_and_new_ones_around_them():
+    (views, which), cameras = chosen("jittered", extra_views=7)
+    assert views[:4] == cameras[:4] and len(views) == 11
+    assert which == "4 train views and 7 around them"
+    assert all(view.size == (24, 32) for view in views)
+    reach = max(float((a.center - b.center).norm()) for a in cameras for b in cameras)
+    assert all(min(float((view.center - camera.center).norm()) for camera in cameras) < reach for view in views)
+
+
+def test_views_follow_from_the_seed():
+    centers = [torch.stack([view.center for view in chosen("jittered", extra_views=3, seed=seed)[0][0]]) for seed in (0, 0, 1)]
+    assert torch.equal(centers[0], centers[1]) and not torch.equal(centers[0], centers[2])
+
+
+def test_an_orbit_that_is_asked_for_samples_as_densely_as_the_cameras():
+    (views, which), cameras = chosen("orbit", extra_views=5)
+    assert len(views) == 5 and all(math.isclose(view.fx, cameras[0].fx, rel_tol=0.05) for view in views)
+    assert which == f"5 views of a generated orbit at {views[0].width} px (asked for)"
+
+
+@pytest.mark.parametrize("policy", ["given", "train", "test", "orbit", "jittered"])
+def test_without_cameras_there_is_an_orbit(policy):
+    (views, which), _ = chosen(policy, cameras=[], extra_views=5)
+    assert which == f"5 views of a generated orbit at {views_module.ORBIT_PIXELS} px (the checkpoint came without cameras)"
+    assert len(views) == 5
+
+
+def test_a_split_without_views_is_refused():
+    with pytest.raises(SettingsError, match="there are no test views among the 4 cameras; ask for the views 'given'"):
+        chosen("test", cameras=tiny.cameras(4))
+
+
+def test_rounds_show_every_view_once_and_start_anywhere():
+    views = tiny.cameras(5)
+    rounds = Rounds(views, seed=2)
+    drawn = [rounds(draw) for draw in range(15)]
+    for start in (0, 5, 10):
+        assert set(drawn[start : start + 5]) == set(views)
+    assert drawn[:5] != drawn[5:10]
+    assert [Rounds(views, seed=2)(draw) for draw in range(15)] == drawn
+    assert [Rounds(views, seed=3)(draw) for draw in range(15)] != drawn
+
+
+def test_the_extent_is_inrias_and_one_for_a_single_place():
+    views = tiny.cameras(4)
+    centers = torch.stack([view.center for view in views])
+    assert extent(views) == pytest.approx(1.1 * float((centers - centers.mean(0)).norm(dim=1).max()))
+    assert extent(views[:1]) == 1.0

@@ -1,0 +1,154 @@
+"""Names in, objects out: strangers' backends are listed with their reasons, and a broken one breaks nothing."""
+
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+import torch
+
+from mipmap_plugin import registry
+from mipmap_plugin.backends import BACKENDS, choose_backend, get_backend, register_backend, survey
+from mipmap_plugin.backends.base import API_VERSION, Needs
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
+from mipmap_plugin.evaluation.backends import listing, listing_table
+from mipmap_plugin.registry import Registry
+
+NEEDS = Needs("cpu", torch.float32, gradients=True, sh_degree=1, screen_filter="classic")
+
+
+class Fast(ReferenceBackend):
+    name = "fast"
+    speed = 1000
+
+
+class Fussy(ReferenceBackend):
+    name = "fussy"
+    speed = 2000
+
+    def lacking(self, needs):
+        return ["it is not in the mood", "nor will it be"]
+
+
+class Ancient(ReferenceBackend):
+    api_version = API_VERSION - 1
+
+
+class Crashing:
+    def __init__(self):
+        raise RuntimeError("no driver")
+
+
+@pytest.fixture(autouse=True)
+def only_the_reference(monkeypatch):
+    monkeypatch.setattr(BACKENDS, "_targets", {"reference": "mipmap_plugin.backends.reference:ReferenceBackend"})
+
+
+@pytest.fixture
+def install(monkeypatch):
+    """Make it look as if a package with this entry point were installed."""
+
+    def do(name, value, group="mipmap_plugin.backends"):
+        points = [EntryPoint(name, value, group)]
+        monkeypatch.setattr(registry, "entry_points", lambda group: [point for point in points if point.group == group])
+
+    return do
+
+
+def test_auto_takes_the_fastest_that_lacks_nothing_and_says_why():
+    register_backend("fast", Fast)
+    register_backend("fussy", Fussy)
+    backend, why = choose_backend("auto", NEEDS)
+    assert isinstance(backend, Fast)
+    assert why == "fast: the fastest that lacks nothing; fussy not, because it is not in the mood"
+
+
+def test_asking_by_name():
+    register_backend("fussy", Fussy)
+    backend, why = choose_backend("reference", NEEDS)
+    assert (type(backend), why) == (ReferenceBackend, "reference: asked for")
+    with pytest.raises(BackendUnavailable, match="backend 'fussy' cannot do this: it is not in the mood; nor will it be"):
+        choose_backend("fussy", NEEDS)
+    with pytest.raises(SettingsError, match=r"mipmap_plugin\.backends: there is no 'gpu'; known are fussy, reference"):
+        choose_backend("gpu", NEEDS)
+
+
+def test_no_backend_at_all_gives_every_reason():
+    register_backend("fussy", Fussy)
+    needs = Needs("cpu", torch.float16, gradients=True, sh_degree=9, screen_filter="soft")
+    with pytest.raises(BackendUnavailable) as caught:
+        choose_backend("auto", needs)
+    for reason in ("fussy: it is not in the mood", "not in torch.float16", "SH up to degree 4, not 9", "not soft"):
+        assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("no_such_package:Backend", "'bad' (no_such_package:Backend) cannot be loaded: ModuleNotFoundError: No module named 'no_such_package'"),
+        ("mipmap_plugin.backends.reference:Missing", "cannot be loaded: AttributeError"),
+        ("mipmap_plugin.backends.reference", "cannot be loaded: AttributeError"),
+        (Crashing, "backend 'bad' cannot be made: RuntimeError: no driver"),
+        (Ancient, f"backend 'bad' is written for API version {API_VERSION - 1}, this package has {API_VERSION}"),
+        (object, f"backend 'bad' is written for API version unknown, this package has {API_VERSION}"),
+    ],
+)
+def test_a_broken_plugin_is_listed_with_its_reason_and_breaks_nothing(target, reason):
+    register_backend("bad", target)
+    reasons = survey(NEEDS)
+    assert reasons["reference"] == [] and reason in reasons["bad"][0]
+    assert choose_backend("auto", NEEDS)[0].name == "reference"
+    with pytest.raises(PluginError) as caught:
+        get_backend("bad")
+    assert reason in str(caught.value)
+
+
+def test_a_plugin_that_fails_while_it_is_imported(tmp_path, monkeypatch):
+    (tmp_path / "failing_plugin.py").write_text("raise ValueError('half installed')")
+    monkeypatch.syspath_prepend(tmp_path)
+    register_backend("bad", "failing_plugin:Backend")
+    assert "ValueError: half installed" in survey(NEEDS)["bad"][0]
+
+
+def test_the_listing_names_every_backend_and_its_reasons():
+    register_backend("fussy", Fussy)
+    here = {row.name: row.reasons for row in listing() if row.device == "cpu"}
+    assert here == {"reference": (), "fussy": ("it is not in the mood", "nor will it be")}
+    table = listing_table(listing())
+    assert "no: it is not in the mood; nor will it be" in table and "yes" in table
+
+
+def test_a_name_is_taken_once():
+    register_backend("fast", Fast)
+    register_backend("fast", Fast)  # the same again is no conflict
+    with pytest.raises(SettingsError, match="the name 'fast' is taken; pass replace=True to override it"):
+        register_backend("fast", Fussy)
+    register_backend("fast", Fussy, replace=True)
+    assert isinstance(get_backend("fast"), Fussy)
+
+
+def test_an_installed_backend_is_seen_and_used(install):
+    install("ours", f"{__name__}:Fast")
+    assert BACKENDS.names() == ["ours", "reference"]
+    assert choose_backend("auto", NEEDS)[0].name == "fast"
+
+
+def test_an_installed_package_cannot_shadow_a_built_in(install):
+    install("reference", f"{__name__}:Fussy")
+    assert type(get_backend("reference")) is ReferenceBackend
+
+
+def test_an_installed_backend_that_is_broken_breaks_nothing(install):
+    install("bad", "no_such_package:Backend")
+    assert choose_backend("auto", NEEDS)[0].name == "reference"
+    assert "no_such_package" in survey(NEEDS)["bad"][0]
+
+
+def test_targets_are_imported_only_when_asked_for(tmp_path, monkeypatch):
+    (tmp_path / "lazy_plugin.py").write_text("thing = 'made'")
+    monkeypatch.syspath_prepend(tmp_path)
+    things = Registry("group", {"lazy": "lazy_plugin:thing"})
+    assert things.names() == ["lazy"] and "lazy_plugin" not in sys.modules
+    assert things.get("lazy") == "made"
+    sys.modules.pop("lazy_plugin")
+
