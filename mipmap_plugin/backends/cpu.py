@@ -8,7 +8,6 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.filters import SCREEN_FILTERS
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
@@ -24,7 +23,7 @@ class CpuBackend:
     api_version = API_VERSION
     speed = 10
     capabilities = Capabilities(
-        devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=SCREEN_FILTERS
+        devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased"})
     )
 
     def lacking(self, needs: Needs) -> list[str]:

@@ -63,8 +63,9 @@ def run_demo(output: Path, scales: Sequence[float], *, overwrite: bool = False) 
     views = views[:: len(views) // JUDGED][:JUDGED]
     rows: list[Row] = []
     for scale in scales:
+        rows += training_free_rows(base, views, scale, PROTOCOL)
         adapted = base.adapt(scale, resize="box", time_budget_s=BUDGET_S)
-        rows += [*training_free_rows(base, views, scale, PROTOCOL), adapted_row("adapted", adapted, views, PROTOCOL)]
+        rows.append(adapted_row("adapted", adapted, views, PROTOCOL))
         adapted.save(output / f"x{scale:g}.ply", overwrite=overwrite)
         camera = views[0].camera.zoomed(scale)
         pictures = [base.render(camera).image, adapted.render(camera).image, views[0].truth(scale, PROTOCOL)]
