@@ -6,14 +6,15 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tyro
 
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.cli_outputs import adapted_path, picture_names
+from mipmap_plugin.cli_types import Background, Checkpoint, Scale, Scales
 from mipmap_plugin.config import Recipe, ResizeFilter, ViewPolicy
 from mipmap_plugin.effects import explain
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
@@ -25,28 +26,6 @@ from mipmap_plugin.scenes.images import write_image
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 app = tyro.extras.SubcommandApp()
-
-
-def _scale(text: str) -> float:
-    scale = float(Fraction(text))
-    if scale <= 0:
-        raise ValueError(f"{text} is no zoom")
-    return scale
-
-
-Scale = Annotated[
-    float,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="1/4|4",
-        instance_from_str=lambda words: _scale(words[0]),
-        is_instance=lambda value: isinstance(value, float),
-        str_from_instance=lambda value: [f"{value:g}"],
-    ),
-]
-Scales = tyro.conf.UseAppendAction[list[Scale]]
-Background = Literal["white", "black"]
-Checkpoint = tyro.conf.Positional[Path]
 
 
 @app.command
@@ -115,11 +94,12 @@ def adapt(
     wrapped = _wrap(checkpoint, cameras, background, backend)
     chosen: dict[str, Any] = dict(views=views, steps=steps, time_budget_s=time_budget_s, resize=resize, upsampler=upsampler)
     settings = {name: value for name, value in chosen.items() if value is not None}
-    targets = [_output(checkpoint, output, each, len(scale) > 1) for each in scale]
+    scales = _each_once(scale)
+    targets = [adapted_path(checkpoint, output, each, len(scales) > 1) for each in scales]
     for target in targets:
         refuse_existing(target, overwrite)
     reports = []
-    for each, target in zip(scale, targets, strict=True):
+    for each, target in zip(scales, targets, strict=True):
         adapted = wrapped.adapt(each, recipe=recipe, seed=seed, resume=target.with_name(target.name + ".resume"), **settings)
         saved = adapted.save(target, overwrite=overwrite)
         report = adapted.report
@@ -161,7 +141,7 @@ def render(
     """
     wrapped = _wrap(checkpoint, cameras, background, backend)
     views = _named(wrapped, view)
-    names = [f"{camera.split}_{camera.name}.png" for camera in views]
+    names = picture_names(views)
     for name in names:
         refuse_existing(output / name, overwrite)
     for camera, name in zip(views, names, strict=True):
@@ -208,7 +188,7 @@ def evaluate(
         refuse_existing(output, overwrite)
     wrapped = _wrap(checkpoint, None, background, backend)
     overrides: dict[str, Any] = {"seed": seed} | ({} if steps is None else {"steps": steps})
-    rows = rows_of(wrapped, load_scene(images), scale, recipe, protocol, **overrides)
+    rows = rows_of(wrapped, load_scene(images), _each_once(scale), recipe, protocol, **overrides)
     if output:
         write_json(output, records(rows), overwrite)
     if json:
@@ -278,12 +258,10 @@ def _named(wrapped: Wrapped, names: Sequence[str]) -> list[Camera]:
     return found
 
 
-def _output(checkpoint: Path, output: Path | None, scale: float, several: bool) -> Path:
-    suffix = ".ply" if checkpoint.suffix == ".ply" else ""
-    name = f"{checkpoint.resolve().name.removesuffix('.ply')}_x{scale:g}{suffix}"
-    if output is None:
-        return checkpoint.resolve().parent / name
-    return output / name if several else output
+def _each_once(scales: Sequence[float]) -> list[float]:
+    if not scales:
+        raise SettingsError("no scale is given; pass --scale 1/4 or --scale 4, for example")
+    return list(dict.fromkeys(scales))
 
 
 def _tell(facts: Any, as_json: bool) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import orbit, write_cameras
+from mipmap_plugin.scenes.images import write_image
 
 WIDTH, HEIGHT = 32, 24  # px
 
@@ -45,4 +49,18 @@ def folder(path: Path, views: list[Camera] | None = None, **options) -> Path:
     """A model folder, with the cameras beside the splats."""
     model(**options).save(path, provenance={})
     write_cameras(path / "cameras.json", views or cameras())
+    return path
+
+
+def scene(path: Path, test: list[Camera] | None = None, train: list[Camera] | None = None, **options) -> Path:
+    """A transforms scene with photographs, which are exact renders of the model at the size of each camera."""
+    splats, painter = model(**options), ReferenceBackend()
+    for split, views in (("train", train or []), ("test", test or cameras(2, seed=9, split="test"))):
+        frames = []
+        for view in views:
+            pose = torch.linalg.inv(view.viewmat) @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+            frames.append({"file_path": f"./{split}/{view.name}", "transform_matrix": pose.tolist(), "fl_x": view.fx, "fl_y": view.fy})
+            write_image(path / split / f"{view.name}.png", painter.render(splats.gaussians(view), view, Effects(1)).image)
+        if frames:
+            (path / f"transforms_{split}.json").write_text(json.dumps({"frames": frames}))
     return path

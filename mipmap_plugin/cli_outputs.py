@@ -1,0 +1,24 @@
+"""What the command line calls the files that it writes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mipmap_plugin.camera import Camera
+
+
+def adapted_path(checkpoint: Path, output: Path | None, scale: float, several: bool) -> Path:
+    """Beside the checkpoint as NAME_x0.25, or `output`, which is a folder for all where there are several scales."""
+    suffix = ".ply" if checkpoint.suffix == ".ply" else ""
+    name = f"{checkpoint.resolve().name.removesuffix('.ply')}_x{scale:g}{suffix}"
+    if output is None:
+        return checkpoint.resolve().parent / name
+    return output / name if several else output
+
+
+def picture_names(views: Sequence[Camera]) -> list[str]:
+    """A PNG's name for each view, none twice and none with a folder in it; views of the same name are numbered."""
+    names = [f"{view.split}_{view.name}".replace("/", "_").replace("\\", "_") for view in views]
+    numbers = [f"_{names[:i].count(name) + 1}" if names.count(name) > 1 else "" for i, name in enumerate(names)]
+    return [f"{name}{number}.png" for name, number in zip(names, numbers, strict=True)]

@@ -1,0 +1,35 @@
+"""What the words of the command line are read as."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+def read_scale(text: str) -> float:
+    """A zoom: 0.25, 1/4, 4. Raises ValueError."""
+    try:
+        scale = float(Fraction(text))
+    except (ValueError, ZeroDivisionError, OverflowError):
+        scale = 0.0
+    if scale <= 0:
+        raise ValueError(f"{text} is no zoom; give a number above 0, such as 1/4 or 4")
+    return scale
+
+
+Scale = Annotated[
+    float,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="1/4|4",
+        instance_from_str=lambda words: read_scale(words[0]),
+        is_instance=lambda value: isinstance(value, float),
+        str_from_instance=lambda value: [f"{value:g}"],
+    ),
+]
+Scales = tyro.conf.UseAppendAction[list[Scale]]
+Background = Literal["white", "black"]
+Checkpoint = tyro.conf.Positional[Path]
