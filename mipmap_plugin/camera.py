@@ -25,6 +25,8 @@ class Camera:
     name: str = ""
     split: Literal["train", "test"] = "train"
     time: float | None = None  # 0..1, for moving scenes
+    zoom: float = 1.0  # how much finer than in training this view is sampled, for models with levels of detail
+    index: int | None = None  # the number of a training view, for models with an appearance for each
 
     def __post_init__(self) -> None:
         if tuple(self.viewmat.shape) != (4, 4):
@@ -50,10 +52,11 @@ class Camera:
         Width and height are rounded as Pillow users do, and the focal lengths follow each axis' true factor, so
         that the field of view is exactly kept.
         """
-        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+        resized = self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+        return replace(resized, zoom=self.zoom * factor)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same field of view at `width` x `height` px."""
+        """The same field of view at `width` x `height` px; what the model is asked for (`zoom`) stays."""
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 

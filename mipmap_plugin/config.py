@@ -24,6 +24,9 @@ class LearningRates(BaseModel):
     opacities: float = Field(0.05, ge=0, description="Of the logits.")
     sh0: float = Field(0.0025, ge=0)
     shN: float = Field(0.0025 / 20, ge=0)
+    offsets: float = Field(0.0, ge=0, description="Of an anchor's splats around it, times the extent.")
+    features: float = Field(0.0075, ge=0, description="Of an anchor's feature vector.")
+    networks: float = Field(0.0, ge=0, description="Of networks that all anchors share; a deformation network never moves.")
 
 
 class AdaptConfig(BaseModel):

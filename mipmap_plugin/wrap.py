@@ -166,7 +166,7 @@ class _Adaptation:
     @torch.no_grad()
     def _start_closed_form(self, student: SplatModel) -> None:
         began = time.perf_counter()
-        student.reshape(*closed_form(self.base.gaussians(self.views[0]), self.views, self.scale, self.trained))
+        student.reshape(lambda gaussians: closed_form(gaussians, self.views, self.scale, self.trained), self.views)
         self.seconds["closed form"] = time.perf_counter() - began
 
     def _render(self, model: SplatModel, camera: Camera) -> Tensor:
@@ -195,7 +195,7 @@ class _Adaptation:
             filters=f"pseudo truth {truth}; base {self.trained.screen_filter} {self.trained.eps2d:g} px²; file classic {DILATION:g} px²",
             effects=[f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(self.effects, before)],
             gaussians_before=len(before),
-            gaussians_after=len(run.student.row_opacities()),
+            gaussians_after=len(run.student.gaussians(self.views[0])),
             seconds=self.seconds,
             ended_by=ended_by,
             curve=run.curve,
@@ -206,7 +206,7 @@ class _Adaptation:
 def _digest(model: SplatModel) -> str:
     """The sha256 of a model that was made in memory."""
     digest = hashlib.sha256()
-    for tensor in model.parameters().values():
+    for tensor in {**model.parameters(), **model.shared_parameters()}.values():
         digest.update(tensor.detach().cpu().contiguous().numpy())
     return digest.hexdigest()
 

@@ -102,7 +102,7 @@ def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
         shown = run.student.gaussians(task.views[0]).detach()
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
         density.densify(run.student, run.optimizer, run.gradients.mean() >= config.densify_gradient, extent(task.views), shown, generator)
-    density.prune(run.student, run.optimizer, run.student.row_opacities() >= config.min_opacity)
+    density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
     means = run.student.parameters()["means"]
     run.gradients = density.ScreenGradients(len(means), means.device)
     run.rows_changed |= means is not before
@@ -111,5 +111,5 @@ def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
 def _mark(run: Run, config: AdaptConfig) -> None:
     """A new point of the curve, from the losses of the steps since the last one."""
     mean = run.square_error / config.check_every
-    run.curve.append(CurvePoint(step=run.step, seconds=run.watch.seconds, psnr_db=decibel(mean), gaussians=len(run.student.row_opacities())))
+    run.curve.append(CurvePoint(step=run.step, seconds=run.watch.seconds, psnr_db=decibel(mean), gaussians=len(run.student.parameters()["means"])))
     run.square_error = 0.0

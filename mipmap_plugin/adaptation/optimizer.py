@@ -15,10 +15,13 @@ ADAM_EPS = 1e-15
 
 
 def make_optimizer(model: SplatModel, config: AdaptConfig, extent: float) -> torch.optim.Adam:
-    """One group per parameter that moves; the means' rate is times `extent`, in world units."""
+    """One group per parameter that moves; the rates of means and offsets are times `extent`, in world units."""
     rates = config.rates.model_dump()
     rates["means"] *= extent
+    rates["offsets"] *= extent
     groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]
+    if shared := list(model.shared_parameters().values()):
+        groups.append({"params": shared, "lr": rates["networks"], "base_lr": rates["networks"], "name": "networks"})
     return torch.optim.Adam(groups, eps=ADAM_EPS, fused=True)
 
 
@@ -34,7 +37,8 @@ def change_rows(
 ) -> None:
     """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in model and optimizer alike."""
     fresh = {}
-    for group in optimizer.param_groups:
+    names = model.parameters().keys()
+    for group in (group for group in optimizer.param_groups if group["name"] in names):
         old = group["params"][0]
         new = parameter(group["name"], old.detach()).clone().requires_grad_()
         state = optimizer.state.pop(old, {})

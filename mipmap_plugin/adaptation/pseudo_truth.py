@@ -50,6 +50,7 @@ class PseudoTruth:
 
         Clamped before any resizing, as a display does: unclamped highlights would bleed into their neighbors (-3 dB at x1/8).
         """
-        camera = view if share == 1 else view.zoomed(share)
+        # Resized, not zoomed: the base is asked for what it showed in training, at fewer pixels.
+        camera = view if share == 1 else view.resized(max(1, round(view.width * share)), max(1, round(view.height * share)))
         effects = replace(self._effects, eps2d=self._effects.eps2d * share**2)
         return self._backend.render(self._base.gaussians(camera), camera, effects).image.clamp(0, 1)

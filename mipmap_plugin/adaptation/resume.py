@@ -28,6 +28,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "rows_changed": run.rows_changed,
         "curve": [point.model_dump() for point in run.curve],
         "parameters": {name: tensor.detach() for name, tensor in run.student.parameters().items()},
+        "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
         "optimizer": run.optimizer.state_dict(),
         "gradients": (run.gradients.total, run.gradients.seen),
     }
@@ -47,6 +48,9 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
         with torch.no_grad():
             for name, tensor in student.parameters().items():
                 tensor.copy_(state["parameters"][name])
+    with torch.no_grad():
+        for name, tensor in student.shared_parameters().items():
+            tensor.copy_(state["shared"][name])
     optimizer = make_optimizer(student, config, extent(task.views))
     optimizer.load_state_dict(state["optimizer"])
     gradients = ScreenGradients(0, device)

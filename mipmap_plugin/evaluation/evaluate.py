@@ -54,7 +54,7 @@ def judge(name: str, show: Callable[[Camera], Tensor], views: Sequence[Judged], 
 
 def training_free_rows(model: Wrapped, views: Sequence[Judged], scale: float, protocol: Protocol) -> list[Row]:
     """The base as it is, each screen filter that needs no training, and the base's own render resized (for zoom-out, supersampling)."""
-    count = len(model.model.row_opacities())
+    count = len(model.model.gaussians(model.any_camera()))
 
     def filtered(screen_filter: str | None) -> Callable[[Camera], Tensor]:
         return lambda camera: model.render(camera.zoomed(scale), scale, screen_filter).image

@@ -65,7 +65,13 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
     cameras = [c for c in cameras if c.split == "test"] or cameras
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to judge by")
-    return [TestView(camera.zoomed(base.fx / camera.fx), scene.image(camera, background)) for camera in cameras]
+    return [TestView(_as_sampled(camera, base), scene.image(camera, background)) for camera in cameras]
+
+
+def _as_sampled(camera: Camera, base: Camera) -> Camera:
+    """`camera` at the pixel density of `base`: where zooming starts from, and not itself a zoom."""
+    ratio = base.fx / camera.fx
+    return camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
 
 
 def resized_base(render: Tensor, size: tuple[int, int], upsampler: str = "bicubic") -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -49,11 +50,17 @@ class SplatModel(Protocol):
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
         """Take these very tensors, all with the same number of rows, as the model's leaves. Only ever called on a copy."""
 
-    def reshape(self, scales: Tensor, opacities: Tensor) -> None:
-        """Make these activated scales [N, 3] and opacities [N] the model's own. Only ever called on a copy."""
+    def shared_parameters(self) -> dict[str, Tensor]:
+        """What adaptation may move besides and that belongs to no row, such as the networks of an anchor model; {} for most."""
 
-    def row_opacities(self) -> Tensor:
-        """[N], 0..1: how much each row of the parameters can show; rows that show nothing may be pruned."""
+    def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera]) -> None:
+        """Give the model's splats the scales [M, 3] and opacities [M] that `form` finds for them, as far as the family can.
+
+        `views` are there for families whose splats exist only for a camera. Only ever called on a copy.
+        """
+
+    def row_opacities(self, views: Sequence[Camera]) -> Tensor:
+        """[N], 0..1, without gradient: how much each row of the parameters can show; rows that show nothing may be pruned."""
 
     def to(self, device: torch.device | str) -> SplatModel:
         """A copy on another device."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -113,8 +113,13 @@ class VanillaModel:
             self.notes.append(f"the extra columns {', '.join(self._origin.extras)} are dropped, since splats were added or removed")
             self._origin = replace(self._origin, extras={})
 
-    def reshape(self, scales: Tensor, opacities: Tensor) -> None:
-        """Set the activated scales [N, 3] and opacities [N], in place, so that an optimizer keeps its leaves. Raises ShapeError."""
+    def shared_parameters(self) -> dict[str, Tensor]:
+        """None: every parameter belongs to a splat."""
+        return {}
+
+    def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
+        """Set the scales [N, 3] and opacities [N] that `form` finds, in place, so that an optimizer keeps its leaves. Raises ShapeError."""
+        scales, opacities = form(self.gaussians().detach())
         for name, wanted in {"scales": _log(scales), "opacities": _logit(opacities)}.items():
             held = self._parameters[name]
             if wanted.shape != held.shape:
@@ -136,8 +141,8 @@ class VanillaModel:
         cfg_args = cfg_args_for(self.folder, path, self.trained, self.sh_degree)
         return write_folder(path, self.folder, cfg_args, self._origin.iteration, overwrite, partial(write_ply, columns=columns, comments=comments))
 
-    def row_opacities(self) -> Tensor:
-        """[N], 0..1, without gradient."""
+    def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
+        """[N], 0..1, without gradient; the same for all views."""
         return self._parameters["opacities"].detach().sigmoid()
 
     def _with(self, parameters: dict[str, Tensor], origin: Origin | None = None) -> VanillaModel:
