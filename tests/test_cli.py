@@ -1,0 +1,360 @@
+"""The command line: what it prints and writes, its exit codes, and one sentence instead of a traceback for everything that is wrong."""
+
+import errno
+import json
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+from PIL import Image
+
+from mipmap_plugin import registry
+from mipmap_plugin.backends.conformance import Outcome
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.cli import main
+from mipmap_plugin.cli_outputs import picture_names
+from mipmap_plugin.cli_types import read_scale
+from mipmap_plugin.evaluation import backends as backends_module
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.tags import provenance_of
+
+QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
+
+
+@pytest.fixture
+def run(capsys):
+    """Call the command line; return (exit code, what it said on stdout, what on stderr)."""
+
+    def call(*words):
+        capsys.readouterr()
+        try:
+            code = main([str(word) for word in words])
+        except SystemExit as leaving:  # how the argument parser ends
+            code = leaving.code
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
+
+
+@pytest.fixture
+def model_folder(tmp_path):
+    return tiny.folder(tmp_path / "base", tiny.cameras(3) + tiny.cameras(1, seed=9, split="test"))
+
+
+def refused(answer, *words):
+    """Check that it ended in one sentence on stderr, with nothing on stdout, and return the sentence."""
+    code, out, err = answer
+    assert (code, out) == (2, "")
+    assert err.startswith("mipmap-plugin: ") and err.count("\n") == 1
+    assert all(word in err for word in words), err
+    return err
+
+
+# inspect
+
+
+def test_inspect_says_what_a_checkpoint_is(run, model_folder):
+    code, out, err = run("inspect", model_folder)
+    assert (code, err) == (0, "")
+    facts = "family:       3dgs", "splats:       60", "1 in use of 1", "classic, 0.3 px²", "4, 32 x 24 px", "health:"
+    assert all(fact in out for fact in (*facts, "screen filter: on", "compensation: off"))
+
+
+def test_inspect_as_json(run, tmp_path):
+    code, out, _ = run("inspect", tiny.ply(tmp_path / "a.ply"), "--json")
+    facts = json.loads(out)
+    assert code == 0
+    assert (facts["family"], facts["splats"], facts["cameras"]) == ("3dgs", 60, "none beside the checkpoint")
+    assert isinstance(facts["effects"], list) and isinstance(facts["notes"], list)
+
+
+def test_inspect_of_an_iteration(run, model_folder):
+    assert run("inspect", model_folder, "--iteration", "30000")[0] == 0
+    refused(run("inspect", model_folder, "--iteration", "7"), "7")
+
+
+# adapt
+
+
+def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
+    code, out, _ = run("adapt", model_folder, "--scale", "1/4", "--scale", "2", "--output", tmp_path / "out", *QUICK)
+    assert code == 0
+    for scale, name in [(0.25, "base_x0.25"), (2, "base_x2")]:
+        ply = tmp_path / "out" / name / "point_cloud/iteration_30000/point_cloud.ply"
+        assert provenance_of(read_ply(ply).comments)["scale"] == scale
+        assert json.loads(ply.with_name("point_cloud.ply.adaptation.json").read_text())["scale"] == scale
+        assert f"x{scale:g}: {ply}" in out
+    assert "ended by 2 steps" in out and "backend reference: asked for" in out and "the 4 given views" in out
+    assert not list(tmp_path.rglob("*.resume"))
+
+
+def test_adapt_writes_beside_the_checkpoint_unless_told_otherwise(run, tmp_path):
+    base = tiny.ply(tmp_path / "base.ply")
+    code, out, _ = run("adapt", base, "--scale", "4", "--backend", "reference", "--json")
+    assert code == 0
+    [report] = json.loads(out)
+    assert report["file"] == str(tmp_path / "base_x4.ply") and report["settings"]["recipe"] == "default"
+    assert len(load_model(tmp_path / "base_x4.ply")) == 60
+
+
+def test_adapt_hands_its_options_on(run, model_folder, tmp_path):
+    options = ["--recipe", "paper", "--seed", "7", "--resize", "area", "--upsampler", "lanczos", "--background", "white", "--time-budget-s", "60"]
+    code, out, _ = run("adapt", model_folder, "--scale", "1/2", "--output", tmp_path / "a.ply", "--json", *options, *QUICK)
+    assert code == 0
+    settings = json.loads(out)[0]["settings"]
+    assert {name: settings[name] for name in ("recipe", "seed", "resize", "upsampler", "time_budget_s", "steps", "views")} == {
+        "recipe": "paper", "seed": 7, "resize": "area", "upsampler": "lanczos", "time_budget_s": 60, "steps": 2, "views": "given",
+    }  # fmt: skip
+
+
+def test_adapt_takes_cameras_from_elsewhere(run, tmp_path):
+    views = tiny.scene(tmp_path / "scene", train=tiny.cameras(3))
+    answer = run("adapt", tiny.ply(tmp_path / "a.ply"), "--scale", "1/2", "--cameras", views, *QUICK)
+    assert answer[0] == 0 and "the 5 given views" in answer[1]
+
+
+def test_the_same_scale_twice_is_one_scale(run, model_folder, tmp_path):
+    code, out, _ = run("adapt", model_folder, "--scale", "4", "--scale", "4/1", "--output", tmp_path / "a.ply", "--backend", "reference")
+    assert code == 0 and out.count("x4:") == 1
+
+
+def test_an_output_that_exists_needs_overwrite_and_is_refused_before_any_work(run, tmp_path, monkeypatch):
+    base = tiny.ply(tmp_path / "base.ply")
+    (tmp_path / "base_x4.ply").write_text("precious")
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+    refused(run("adapt", base, "--scale", "2", "--scale", "4"), "base_x4.ply exists already; pass --overwrite")
+    monkeypatch.undo()
+    assert (tmp_path / "base_x4.ply").read_text() == "precious" and not (tmp_path / "base_x2.ply").exists()
+    assert run("adapt", base, "--scale", "4", "--overwrite", "--backend", "reference")[0] == 0
+    assert len(load_model(tmp_path / "base_x4.ply")) == 60
+
+
+def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tmp_path, monkeypatch):
+    command = ["adapt", model_folder, "--scale", "1/4", *QUICK]
+    run(*command, "--output", tmp_path / "whole.ply")
+    render, pressed = ReferenceBackend.render, []
+
+    def interrupting(self, gaussians, camera, effects):
+        if torch.is_grad_enabled() and not pressed:
+            pressed.append(signal.raise_signal(signal.SIGINT))
+        return render(self, gaussians, camera, effects)
+
+    monkeypatch.setattr(ReferenceBackend, "render", interrupting)
+    code, out, err = run(*command, "--output", tmp_path / "new.ply")
+    assert (code, out) == (130, "")
+    assert "interrupted at step 1; run the same command again to go on from" in err and "Traceback" not in err
+    assert (tmp_path / "new.ply.resume").exists() and not (tmp_path / "new.ply").exists()
+    assert run(*command, "--output", tmp_path / "new.ply")[0] == 0
+    assert (tmp_path / "new.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    assert not (tmp_path / "new.ply.resume").exists()
+
+
+def test_ctrl_c_anywhere_else_says_interrupted(run, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.cli.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    code, _, err = run("inspect", "a.ply")
+    assert code == 130 and err.strip() == "mipmap-plugin: interrupted"
+
+
+# render
+
+
+def test_render_writes_the_test_views_at_the_scale(run, model_folder, tmp_path):
+    words = ["--scale", "1/2", "--cameras", model_folder / "cameras.json", "--backend", "reference"]
+    code, out, _ = run("render", model_folder, "--output", tmp_path / "out", *words)
+    assert (code, out) == (0, f"4 pictures in {tmp_path / 'out'}\n")
+    pictures = sorted((tmp_path / "out").iterdir())
+    assert len(pictures) == 4  # cameras.json alone does not say which views are for testing, and two have one name
+    assert all(Image.open(picture).size == (16, 12) for picture in pictures)
+
+
+def test_render_of_one_view_is_the_view(run, model_folder, tmp_path):
+    words = ["--view", "view_1", "--screen-filter", "scaled", "--supersampling", "2", "--background", "white", "--backend", "reference"]
+    code, out, _ = run("render", model_folder, "--output", tmp_path / "out", *words)
+    assert code == 0 and out.startswith("1 pictures")
+    [picture] = (tmp_path / "out").iterdir()
+    assert picture.name == "train_view_1.png" and Image.open(picture).getpixel((0, 0)) == (255, 255, 255)
+
+
+def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, model_folder, tmp_path):
+    refused(run("render", model_folder, "--output", tmp_path / "out", "--view", "nowhere"), "there is no view nowhere; the first of 4 are view_")
+    words = ["render", model_folder, "--output", tmp_path / "out", "--view", "view_1", "--backend", "reference"]
+    assert run(*words)[0] == 0
+    refused(run(*words), "train_view_1.png exists already; pass --overwrite")
+    assert run(*words, "--overwrite")[0] == 0
+
+
+def test_picture_names_are_unique_and_stay_in_their_folder():
+    given = [("a", "train"), ("a", "train"), ("a", "test"), ("../../b", "test"), ("c\\d", "train")]
+    named = [replace(tiny.cameras(1)[0], name=name, split=split) for name, split in given]
+    assert picture_names(named) == ["train_a_1.png", "train_a_2.png", "test_a.png", "test_.._.._b.png", "train_c_d.png"]
+
+
+# evaluate
+
+
+def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path):
+    scene = tiny.scene(tmp_path / "scene")
+    wanted = ["--scale", "1", "--scale", "1/4", "--recipe", "instant", "--protocol", "P1", "--backend", "reference"]
+    words = ["evaluate", model_folder, "--images", scene, "--output", tmp_path / "rows.json", *wanted]
+    code, out, _ = run(*words)
+    assert code == 0
+    assert "truth: P1" in out and "| x1 " in out and "| x0.25 " in out and "resized base" in out and "instant, held out" in out
+    rows = json.loads((tmp_path / "rows.json").read_text())
+    assert [row["name"] for row in rows][:2] == ["base", "naive"] and rows[0]["psnr_db"] > 50
+    refused(run(*words), "rows.json exists already; pass --overwrite")
+
+
+def test_evaluate_as_json(run, model_folder, tmp_path):
+    code, out, _ = run("evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1", "--json", "--backend", "reference")
+    assert code == 0 and json.loads(out)[0]["name"] == "base"
+
+
+def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
+    scene = tiny.scene(tmp_path / "scene")
+    refused(run("evaluate", tiny.ply(tmp_path / "a.ply"), "--images", scene, "--scale", "1"), "has no cameras, so its base scale is not known")
+    refused(run("evaluate", model_folder, "--images", scene, "--scale", "4", "--backend", "reference"), "the photographs have only 32 x 24")
+    refused(run("evaluate", model_folder, "--images", tmp_path / "nowhere", "--scale", "1"), "there is no such file or folder")
+
+
+# backends
+
+
+def test_backends_lists_each_with_its_reasons(run, monkeypatch):
+    code, out, _ = run("backends")
+    assert code == 0 and "| reference " in out and "adapts 3DGS?" in out
+    code, out, _ = run("backends", "--json")
+    assert code == 0 and {"name": "reference", "device": "cpu", "reasons": []} in json.loads(out)
+
+
+def test_backends_check_prints_a_table_and_fails_if_a_case_does(run, monkeypatch):
+    outcomes = [Outcome("fine", 1e-6, True, True, ""), Outcome("odd", 0.5, True, False, "the image differs")]
+    monkeypatch.setattr(backends_module, "check_backend", lambda backend: outcomes)
+    code, out, err = run("backends", "--check", "reference")
+    assert code == 2 and "FAIL: the image differs" in out and "| fine " in out
+    assert err == "mipmap-plugin: backend 'reference' fails 1 of 2 cases: odd\n"
+    outcomes.pop()
+    assert run("backends", "--check", "reference")[0] == 0
+    refused(run("backends", "--check", "gpu"), "there is no 'gpu'")
+
+
+# One sentence, no traceback
+
+
+def malformed(folder: Path) -> dict[str, Path]:
+    sound = tiny.ply(folder / "sound.ply").read_bytes()
+    header = sound.index(b"end_header\n") + len(b"end_header\n")
+    contents = {
+        "empty.ply": b"",
+        "text.ply": b"not a splat",
+        "header_only.ply": sound[: header - 20],
+        "cut.ply": sound[:-100],
+        "no_rows.ply": sound[:header],
+        "mesh.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n0 0 0\n",
+        "lfs.ply": b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n",
+        "zip.ply": b"PK\x03\x04" + b"\0" * 40,
+        "poison.ply": sound[:header] + b"\xff" * (len(sound) - header),
+    }
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    (folder / "empty_folder").mkdir()
+    return {name: folder / name for name in [*contents, "empty_folder", "absent.ply"]}
+
+
+@pytest.mark.parametrize("command", ["inspect", "adapt"])
+def test_malformed_checkpoints_end_in_one_sentence(run, tmp_path, command):
+    for name, path in malformed(tmp_path).items():
+        words = ["--scale", "4"] if command == "adapt" else []
+        assert name in refused(run(command, path, *words)), name
+    assert not [path for path in tmp_path.iterdir() if "_x4" in path.name]
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "[1]", '[{"id": 0}]', '{"frames": []}', "\0"])
+def test_malformed_cameras_end_in_one_sentence(run, model_folder, content):
+    (model_folder / "cameras.json").write_text(content)
+    assert "cameras.json" in refused(run("inspect", model_folder))
+
+
+@pytest.mark.parametrize("content", ["", "{}", '{"frames": []}', '{"frames": [{"file_path": "a"}]}', '{"frames": [{"w": 4, "h": 4}]}'])
+def test_malformed_scenes_end_in_one_sentence(run, model_folder, tmp_path, content):
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/transforms_test.json").write_text(content)
+    refused(run("evaluate", model_folder, "--images", tmp_path / "scene", "--scale", "1"), "scene")
+
+
+def test_a_damaged_photograph_ends_in_one_sentence(run, model_folder, tmp_path):
+    scene = tiny.scene(tmp_path / "scene")
+    picture = scene / "test/view_0.png"
+    picture.write_bytes(picture.read_bytes()[:200])
+    refused(run("evaluate", model_folder, "--images", scene, "--scale", "1", "--backend", "reference"), "view_0.png")
+
+
+def test_a_damaged_state_ends_in_one_sentence(run, model_folder, tmp_path):
+    (tmp_path / "new.ply.resume").write_bytes(b"PK\x03\x04 not quite")
+    refused(run("adapt", model_folder, "--scale", "1/4", "--output", tmp_path / "new.ply", *QUICK), "is not the state of an interrupted run")
+
+
+def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
+    refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no 'gpu'; known are", "reference")
+    refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no 'swin'; known are bicubic, lanczos")
+    refused(run("adapt", model_folder, "--scale", "4", "--steps", "-1"), "setting steps: Input should be greater than or equal to 0")
+    refused(run("adapt", model_folder), "no scale is given; pass --scale 1/4")
+    refused(run("evaluate", model_folder, "--images", model_folder), "no scale is given; pass --scale 1/4")
+    refused(run("adapt", model_folder, "--scale", "4", "--cameras", "nowhere.json"), "nowhere.json: there is no such file")
+
+
+def test_a_broken_plugin_breaks_only_itself(run, tmp_path, monkeypatch):
+    from importlib.metadata import EntryPoint
+
+    points = [EntryPoint("broken", "no_such_package:Backend", "mipmap_plugin.backends")]
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point for point in points if point.group == group])
+    assert "No module named 'no_such_package'" in run("backends")[1]
+    refused(run("adapt", tiny.ply(tmp_path / "a.ply"), "--scale", "4", "--backend", "broken"), "'broken'", "cannot be loaded")
+
+
+def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path, monkeypatch):
+    base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / "new.ply"
+    output.write_text("precious")
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("mipmap_plugin.files.os.replace", full)
+    words = ["--output", output, "--overwrite", "--backend", "reference"]
+    refused(run("adapt", base, "--scale", "4", *words), "new.ply cannot be written: No space left on device")
+    assert output.read_text() == "precious" and sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply"]
+
+
+def test_an_output_below_a_file_ends_in_one_sentence(run, tmp_path):
+    base = tiny.ply(tmp_path / "base.ply")
+    refused(run("adapt", base, "--scale", "4", "--output", base / "new.ply", "--backend", "reference"), "new.ply")
+
+
+@pytest.mark.parametrize("words", ["", "fly", "adapt", "adapt a.ply --scale 0", "adapt a.ply --scale 1/0", "inspect a --what"])
+def test_words_that_are_not_understood_exit_with_2(run, words):
+    code, _, err = run(*words.split())
+    assert code == 2 and "Traceback" not in err
+
+
+@pytest.mark.parametrize(("text", "scale"), [("1/4", 0.25), ("4", 4.0), ("0.3", 0.3), ("1e-3", 0.001)])
+def test_scales_are_fractions_or_numbers(text, scale):
+    assert read_scale(text) == scale
+
+
+@pytest.mark.parametrize("text", ["", "x", "0", "-1/4", "1/0", "inf", "nan", "1e999"])
+def test_scales_that_are_no_zoom(text):
+    with pytest.raises(ValueError, match="is no zoom; give a number above 0, such as 1/4 or 4"):
+        read_scale(text)
+
+
+def test_the_module_runs():
+    root = Path(__file__).parents[1]
+    done = subprocess.run([sys.executable, "-m", "mipmap_plugin.cli", "--help"], capture_output=True, text=True, cwd=root)
+    assert done.returncode == 0 and done.stderr == ""
+    assert all(command in done.stdout for command in ("inspect", "adapt", "render", "evaluate", "backends", "demo"))
