@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.closed_form import closed_form
+from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Report, versions
@@ -153,15 +154,22 @@ class _Adaptation:
         student.trained = replace(student.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
         if self.config.closed_form:
             self._start_closed_form(student)
-        task = Task(self.views, self.scale, PseudoTruth(self.base, self.backend, self.trained, self.scale, self.config), self._render, self._white)
+        self.seconds["total"] = time.perf_counter() - began
+        curve, ended_by = self._optimize(student, resume) if self.config.steps else ([], "0 steps")
+        return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects)
+
+    def _optimize(self, student: SplatModel, resume: Path | None) -> tuple[list[CurvePoint], str]:
+        """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""
+        truth = PseudoTruth(self.base, self.backend, self.trained, self.scale, self.config)
+        task = Task(self.views, self.scale, truth, self._render, self._white)
         fingerprint = self._fingerprint()
         run = load_run(resume, student, task, self.config, fingerprint) if resume and resume.exists() else Run.start(student, task, self.config)
-        before = run.watch.seconds
         ended_by = adapt(run, task, self.config, lambda run: _stop(run, resume, fingerprint))
         if resume:
             resume.unlink(missing_ok=True)
-        self.seconds |= {"optimization": run.watch.seconds, "total": time.perf_counter() - began + before}
-        return Adapted(student, self._report(run, ended_by), self.backend, self.effects)
+        self.seconds["optimization"] = run.watch.seconds
+        self.seconds["total"] += run.watch.seconds
+        return run.curve, ended_by
 
     @torch.no_grad()
     def _start_closed_form(self, student: SplatModel) -> None:
@@ -183,7 +191,7 @@ class _Adaptation:
         facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.trained), poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
-    def _report(self, run: Run, ended_by: str) -> Report:
+    def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str) -> Report:
         truth = self.config.resize if self.scale < 1 else self.config.upsampler
         before = self.base.gaussians(self.views[0])
         return Report(
@@ -195,10 +203,10 @@ class _Adaptation:
             filters=f"pseudo truth {truth}; base {self.trained.screen_filter} {self.trained.eps2d:g} px²; file classic {DILATION:g} px²",
             effects=[f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(self.effects, before)],
             gaussians_before=len(before),
-            gaussians_after=len(run.student.gaussians(self.views[0])),
+            gaussians_after=len(student.gaussians(self.views[0])),
             seconds=self.seconds,
             ended_by=ended_by,
-            curve=run.curve,
+            curve=curve,
             versions=versions(),
         )
 
@@ -207,7 +215,7 @@ def _digest(model: SplatModel) -> str:
     """The sha256 of a model that was made in memory."""
     digest = hashlib.sha256()
     for tensor in {**model.parameters(), **model.shared_parameters()}.values():
-        digest.update(tensor.detach().cpu().contiguous().numpy())
+        digest.update(tensor.detach().cpu().numpy().tobytes())
     return digest.hexdigest()
 
 

@@ -85,7 +85,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         loss = (image - target).square().mean()
         loss.backward()
         run.square_error += float(loss.detach()) / len(views)
-        if config.densify_gradient is not None:
+        if config.densify_gradient is not None and means.grad is not None:
             run.gradients.add(means, means.grad - before, camera)
             before = means.grad.clone()
     run.optimizer.step()
