@@ -146,7 +146,7 @@ class _Adaptation:
         self.trained = wrapped.effects()
         self.effects = replace(self.trained, screen_filter="classic", eps2d=DILATION)
         self.views, self.which = choose_views(cameras, self.base.gaussians(wrapped.any_camera()).detach(), config)
-        self.seconds: dict[str, float] = {}
+        self.seconds = {"optimization": 0.0}
 
     def run(self, resume: Path | None) -> Adapted:
         began = time.perf_counter()
