@@ -146,6 +146,7 @@ class _Adaptation:
         self.trained = wrapped.effects()
         self.effects = replace(self.trained, screen_filter="classic", eps2d=DILATION)
         self.views, self.which = choose_views(cameras, self.base.gaussians(wrapped.any_camera()).detach(), config)
+        self.truth = PseudoTruth(self.base, self.backend, self.trained, scale, config)
         self.seconds = {"optimization": 0.0}
 
     def run(self, resume: Path | None) -> Adapted:
@@ -160,8 +161,7 @@ class _Adaptation:
 
     def _optimize(self, student: SplatModel, resume: Path | None) -> tuple[list[CurvePoint], str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""
-        truth = PseudoTruth(self.base, self.backend, self.trained, self.scale, self.config)
-        task = Task(self.views, self.scale, truth, self._render, self._white)
+        task = Task(self.views, self.scale, self.truth, self._render, self._white)
         fingerprint = self._fingerprint()
         run = load_run(resume, student, task, self.config, fingerprint) if resume and resume.exists() else Run.start(student, task, self.config)
         ended_by = adapt(run, task, self.config, lambda run: _stop(run, resume, fingerprint))
