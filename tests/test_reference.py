@@ -44,7 +44,7 @@ def test_float32_equals_float64_but_for_pixels_on_a_cut_off():
 
 def test_covariances_override_quats_and_scales():
     g = gaussians()
-    rotation = torch.stack([torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(i)))[0] for i in range(len(g))])
+    rotation = torch.linalg.qr(torch.randn(len(g), 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))[0]
     covariances = rotation @ torch.diag_embed(g.scales**2) @ rotation.mT
     given = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh, covariances)
     torch.testing.assert_close(BACKEND.render(given, camera(), Effects(1)).image, brute_force(given, camera())[0], atol=1e-10, rtol=0)

@@ -9,9 +9,9 @@ import pytest
 import torch
 from ply_files import splat_columns, splat_names, write, write_model_folder, write_splats
 
+from mipmap_plugin import files
 from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin import files
 from mipmap_plugin.models import inria_folder, load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.cfg_args import read_cfg_args
