@@ -6,7 +6,6 @@ import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from mipmap_plugin.errors import CheckpointError, SettingsError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
-from mipmap_plugin.models.detect import detect, not_loaded
+from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
 from mipmap_plugin.models.health import drop, examine
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.ply import read_ply, write_ply
@@ -127,19 +126,26 @@ class VanillaModel:
             with torch.no_grad():
                 held.copy_(wanted)
 
-    def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
+    def save(
+        self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False, companions: Callable[[Path], Any] = lambda ply: None
+    ) -> Path:
         """Write a PLY where `path` ends in .ply, else a 3DGS model folder, atomically; return the PLY written.
 
-        The folder repeats the iteration, cfg_args, cameras and exposures that the model came with. Raises OutputExists,
-        and OutputError when the disk refuses.
+        The folder repeats the iteration, cfg_args, cameras and exposures that the model came with; `companions` adds to it what
+        else a family keeps around the PLY that it is given. Raises OutputExists, and OutputError when the disk refuses.
         """
         path = Path(path)
         columns = {**to_columns(self._parameters), **self._origin.extras}
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
         if path.suffix.lower() == ".ply":
             return write_ply(path, columns, comments, overwrite=overwrite)
+
+        def write(ply: Path) -> None:
+            write_ply(ply, columns, comments)
+            companions(ply)
+
         cfg_args = cfg_args_for(self.folder, path, self.trained, self.sh_degree)
-        return write_folder(path, self.folder, cfg_args, self._origin.iteration, overwrite, partial(write_ply, columns=columns, comments=comments))
+        return write_folder(path, self.folder, cfg_args, self._origin.iteration, overwrite, write)
 
     def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
         """[N], 0..1, without gradient; the same for all views."""
@@ -157,6 +163,11 @@ def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaMo
     found = detect(path, iteration=iteration)
     if found.family != "3dgs":
         raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
+    return read_vanilla(found)
+
+
+def read_vanilla(found: Checkpoint) -> VanillaModel:
+    """The splats of a checkpoint of 3DGS, or of a family that keeps them in the same columns. Raises CheckpointError."""
     ply = read_ply(found.path)
     parameters, extras = to_parameters(ply.columns, found.path), extra_columns(ply.columns)
     options, notes = read_options(found.folder)
