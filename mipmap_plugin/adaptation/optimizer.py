@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import CARRIED, SplatModel
 
 # INRIA's: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
 ADAM_EPS = 1e-15
@@ -16,7 +16,7 @@ ADAM_EPS = 1e-15
 
 def make_optimizer(model: SplatModel, config: AdaptConfig, extent: float) -> torch.optim.Adam:
     """One group per parameter that moves; the rates of means and offsets are times `extent`, in world units."""
-    rates = config.rates.model_dump()
+    rates = {**config.rates.model_dump(), CARRIED: 0.0}
     rates["means"] *= extent
     rates["offsets"] *= extent
     groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]

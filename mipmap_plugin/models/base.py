@@ -15,6 +15,11 @@ from mipmap_plugin.effects import DILATION
 from mipmap_plugin.gaussians import Gaussians
 
 
+# The name, among a model's parameters, of columns that go with their rows when rows are removed, and that never move: an anchor's
+# level, for example.
+CARRIED = "carried"
+
+
 @dataclass(frozen=True)
 class TrainedScale:
     """The screen filter that a checkpoint was trained with, and how its cameras were sampled."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -45,12 +45,12 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     bands = len(rest) // 3
     basis_major = tuple(rest[c * bands + j] for j in range(bands) for c in range(3))  # the file is channel-major
     return {
-        "means": _stacked(columns, POSITION),
-        "scales": _stacked(columns, SCALE),
-        "quats": _stacked(columns, QUATERNION),
-        "opacities": _stacked(columns, ("opacity",))[:, 0],
-        "sh0": _stacked(columns, DC)[:, None],
-        "shN": _stacked(columns, basis_major).unflatten(1, (bands, 3)),
+        "means": stacked(columns, POSITION),
+        "scales": stacked(columns, SCALE),
+        "quats": stacked(columns, QUATERNION),
+        "opacities": stacked(columns, ("opacity",))[:, 0],
+        "sh0": stacked(columns, DC)[:, None],
+        "shN": stacked(columns, basis_major).unflatten(1, (bands, 3)),
     }
 
 
@@ -79,9 +79,13 @@ def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def rest_names(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """f_rest_0, f_rest_1, ... by their number, since neither the file's order nor the alphabet's is theirs."""
-    names = [name for name in columns if re.fullmatch(r"f_rest_\d+", name)]
-    return tuple(sorted(names, key=lambda name: int(name.removeprefix("f_rest_"))))
+    return numbered(columns, "f_rest_")
+
+
+def numbered(columns: Iterable[str], prefix: str) -> tuple[str, ...]:
+    """`prefix`0, `prefix`1, ... by their number, since neither the file's order nor the alphabet's is theirs."""
+    names = [name for name in columns if re.fullmatch(re.escape(prefix) + r"\d+", name)]
+    return tuple(sorted(names, key=lambda name: int(name.removeprefix(prefix))))
 
 
 def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
@@ -96,7 +100,7 @@ def _unit(column: np.ndarray) -> np.ndarray:
     return column.astype(np.float64) / full
 
 
-def _stacked(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> Tensor:
+def stacked(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> Tensor:
     """[N, len(names)] float32. What float32 cannot hold becomes infinite, and is found by `health`."""
     block = np.empty((len(columns["x"]), len(names)), np.float32)
     with np.errstate(over="ignore"):
