@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import secrets
@@ -39,10 +40,33 @@ def write_json(path: Path, facts: Any, overwrite: bool) -> None:
         temporary.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
 
+def sha256(*paths: Path) -> str:
+    """The sha256 of the files' bytes, one after the other, hexadecimal."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while chunk := file.read(1 << 20):
+                digest.update(chunk)
+    return digest.hexdigest()
+
+
 def refuse_existing(path: Path, overwrite: bool) -> None:
     """Raise OutputExists when something is at `path` and was not to be replaced."""
     if path.exists() and not overwrite:
         raise OutputExists(f"{path} exists already; pass --overwrite (overwrite=True) to replace it, or choose another path")
+
+
+def refuse_to_lose(target: Path, source: Path | None, holds: str) -> None:
+    """Raise OutputExists when the folder `target` is the base checkpoint's, or no model: one has a folder named `holds`.
+
+    Replacing a folder deletes what is in it.
+    """
+    if source is not None and source.resolve().is_relative_to(target.resolve()):
+        raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
+    if target.is_dir() and any(target.iterdir()) and not (target / holds).is_dir():
+        raise OutputExists(f"{target} is a folder with other things in it, which --overwrite would delete; choose another folder")
+    if target.is_file():
+        raise OutputExists(f"{target} is a file; choose another folder, or the path of a file")
 
 
 @contextlib.contextmanager

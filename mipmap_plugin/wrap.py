@@ -76,8 +76,8 @@ class Wrapped:
         degree = self.model.gaussians(self.any_camera()).used_sh_degree()
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
-            return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling)
-        return Effects(degree, screen_filter, DILATION, self.background, supersampling)
+            return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
+        return Effects(degree, screen_filter, DILATION, self.background, supersampling, trained.near_plane)
 
     def backend(self, *, gradients: bool = False, screen_filter: str | None = None) -> tuple[Backend, str]:
         """The backend that serves this model, and why it was taken."""

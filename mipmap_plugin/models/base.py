@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION
+from mipmap_plugin.effects import DILATION, NEAR_PLANE
 from mipmap_plugin.gaussians import Gaussians
 
 
@@ -28,6 +28,7 @@ class TrainedScale:
     eps2d: float = DILATION  # px² of a training pixel
     resolution: float = -1  # INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px
     background: tuple[float, float, float] | None = None  # linear RGB; None: the checkpoint does not say
+    near_plane: float = NEAR_PLANE  # world units
 
 
 class SplatModel(Protocol):

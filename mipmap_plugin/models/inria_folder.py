@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.errors import CheckpointError, OutputExists
-from mipmap_plugin.files import new_folder
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.files import new_folder, refuse_to_lose
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args
 
@@ -56,7 +56,7 @@ def companion_notes(folder: Path | None, options: dict[str, Any], sh_degree: int
 
 def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: int | None, overwrite: bool, write_ply: Callable[[Path], Any]) -> Path:
     """Lay out a model folder around the PLY that `write_ply` writes, all or nothing; return that PLY's path. Raises OutputExists."""
-    _refuse_to_lose(target, source)
+    refuse_to_lose(target, source, holds="point_cloud")
     within = Path("point_cloud", f"iteration_{iteration or DEFAULT_ITERATION}", "point_cloud.ply")
     with new_folder(target, overwrite) as fresh:
         (fresh / within).parent.mkdir(parents=True)
@@ -76,16 +76,6 @@ def cfg_args_for(source: Path | None, target: Path, trained: TrainedScale, sh_de
     usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": False}
     white = trained.background == (1.0, 1.0, 1.0)
     return format_cfg_args({**usual, "white_background": white, **options, "sh_degree": sh_degree})
-
-
-def _refuse_to_lose(target: Path, source: Path | None) -> None:
-    """Replacing a folder deletes what is in it, which must be neither the base checkpoint nor anything but a model."""
-    if source is not None and source.resolve().is_relative_to(target.resolve()):
-        raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
-    if target.is_dir() and any(target.iterdir()) and not (target / "point_cloud").is_dir():
-        raise OutputExists(f"{target} is a folder with other things in it, which --overwrite would delete; choose another folder")
-    if target.is_file():
-        raise OutputExists(f"{target} is a file; choose another folder, or a path that ends in .ply")
 
 
 def _exposure_note(path: Path) -> str:

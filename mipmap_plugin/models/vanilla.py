@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,11 +14,13 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import CheckpointError, SettingsError, ShapeError
+from mipmap_plugin.files import sha256
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
 from mipmap_plugin.models.health import drop, examine
+from mipmap_plugin.models.hosts import Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.ply import read_ply, write_ply
 from mipmap_plugin.models.tags import render_mode, with_tags
@@ -41,6 +42,7 @@ class Origin:
     iteration: int | None = None
     comments: tuple[str, ...] = ()
     extras: dict[str, np.ndarray] = field(default_factory=dict)  # columns that 3DGS does not know, [N] each
+    host: Host | None = None  # the other project whose file holds the splats; None: a PLY of 3DGS
 
 
 class VanillaModel:
@@ -59,6 +61,8 @@ class VanillaModel:
         _check(parameters)
         self._parameters = dict(parameters)
         self._origin = origin
+        if origin.host:
+            self.family = origin.host.family
         self.source, self.folder, self.digest = origin.source, origin.folder, origin.digest
         self.trained = trained
         self.notes: list[str] = list(notes)
@@ -129,14 +133,17 @@ class VanillaModel:
     def save(
         self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False, companions: Callable[[Path], Any] = lambda ply: None
     ) -> Path:
-        """Write a PLY where `path` ends in .ply, else a 3DGS model folder, atomically; return the PLY written.
+        """Write a PLY where `path` ends in .ply, else what the model came in, atomically; return the file with the splats.
 
-        The folder repeats the iteration, cfg_args, cameras and exposures that the model came with; `companions` adds to it what
-        else a family keeps around the PLY that it is given. Raises OutputExists, and OutputError when the disk refuses.
+        A model from another project's file goes back into one (`Host.write`). A folder of 3DGS repeats the iteration, cfg_args,
+        cameras and exposures that the model came with; `companions` adds to it what else a family keeps around the PLY that
+        it is given. Raises OutputExists, and OutputError when the disk refuses.
         """
         path = Path(path)
-        columns = {**to_columns(self._parameters), **self._origin.extras}
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
+        if self._origin.host and path.suffix.lower() != ".ply":
+            return self._origin.host.write(path, self._parameters, comments, overwrite=overwrite)
+        columns = {**to_columns(self._parameters), **self._origin.extras}
         if path.suffix.lower() == ".ply":
             return write_ply(path, columns, comments, overwrite=overwrite)
 
@@ -150,6 +157,12 @@ class VanillaModel:
     def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
         """[N], 0..1, without gradient; the same for all views."""
         return self._parameters["opacities"].detach().sigmoid()
+
+    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None) -> list[Camera]:
+        """Views of the photographs' scene, with its SfM `points` [P, 3], in the frame and at the size that the model was trained in."""
+        if self._origin.host is None:
+            return list(cameras)
+        return self._origin.host.as_trained(cameras, points, self._parameters["means"].detach())
 
     def _with(self, parameters: dict[str, Tensor], origin: Origin | None = None) -> VanillaModel:
         return VanillaModel(parameters, self.trained, origin or self._origin, self.notes)
@@ -172,7 +185,7 @@ def read_vanilla(found: Checkpoint) -> VanillaModel:
     parameters, extras = to_parameters(ply.columns, found.path), extra_columns(ply.columns)
     options, notes = read_options(found.folder)
     screen_filter = render_mode(ply.comments)
-    origin = Origin(found.path, _sha256(found.path), found.folder, found.iteration, ply.comments, extras)
+    origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, ply.comments, extras)
     model = VanillaModel(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
     del ply  # as large as the model, and no longer needed by what follows
     model.notes += companion_notes(found.folder, options, model.sh_degree)
@@ -180,7 +193,7 @@ def read_vanilla(found: Checkpoint) -> VanillaModel:
         model.notes.append(f"the header says that the splats were trained {screen_filter}, so they are rendered so")
     if extras:
         model.notes.append(f"extra columns are carried along: {', '.join(extras)}")
-    return _without_poison(model)
+    return without_poison(model)
 
 
 def unit_quaternions(quats: Tensor) -> Tensor:
@@ -196,7 +209,8 @@ def unit_quaternions(quats: Tensor) -> Tensor:
     return scaled / scaled.norm(dim=1, keepdim=True)
 
 
-def _without_poison(model: VanillaModel) -> VanillaModel:
+def without_poison(model: VanillaModel) -> VanillaModel:
+    """The model without the splats that are not finite once activated, with a note. Raises CheckpointError when none is left."""
     health = examine(model)
     if not health.poisonous.any():
         return model
@@ -230,11 +244,3 @@ def _logit(opacities: Tensor) -> Tensor:
 
 def _moved(tensor: Tensor, device: torch.device | str) -> Tensor:
     return tensor.detach().to(device, copy=True).requires_grad_(tensor.requires_grad)
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(1 << 20):
-            digest.update(chunk)
-    return digest.hexdigest()
