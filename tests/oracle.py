@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 
 
-def brute_force(gaussians, camera, eps2d=0.3, background=(0.0, 0.0, 0.0), antialiased=False, near=0.2):
+def brute_force(gaussians, camera, eps2d=0.3, background=(0.0, 0.0, 0.0), screen_filter="classic", near=0.2):
     """(image [H, W, 3], alpha [H, W]) in float64 from any Gaussians with SH of degree <= 1."""
     g = gaussians.to(dtype=torch.float64)
     view = camera.viewmat
@@ -20,19 +21,40 @@ def brute_force(gaussians, camera, eps2d=0.3, background=(0.0, 0.0, 0.0), antial
     done = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     for i in order:
         covariance, mean = project_one(g, i, p[i], camera)
-        dilated = covariance + eps2d * torch.eye(2, dtype=torch.float64)
-        opacity = g.opacities[i]
-        if antialiased:
-            opacity = opacity * (torch.linalg.det(covariance) / torch.linalg.det(dilated)).clamp_min(0.005**2).sqrt()
         offset = torch.stack([xs - mean[0], ys - mean[1]], -1)
-        power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(dilated), offset)
-        alpha = (opacity * power.exp()).clamp_max(0.99)
+        alpha = (g.opacities[i] * FALLOFFS[screen_filter](covariance, offset, eps2d)).clamp_max(0.99)
         alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
         done = done | ((through * (1 - alpha) < 1e-4) & (alpha > 0))
         alpha = torch.where(done, 0.0, alpha)
         image = image + (through * alpha)[..., None] * color_one(g, i, camera)
         through = through * (1 - alpha)
     return image + through[..., None] * torch.tensor(background, dtype=torch.float64), 1 - through
+
+
+def dilated(covariance, offset, eps2d, least_light=1.0):
+    """The Gaussian of `covariance` + eps2d·I at each offset [H, W, 2], dimmed to the light that it had, but not below `least_light`."""
+    wider = covariance + eps2d * torch.eye(2, dtype=torch.float64)
+    light = (torch.linalg.det(covariance) / torch.linalg.det(wider)).clamp(least_light**2, 1).sqrt()
+    return light * torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(wider), offset))
+
+
+def integrated(covariance, offset, _):
+    """FORMATS.md 6.4: the Gaussian times its area, integrated over squares that lie along its axes."""
+    variances, axes = torch.linalg.eigh(covariance)
+    places, sigmas = offset @ axes, variances.sqrt()
+    return 2 * math.pi * (sigmas * (below((places + 0.5) / sigmas) - below((places - 0.5) / sigmas))).prod(-1)
+
+
+def below(x):
+    return 0.5 + 0.5 * torch.tanh(0.5 * (1.6 * x + 0.07 * x**3))
+
+
+FALLOFFS = {
+    "classic": dilated,
+    "antialiased": partial(dilated, least_light=0.005),
+    "mip": partial(dilated, least_light=0.001),
+    "analytic": integrated,
+}
 
 
 def project_one(g, i, p, camera):

@@ -10,7 +10,7 @@ from oracle import brute_force
 from samples import camera, gaussians, leaves
 
 from mipmap_plugin.backends import compositing
-from mipmap_plugin.backends.filters import footprint
+from mipmap_plugin.backends.filters import SCREEN_FILTERS, footprint
 from mipmap_plugin.backends.harmonics import basis
 from mipmap_plugin.backends.projection import project
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -22,13 +22,13 @@ from mipmap_plugin.gaussians import Gaussians
 BACKEND = ReferenceBackend()
 
 
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("screen_filter", sorted(SCREEN_FILTERS))
 @pytest.mark.parametrize("eps2d", [0.3, 0.02])
-def test_equals_a_sum_over_every_pixel(antialiased, eps2d):
+def test_equals_a_sum_over_every_pixel(screen_filter, eps2d):
     g, view = gaussians(), camera(cx=17.3, cy=12.9)
-    effects = Effects(1, "antialiased" if antialiased else "classic", eps2d, (0.2, 0.5, 0.9))
+    effects = Effects(1, screen_filter, eps2d, (0.2, 0.5, 0.9))
     rendered = BACKEND.render(g, view, effects)
-    image, alpha = brute_force(g, view, eps2d, effects.background, antialiased)
+    image, alpha = brute_force(g, view, eps2d, effects.background, screen_filter)
     torch.testing.assert_close(rendered.image, image, atol=1e-10, rtol=0)
     torch.testing.assert_close(rendered.alpha, alpha, atol=1e-10, rtol=0)
 
@@ -62,7 +62,7 @@ def test_gradients_equal_finite_differences():
     view = camera(6, 5, 7.0, 6.5)
     g = Gaussians(torch.cat([g.means[:, :2] * 0.2, 2 + g.means[:, 2:].abs()], 1), g.quats, g.scales + 0.8, 0.1 + 0.6 * g.opacities, g.sh)
     tensors, _ = leaves(g)
-    for name in ("classic", "antialiased"):
+    for name in sorted(SCREEN_FILTERS):
         effects = Effects(1, name, 0.3, (1.0, 1.0, 1.0))
         assert torch.autograd.gradcheck(lambda *t, e=effects: BACKEND.render(Gaussians(*t), view, e).image, tensors, eps=1e-6, atol=1e-6)
 
@@ -109,6 +109,8 @@ def test_t3_projection():
     assert float(dilated.across * dilated.yy) == pytest.approx(3.261146218, abs=1e-7)
     compensated = footprint(projected, t3_gaussian().opacities, "antialiased", 0.3)
     assert float(compensated.opacities / dilated.opacities) == pytest.approx(0.806311541, abs=1e-7)
+    mip = footprint(projected, t3_gaussian().opacities, "mip", 0.1)  # the published number has two summands of 1e-6 more
+    assert float(mip.opacities / dilated.opacities) == pytest.approx(0.924522412, abs=1e-6)
 
 
 def test_t3_pixel():

@@ -7,7 +7,7 @@ memory grows with the batch and not with splats x pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -32,8 +32,9 @@ class Splats:
     """What compositing needs of the splats that can be seen, sorted front to back."""
 
     means2d: Tensor  # [M, 2] px
-    feet: Tensor  # [M, 4] yy, shear, across, opacity
+    feet: Tensor  # [M, F], what `alpha` needs of each
     colors: Tensor  # [M, 3]
+    alpha: Callable[[Tensor, Tensor, Tensor], Tensor]  # (feet [..., F], dx, dy px from the center) -> alpha
 
 
 def composite(splats: Splats, extents: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -43,13 +44,13 @@ def composite(splats: Splats, extents: Tensor, camera: Camera) -> tuple[Tensor, 
     # The empty sum ties the image to the splats even where none is drawn: its gradient is then 0, not an error.
     color = splats.colors[:0].sum() + splats.colors.new_zeros(rows * columns, TILE * TILE, 3)
     through = splats.colors.new_ones(rows * columns, TILE * TILE)
-    tensors = (splats.means2d, splats.feet, splats.colors)
+    parts = (splats.alpha, splats.means2d, splats.feet, splats.colors)
     for tiles, ids in _batches(starts, members):
         pixels = _pixel_centers(tiles, columns).to(splats.colors)
         if torch.is_grad_enabled():
-            batch = checkpoint(_composite_batch, *tensors, ids, pixels, use_reentrant=False, preserve_rng_state=False)
+            batch = checkpoint(_composite_batch, *parts, ids, pixels, use_reentrant=False, preserve_rng_state=False)
         else:
-            batch = _composite_batch(*tensors, ids, pixels)
+            batch = _composite_batch(*parts, ids, pixels)
         color, through = color.index_copy(0, tiles, batch[0]), through.index_copy(0, tiles, batch[1])
     return _untile(color, columns, camera), _untile(through[..., None], columns, camera)[..., 0]
 
@@ -85,14 +86,12 @@ def _batches(starts: Tensor, members: Tensor) -> Iterator[tuple[Tensor, Tensor]]
         yield tiles, torch.where(inside, members[(starts[tiles][:, None] + slots).clamp_max(len(members) - 1)], -1)
 
 
-def _composite_batch(means2d: Tensor, feet: Tensor, colors: Tensor, ids: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def _composite_batch(falloff: Callable, means2d: Tensor, feet: Tensor, colors: Tensor, ids: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """One batch of tiles: ids [B, K], pixels [B, P, 2] -> color [B, P, 3], transmittance [B, P]."""
     shown = (ids >= 0)[:, :, None]
     ids = ids.clamp_min(0)
     dx, dy = (pixels[:, None] - means2d[ids][:, :, None]).unbind(-1)  # [B, K, P]
-    yy, shear, across, opacity = feet[ids][..., None].unbind(-2)  # [B, K, 1]
-    q = dy.square() / yy + (dx - shear * dy).square() / across
-    alpha = (opacity * torch.exp(-q / 2)).clamp_max(MAX_ALPHA)
+    alpha = falloff(feet[ids][:, :, None], dx, dy).clamp_max(MAX_ALPHA)
     alpha = torch.where(shown & (alpha >= MIN_ALPHA), alpha, 0.0)
     after = torch.cumprod(1 - alpha, dim=1)
     open_ = after.detach() >= MIN_TRANSMITTANCE  # a pixel stops before the splat that would finish it

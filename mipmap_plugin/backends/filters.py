@@ -7,11 +7,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mipmap_plugin.backends.pixel_integral import PixelIntegral, pixel_integral
 from mipmap_plugin.backends.projection import Projected
+from mipmap_plugin.effects import DILATION
 
-# The least share of its opacity that compensation leaves to a splat (dr_aa, gsplat 1.6): without it, flat and needle-shaped
-# splats, whose projected area is almost zero, would vanish from the image and from the gradient.
-MIN_COMPENSATION = 0.005
+# The least share of its opacity that a compensating filter leaves to a splat. Below it the gradient is cut off, and light is too bright.
+# "antialiased" (dr_aa, gsplat 1.6): so much that flat and needle-shaped splats, whose projected area is almost zero, can still be seen.
+# "mip" (Mip-Splatting): its 1e-6 under the root, which no splat is visible with. It also adds 1e-6 to det_blur, and drops a splat
+# whose det is below 1e-6 px⁴ at once, which here fades.
+LEAST_LIGHT = {"classic": 1.0, "antialiased": 0.005, "mip": 0.001}
+
+# px², what each filter dilates by where nobody says otherwise. "analytic" integrates over the pixel instead.
+USUAL_EPS2D = {"classic": DILATION, "antialiased": DILATION, "mip": 0.1, "analytic": 0.0}
+
+SCREEN_FILTERS = frozenset(USUAL_EPS2D)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,25 +37,37 @@ class Footprint:
     xx: Tensor  # [N] px², variance along x
     opacities: Tensor  # [N]
 
+    def packed(self) -> Tensor:
+        """[N, 4]: what `alpha` needs of each splat."""
+        return torch.stack([self.yy, self.shear, self.across, self.opacities], -1)
 
-def footprint(projected: Projected, opacities: Tensor, screen_filter: str, eps2d: float) -> Footprint:
-    """Dilate by `eps2d` px²; "antialiased" also scales the opacity so that the splat's light stays what it was."""
+    @staticmethod
+    def alpha(packed: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
+        """Alpha, not clamped, of splats [..., 4] at pixels dx, dy px from their centers."""
+        yy, shear, across, opacity = packed.unbind(-1)
+        return opacity * torch.exp(-(dy.square() / yy + (dx - shear * dy).square() / across) / 2)
+
+    def visible(self, min_alpha: float) -> Tensor:
+        """[N] bool: finite, and bright enough to reach `min_alpha` somewhere."""
+        finite = torch.isfinite(torch.stack([self.yy, self.shear, self.across, self.xx, self.opacities])).all(0)
+        return finite & (self.opacities >= min_alpha) & (self.across > 0)
+
+    def extents(self, min_alpha: float) -> Tensor:
+        """[N, 2] px, without gradient: the half-sizes of the box around each ellipse alpha >= `min_alpha`."""
+        reach = (2 * (self.opacities / min_alpha).log()).clamp_min(0)
+        return (reach[:, None] * torch.stack([self.xx, self.yy], -1)).sqrt().detach()
+
+
+def footprint(projected: Projected, opacities: Tensor, screen_filter: str, eps2d: float) -> Footprint | PixelIntegral:
+    """What the screen filter makes of splats.
+
+    "classic" dilates by `eps2d` px²; "antialiased" and "mip" also scale the opacity so that the splat's light stays what it
+    was; "analytic" integrates the splat over each pixel, whatever `eps2d` is.
+    """
+    if screen_filter == "analytic":
+        return pixel_integral(projected, opacities)
     xx, yy = projected.xx + eps2d, projected.yy + eps2d
     det = projected.det + eps2d * (projected.xx + projected.yy) + eps2d**2  # = xx·yy - xy² without its cancellation
-    if screen_filter == "antialiased":
-        opacities = opacities * (projected.det / det).clamp_min(MIN_COMPENSATION**2).sqrt()
+    if screen_filter != "classic":
+        opacities = opacities * (projected.det / det).clamp_min(LEAST_LIGHT[screen_filter] ** 2).sqrt()
     return Footprint(yy, projected.xy / yy, det / yy, xx, opacities)
-
-
-SCREEN_FILTERS = frozenset({"classic", "antialiased"})
-
-
-def scaled_eps2d(eps2d: float, scale: float) -> float:
-    """The training-free filter of SA-GS: the dilation keeps the size that it had in the world (METHODS: Σ₂D·s² + eps2d·s²)."""
-    return eps2d * scale**2
-
-
-def visible(feet: Footprint, min_alpha: float) -> Tensor:
-    """[N] bool: finite, and bright enough to reach `min_alpha` somewhere."""
-    finite = torch.isfinite(torch.stack([feet.yy, feet.shear, feet.across, feet.xx, feet.opacities])).all(0)
-    return finite & (feet.opacities >= min_alpha) & (feet.across > 0)

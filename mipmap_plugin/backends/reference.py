@@ -7,8 +7,9 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
 from mipmap_plugin.backends.compositing import MIN_ALPHA, Splats, composite
-from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint, visible
+from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
 from mipmap_plugin.backends.harmonics import colors
+from mipmap_plugin.backends.pixel_integral import PixelIntegral
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -33,8 +34,7 @@ class ReferenceBackend:
         projected, feet = _footprints(gaussians, camera, effects)
         degree = min(effects.sh_degree, gaussians.sh_degree)
         rgb = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), degree)
-        shape = torch.stack([feet.yy, feet.shear, feet.across, feet.opacities], -1)
-        color, through = composite(Splats(projected.means2d, shape, rgb), extents(feet), camera)
+        color, through = composite(Splats(projected.means2d, feet.packed(), rgb, feet.alpha), extents(feet), camera)
         return Rendered(color + through[..., None] * color.new_tensor(effects.background), 1 - through)
 
 
@@ -47,7 +47,7 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor
     half = extents(feet)
     low, high = projected.means2d - half, projected.means2d + half
     inside = (high > 0).all(1) & (low < low.new_tensor([camera.width, camera.height])).all(1)
-    drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & visible(feet, MIN_ALPHA) & inside
+    drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & feet.visible(MIN_ALPHA) & inside
     rows = drawn.nonzero()[:, 0]
     return rows[projected.depths[rows].argsort(stable=True)]
 
@@ -59,12 +59,11 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
     return torch.isfinite(torch.cat(given + shape, dim=1)).all(1)
 
 
-def extents(feet: Footprint) -> Tensor:
-    """[N, 2] px: the half-sizes of the box around each ellipse alpha >= 1/255."""
-    reach = (2 * (feet.opacities / MIN_ALPHA).log()).clamp_min(0)
-    return (reach[:, None] * torch.stack([feet.xx, feet.yy], -1)).sqrt().detach()
+def extents(feet: Footprint | PixelIntegral) -> Tensor:
+    """[N, 2] px: the half-sizes of a box around all pixels that each splat can touch."""
+    return feet.extents(MIN_ALPHA)
 
 
-def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint]:
+def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral]:
     projected = project(gaussians, camera, effects.near_plane)
     return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d)

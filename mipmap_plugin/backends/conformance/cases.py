@@ -160,7 +160,7 @@ ROWS = {
     "saturated-color": _row(sh=1e3),
 }
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
-FILTERS = ("classic", "antialiased")
+FILTERS = ("classic", "antialiased", "mip", "analytic")
 
 CASES: dict[str, Builder] = {
     **{f"{name}-{kind}": partial(odd_row, row, kind) for (name, row), kind in product(ROWS.items(), FILTERS)},

@@ -14,6 +14,7 @@ from torch import Tensor
 from mipmap_plugin.backends.cpu_kernels import binning, compositing, projection
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels.records import Frame, Lists, Splats, View
+from mipmap_plugin.backends.filters import LEAST_LIGHT
 from mipmap_plugin.backends.projection import FRUSTUM_MARGIN
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -80,7 +81,7 @@ def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
         height=camera.height,
         near=float(effects.near_plane),
         eps2d=float(effects.eps2d),
-        antialiased=effects.screen_filter == "antialiased",
+        least_light=LEAST_LIGHT[effects.screen_filter],
         sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
     )
 

@@ -8,7 +8,6 @@ import math
 
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, apply_transposed, blend, cross, dot, plus, times
-from mipmap_plugin.backends.filters import MIN_COMPENSATION
 
 
 @inner
@@ -48,7 +47,7 @@ def screen_filter(view, flat):
     """The shape after dilation, and the share of its opacity that the splat keeps."""
     xx, xy, yy, det = flat
     dilated = det + view.eps2d * (xx + yy) + view.eps2d**2  # = xx·yy - xy² without its cancellation
-    light = max(math.sqrt(det / dilated), MIN_COMPENSATION) if view.antialiased else 1.0
+    light = max(math.sqrt(det / dilated), view.least_light)
     return (xx + view.eps2d, xy, yy + view.eps2d, dilated), light
 
 
@@ -57,7 +56,7 @@ def pull_screen_filter(view, flat, dilated, light, d_dilated, d_light):
     """The gradient of a shape before dilation."""
     d_xx, d_xy, d_yy, d_det = d_dilated
     det, det_dilated = flat[3], dilated[3]
-    d_ratio = 0.5 * d_light / light if view.antialiased and light > MIN_COMPENSATION else 0.0
+    d_ratio = 0.5 * d_light / light if light > view.least_light else 0.0
     d_det -= d_ratio * det / det_dilated**2
     return d_xx + view.eps2d * d_det, d_xy, d_yy + view.eps2d * d_det, d_det + d_ratio / det_dilated
 

@@ -25,7 +25,7 @@ class View(NamedTuple):
     height: int
     near: float
     eps2d: float
-    antialiased: bool
+    least_light: float  # the share of its opacity that compensation leaves at least; 1: there is no compensation
     sh_degree: int
 
 
