@@ -1,0 +1,149 @@
+"""One backend on one workload, each measurement in a process of its own: threads, compiled code and peak memory do not mix."""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+from workloads import Workload, activated, effects_of
+
+from mipmap_plugin import register_backend
+from mipmap_plugin.backends import get_backend
+
+YARDSTICK = "gsplat-twins"
+register_backend(YARDSTICK, "gsplat_twins:GsplatTwins")
+
+# Slow backends on large scenes: no run begins after this many seconds, once there are enough for a median.
+BUDGET_S = 60.0
+FEWEST_RUNS = 3
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Several runs of one thing."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: list[float]) -> Spread:
+        return cls(*(round(value, 3) for value in (statistics.median(values), min(values), max(values))))
+
+
+@dataclass(frozen=True)
+class Timing:
+    cpu_ms: Spread  # of the process: with one thread, what it costs even on a busy machine
+    wall_ms: Spread
+    runs: int
+
+    @classmethod
+    def of(cls, runs: list[tuple[float, float]]) -> Timing:
+        cpu, wall = zip(*runs, strict=True)
+        return cls(Spread.of(list(cpu)), Spread.of(list(wall)), len(runs))
+
+
+@dataclass(frozen=True)
+class Speed:
+    """One thread."""
+
+    forward: Timing  # raw parameters -> image, without a graph
+    forward_backward: Timing  # raw parameters -> image -> gradients of all of them
+    extra_mib: float  # peak of a forward and backward pass over what the process held before
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Forward and backward, one thread and two in turn."""
+
+    one: Timing
+    two: Timing
+    wall_ratio: Spread  # one over two, pair by pair
+
+
+class Job:
+    """What is timed."""
+
+    def __init__(self, backend: str, file: Path) -> None:
+        self._backend, self._work = get_backend(backend), Workload.load(file)
+        self._leaves = {name: tensor.requires_grad_() for name, tensor in self._work.raw.items()}
+
+    def forward(self) -> None:
+        with torch.no_grad():
+            self._image()
+
+    def forward_backward(self) -> None:
+        for leaf in self._leaves.values():
+            leaf.grad = None
+        (self._image() * self._work.weights).sum().backward()
+
+    def _image(self) -> Tensor:
+        gaussians = activated(self._leaves)
+        return self._backend.render(gaussians, self._work.camera, effects_of(gaussians)).image
+
+
+def fresh(function: Callable[..., Result], *arguments: object) -> Result:
+    """`function(*arguments)` in a new interpreter that ends with it."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
+def measure_speed(backend: str, file: Path, warm_up: Path, runs: int) -> Speed:
+    """`warm_up`: a tiny workload on which imports and compilation are done, so that neither is in the figures."""
+    torch.set_num_threads(1)
+    Job(backend, warm_up).forward_backward()
+    job = Job(backend, file)
+    before = _peak_mib()
+    job.forward_backward()
+    extra = round(_peak_mib() - before, 1)
+    job.forward()
+    forward, both = _in_turn([job.forward, job.forward_backward], runs)
+    return Speed(Timing.of(forward), Timing.of(both), extra)
+
+
+def measure_scaling(backend: str, file: Path, runs: int) -> Scaling:
+    job = Job(backend, file)
+
+    def on(threads: int) -> None:
+        torch.set_num_threads(threads)
+        job.forward_backward()
+
+    for threads in (1, 2):  # warm-up
+        on(threads)
+    one, two = _in_turn([lambda: on(1), lambda: on(2)], runs)
+    return Scaling(Timing.of(one), Timing.of(two), Spread.of([a[1] / b[1] for a, b in zip(one, two, strict=True)]))
+
+
+def _in_turn(calls: list[Callable[[], None]], runs: int) -> list[list[tuple[float, float]]]:
+    """Milliseconds of CPU and wall of each run of each call. In turn, so that a busy spell of the machine meets all alike."""
+    times: list[list[tuple[float, float]]] = [[] for _ in calls]
+    began = time.perf_counter()
+    for done in range(runs):
+        if done >= FEWEST_RUNS and time.perf_counter() - began > BUDGET_S:
+            break
+        for call, spent in zip(calls, times, strict=True):
+            spent.append(_timed(call))
+    return times
+
+
+def _timed(call: Callable[[], None]) -> tuple[float, float]:
+    cpu, wall = time.process_time(), time.perf_counter()
+    call()
+    return 1000 * (time.process_time() - cpu), 1000 * (time.perf_counter() - wall)
+
+
+def _peak_mib() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10  # bytes there, KiB elsewhere

@@ -1,0 +1,71 @@
+"""The benchmarks' own parts: scenes, counts and the yardstick are what the tables say that they are."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import SHARED
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
+
+from scenes import make  # noqa: E402
+from workloads import activated, count_pairs, effects_of, from_scene  # noqa: E402
+
+from mipmap_plugin.backends import get_backend  # noqa: E402
+from mipmap_plugin.backends.projection import project  # noqa: E402
+
+
+def brute_force_pairs(gaussians, camera):
+    """Every splat at every pixel, from the inverse covariance."""
+    p = project(gaussians, camera, 0.2)
+    covariance = torch.stack([p.xx + 0.3, p.xy, p.xy, p.yy + 0.3], -1).unflatten(-1, (2, 2))
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    gap = torch.stack([x, y], -1).flatten(0, 1)[None] - p.means2d[:, None]
+    q = torch.einsum("npi,nij,npj->np", gap, covariance.inverse(), gap)
+    alpha = gaussians.opacities[:, None] * torch.exp(-q / 2)
+    return int(((alpha >= 1 / 255) & (p.depths > 0.2)[:, None]).sum())
+
+
+def test_pairs_are_counted_exactly():
+    work = from_scene("T")
+    assert count_pairs(activated(work.raw), work.camera) == brute_force_pairs(activated(work.raw).to(dtype=torch.float64), work.camera)
+
+
+def test_scenes_are_those_that_peers_were_measured_on():
+    file = SHARED / "bench" / "scenes.py"
+    if not file.exists():
+        pytest.skip("the peers' generator lies beside the author's repository only")
+    spec = importlib.util.spec_from_file_location("peers_scenes", file)
+    peers = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(peers)
+    theirs, _, weights = peers.make("A")
+    ours = make("A")
+    assert np.array_equal(weights, ours.weights)
+    for name, array in {**ours.raw, "logit_opac": ours.raw["logits"]}.items():
+        assert name == "logits" or np.array_equal(theirs[name], array), name
+
+
+def test_growth_scenes_share_their_splats():
+    few, many = make("P1"), make("P10")
+    assert all(np.allclose(few.raw[name], many.raw[name], atol=1e-5) for name in few.raw)
+
+
+def test_gsplat_twins_draw_what_the_reference_draws():
+    pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is in the test extra")
+    from gsplat_twins import GsplatTwins
+
+    work = from_scene("T")
+    images, grads = [], []
+    for backend in (get_backend("reference"), GsplatTwins()):
+        leaves = {name: tensor.clone().requires_grad_() for name, tensor in work.raw.items()}
+        gaussians = activated(leaves)
+        image = backend.render(gaussians, work.camera, effects_of(gaussians)).image
+        (image * work.weights).sum().backward()
+        images.append(image.detach())
+        grads.append(torch.cat([leaf.grad.flatten() for leaf in leaves.values()]))
+    torch.testing.assert_close(images[1], images[0], atol=1e-4, rtol=0)
+    assert (grads[1] - grads[0]).norm() < 1e-4 * grads[0].norm()
