@@ -11,9 +11,8 @@ from torch import Tensor
 
 from mipmap_plugin import Camera, Effects, Gaussians, wrap_model
 from mipmap_plugin.backends.compositing import MIN_ALPHA
-from mipmap_plugin.backends.filters import Footprint, footprint
 from mipmap_plugin.backends.projection import project
-from mipmap_plugin.backends.reference import drawn_rows, extents
+from mipmap_plugin.effects import DILATION
 from mipmap_plugin.errors import SettingsError
 
 # Splats counted at once, so that counting pairs takes little memory whatever the checkpoint.
@@ -90,26 +89,26 @@ def effects_of(gaussians: Gaussians) -> Effects:
 
 def count_pairs(gaussians: Gaussians, camera: Camera) -> int:
     """(splat, pixel) pairs with alpha of at least 1/255, whether or not the pixel is opaque before."""
-    gaussians, effects = gaussians.to(dtype=torch.float64), effects_of(gaussians)
-    count = 0
-    for rows in drawn_rows(gaussians, camera, effects).split(CHUNK):
-        projected = project(gaussians[rows], camera, effects.near_plane)
-        feet = footprint(projected, gaussians.opacities[rows], effects.screen_filter, effects.eps2d)
-        count += _pairs_of(projected.means2d, feet, camera)
-    return count
+    gaussians, near = gaussians.to(dtype=torch.float64), effects_of(gaussians).near_plane
+    bright = (gaussians.opacities >= MIN_ALPHA).nonzero()[:, 0]
+    return sum(_pairs_of(gaussians[rows], camera, near) for rows in bright.split(CHUNK))
 
 
-def _pairs_of(means2d: Tensor, feet: Footprint, camera: Camera) -> int:
+def _pairs_of(gaussians: Gaussians, camera: Camera, near: float) -> int:
     """Pixel centers inside each ellipse, image row by image row."""
-    y, half = means2d[:, 1], extents(feet)[:, 1]
-    first = (y - half - 0.5).ceil().clamp_min(0).long()
-    last = (y + half - 0.5).floor().clamp_max(camera.height - 1).long()
-    rows = (last - first + 1).clamp_min(0)
-    splat = torch.arange(len(rows)).repeat_interleave(rows)
-    nth = torch.arange(len(splat)) - (rows.cumsum(0) - rows)[splat]
-    dy = first[splat] + nth + 0.5 - y[splat]
-    reach = 2 * (feet.opacities / MIN_ALPHA).log()[splat]
-    across = (feet.across[splat] * (reach - dy.square() / feet.yy[splat]).clamp_min(0)).sqrt()
-    x = means2d[splat, 0] + feet.shear[splat] * dy
-    left, right = (x - across - 0.5).ceil().clamp_min(0), (x + across - 0.5).floor().clamp_max(camera.width - 1)
+    splats = project(gaussians, camera, near)
+    xx, yy = splats.xx + DILATION, splats.yy + DILATION
+    x, y = splats.means2d.unbind(1)
+    reach = 2 * (gaussians.opacities / MIN_ALPHA).log()
+    half = (reach * yy).sqrt()
+    first = (y - half - 0.5).ceil().clamp(0, camera.height).long()
+    last = (y + half - 0.5).floor().clamp(-1, camera.height - 1).long()
+    rows = torch.where(splats.depths > near, (last - first + 1).clamp_min(0), 0)
+
+    ids = torch.arange(len(rows)).repeat_interleave(rows)
+    nth = torch.arange(len(ids)) - (rows.cumsum(0) - rows)[ids]
+    dy = first[ids] + nth + 0.5 - y[ids]
+    across = (xx - splats.xy.square() / yy)[ids] * (reach[ids] - dy.square() / yy[ids])
+    middle, width = x[ids] + (splats.xy / yy)[ids] * dy, across.clamp_min(0).sqrt()
+    left, right = (middle - width - 0.5).ceil().clamp_min(0), (middle + width - 0.5).floor().clamp_max(camera.width - 1)
     return int((right - left + 1).clamp_min(0).sum())
