@@ -60,6 +60,15 @@ class Camera:
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
+    def moved(self, similarity: Tensor) -> Camera:
+        """The same view after all of the world, this camera included, was moved by `similarity` [4, 4]: turned, sized and shifted."""
+        turned_and_sized = similarity[:3, :3].to("cpu", torch.float64)
+        rotation = turned_and_sized / torch.linalg.det(turned_and_sized).pow(1 / 3)
+        viewmat = torch.eye(4, dtype=torch.float64)
+        viewmat[:3, :3] = self.viewmat[:3, :3] @ rotation.T
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (turned_and_sized @ self.center + similarity[:3, 3].to("cpu", torch.float64))
+        return replace(self, viewmat=viewmat)
+
     def looking_from(self, viewmat: Tensor, name: str) -> Camera:
         """The same lens at another pose."""
         return replace(self, viewmat=viewmat, name=name)

@@ -13,7 +13,14 @@ from mipmap_plugin.registry import Registry
 __all__ = ["MODELS", "Checkpoint", "SplatModel", "TrainedScale", "detect", "load_model", "register_model"]
 
 # By family (`detect.FAMILIES`): a function that loads the path of a PLY or model folder, `(path, *, iteration) -> SplatModel`.
-MODELS = Registry("mipmap_plugin.models", {"3dgs": "mipmap_plugin.models.vanilla:load_vanilla"})
+MODELS = Registry(
+    "mipmap_plugin.models",
+    {
+        "3dgs": "mipmap_plugin.models.vanilla:load_vanilla",
+        "gsplat": "mipmap_plugin.models.gsplat:load_gsplat",
+        "splatfacto": "mipmap_plugin.models.splatfacto:load_splatfacto",
+    },
+)
 
 
 def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:

@@ -33,6 +33,10 @@ FAMILIES = {
 
 EXCHANGE = {"spz": "SPZ", "sog": "SOG", "ksplat": "KSPLAT", "splat": "SPLAT", "compressed": "compressed PLY"}
 
+# The files in the result folders of projects that save with torch: the folder they lie in, and their names.
+GSPLAT_FILE = r"ckpt_(?P<step>\d+)(?:_rank(?P<rank>\d+))?\.pt"
+RESULTS = {"gsplat": ("ckpts", GSPLAT_FILE), "splatfacto": ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")}
+
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -60,7 +64,7 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
         raise CheckpointError(f"{path} is a file and has no iterations; give its model folder to choose iteration {iteration}")
     kind = kind_of(path)
     if kind == "torch":
-        return Checkpoint(_family_of_torch_file(path), path)
+        return _detect_torch_file(path)
     if kind != "ply":
         raise CheckpointError(_why_not(path, kind))
     return _detect_ply(path)
@@ -69,6 +73,11 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
 def not_loaded(family: str) -> str:
     """The sentence for a family that is recognized, but that nothing is registered for."""
     return f"this is a {FAMILIES.get(family, family)} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
+
+
+def _detect_torch_file(path: Path) -> Checkpoint:
+    family, place = _family_of_torch_file(path), path.absolute().parent
+    return Checkpoint(family, path, place.parent if place.name == RESULTS[family][0] else None)
 
 
 def _detect_ply(path: Path) -> Checkpoint:
@@ -151,13 +160,13 @@ def _why_not(path: Path, kind: str) -> str:
 def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if (folder / "point_cloud").is_dir():
         return _detect_iteration(folder, iteration)
+    for family, (place, pattern) in RESULTS.items():
+        if steps := _steps(folder / place, pattern):
+            return _detect_step(family, folder, steps, iteration)
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     if (folder / "meta.json").is_file() and any(folder.glob("*.webp")):
         raise CheckpointError(_why_not(folder / "meta.json", "sog"))
-    for family, pattern in {"gsplat": "ckpts/ckpt_*.pt", "splatfacto": "nerfstudio_models/*.ckpt"}.items():
-        if files := sorted(folder.glob(pattern), key=_numbers):
-            return Checkpoint(family, files[-1], folder)
     clouds = sorted(folder.glob("*.ply"))
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
@@ -185,5 +194,14 @@ def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
     raise CheckpointError(f"{folder} has no whole checkpoint: {'; '.join(troubles)}")
 
 
-def _numbers(path: Path) -> list[int]:
-    return [int(digits) for digits in re.findall(r"\d+", path.name)]
+def _steps(folder: Path, pattern: str) -> dict[int, Path]:
+    """The checkpoints of a training by their steps; of several ranks the first."""
+    files = sorted(folder.iterdir(), reverse=True) if folder.is_dir() else []
+    return {int(name["step"]): file for file in files if (name := re.fullmatch(pattern, file.name))}
+
+
+def _detect_step(family: str, folder: Path, steps: dict[int, Path], wanted: int | None) -> Checkpoint:
+    step = max(steps) if wanted is None else wanted
+    if step not in steps:
+        raise CheckpointError(f"{folder} has no checkpoint of step {step}; it has {', '.join(map(str, sorted(steps)))}")
+    return Checkpoint(family, steps[step], folder, step)

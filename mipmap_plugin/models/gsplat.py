@@ -1,0 +1,171 @@
+"""gsplat: the ckpt_*.pt of its simple_trainer, alone or in a result folder; every rank of a run on several GPUs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import CheckpointError, SceneError, ShapeError
+from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.detect import GSPLAT_FILE, detect
+from mipmap_plugin.models.gsplat_frame import normalized_frame
+from mipmap_plugin.models.tags import render_mode
+from mipmap_plugin.models.torch_file import load_torch, save_torch
+from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
+from mipmap_plugin.models.yaml_scalars import read_scalars, with_scalar
+
+NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
+
+# World units, the trainer's default.
+NEAR_PLANE = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class GsplatHost:
+    """What a gsplat checkpoint has besides its splats."""
+
+    family = "gsplat"
+    folder: Path | None = None  # the result folder
+    options: dict[str, Any] = field(default_factory=dict)  # of its cfg.yml
+    siblings: dict[str, Any] = field(default_factory=lambda: {"step": 0})  # of "splats" in the file: the step, poses, ...
+    means: str = "means"  # what the file calls them; "means3d" in gsplat 1.0.0
+
+    def write(self, path: Path, parameters: dict[str, Tensor], comments: Sequence[str], *, overwrite: bool) -> Path:
+        """Write one .pt file, or a result folder with the cfg of the source; return the .pt file. Raises OutputExists."""
+        splats = {self.means if name == "means" else name: tensor.detach().cpu() for name, tensor in parameters.items()}
+        content = {**self.siblings, "splats": splats, "comments": list(comments)}
+        if path.suffix == ".pt":
+            return save_torch(path, content, overwrite=overwrite)
+        refuse_to_lose(path, self.folder, holds="ckpts")
+        within = Path("ckpts", f"ckpt_{self.siblings['step']}_rank0.pt")
+        with new_folder(path, overwrite) as fresh:
+            save_torch(fresh / within, content, overwrite=False)
+            self._write_options(fresh, antialiased=render_mode(comments) == "antialiased")
+        return path / within
+
+    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None, means: Tensor) -> list[Camera]:
+        """Resized by `data_factor`, and moved into the normalized world, which is found again from the cameras and points."""
+        factor = _positive(self.options, "data_factor", 1)
+        resized = [camera.resized(max(1, int(camera.width // factor)), max(1, int(camera.height // factor))) for camera in cameras]
+        if not self.options.get("normalize_world_space", True):  # always on before version 1.4, which had no such option
+            return resized
+        if points is None:
+            advice = "give the COLMAP scene that it was trained on"
+            raise SceneError(f"gsplat trained in a normalized world, whose place is found from the points of COLMAP: {advice}")
+        frame = normalized_frame(cameras, points, means)
+        return [camera.moved(frame) for camera in resized]
+
+    def _write_options(self, folder: Path, *, antialiased: bool) -> None:
+        source = _options_file(self.folder)
+        if source is None:
+            return
+        text = source.read_text(encoding="utf-8")
+        if source.suffix == ".json":
+            text = json.dumps({**json.loads(text), "antialiased": antialiased}, indent=4)
+        else:
+            text = with_scalar(text, "antialiased", str(antialiased).lower())
+        (folder / source.name).write_text(text, encoding="utf-8")
+
+
+def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
+    """Load a .pt file with all ranks of its step, or the newest step (or step `iteration`) of a result folder. Raises CheckpointError."""
+    found = detect(path, iteration=iteration)
+    files = rank_files(found.path)
+    shards = [_read(file) for file in files]
+    options, notes = _options(found.folder)
+    means = "means3d" if "means3d" in shards[0]["splats"] else "means"
+    siblings = {name: value for name, value in shards[0].items() if name not in ("splats", "comments")}
+    tagged = render_mode(shards[0].get("comments", ()))
+    host = GsplatHost(found.folder, options, siblings, means)
+    origin = Origin(files[0], sha256(*files), found.folder, found.iteration, tuple(shards[0].get("comments", ())), host=host)
+    parts = [_parameters(shard["splats"], file) for shard, file in zip(shards, files, strict=True)]
+    try:
+        parameters = {name: torch.cat([part[name] for part in parts]) for name in NAMES}
+        model = VanillaModel(parameters, _trained(options, tagged), origin, notes)
+    except (ShapeError, RuntimeError) as error:  # what torch.cat raises for ranks that do not fit together
+        raise CheckpointError(f"{found.path} holds tensors that do not fit together: {error}; copy it again") from error
+    if len(files) > 1:
+        model.notes.append(f"the splats of {len(files)} ranks are put together: {', '.join(file.name for file in files)}")
+    model.notes += _oddities(options, siblings, model.sh_degree)
+    return without_poison(model)
+
+
+def rank_files(path: Path) -> list[Path]:
+    """The files of the same step as `path`, in the order of their ranks. Raises CheckpointError when one between is missing."""
+    name = re.fullmatch(GSPLAT_FILE, path.name)
+    if not name or name["rank"] is None:
+        return [path]
+    siblings = (re.fullmatch(GSPLAT_FILE, file.name) for file in path.absolute().parent.iterdir())
+    ranks = {int(each["rank"]): path.with_name(each.string) for each in siblings if each and each["rank"] and each["step"] == name["step"]}
+    missing = set(range(max(ranks) + 1)) - set(ranks)
+    if missing:
+        told = ", ".join(map(str, sorted(missing)))
+        raise CheckpointError(f"{path} is one of the files of several GPUs, and rank {told} of step {name['step']} is missing; copy it there")
+    return [ranks[rank] for rank in sorted(ranks)]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    content = load_torch(path)
+    if not isinstance(content, dict) or not isinstance(content.get("splats"), Mapping):
+        raise CheckpointError(f"{path} is no gsplat checkpoint: it has no dictionary of splats; give a ckpt_*.pt of simple_trainer")
+    return {"step": 0, **content}
+
+
+def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """The tensors by gsplat's present names, float32. Raises CheckpointError."""
+    named = {"means" if name == "means3d" else name: tensor for name, tensor in splats.items()}
+    if {"features", "colors"} & set(named):
+        advice = "train without app_opt, or export a PLY from gsplat (save_ply), which bakes one appearance"
+        raise CheckpointError(f"{path} was trained with app_opt: a network of gsplat colors its splats, which is not read here; {advice}")
+    if set(named) != set(NAMES) or not all(torch.is_tensor(tensor) for tensor in named.values()):
+        raise CheckpointError(f"{path} holds the splat tensors {', '.join(named)}; expected are {', '.join(NAMES)}")
+    return {name: named[name].detach().float() for name in NAMES}
+
+
+def _options_file(folder: Path | None) -> Path | None:
+    return next((folder / name for name in ("cfg.yml", "cfg.json") if (folder / name).is_file()), None) if folder else None
+
+
+def _options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
+    """The options of the training, and a note where they are not known. Raises CheckpointError for a 2DGS training."""
+    file = _options_file(folder)
+    if file is None:
+        return {}, ["cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter"]
+    try:
+        options = json.loads(file.read_text(encoding="utf-8")) if file.suffix == ".json" else read_scalars(file)
+    except ValueError as error:
+        raise CheckpointError(f"{file} is not JSON ({error}); copy it again, or remove it") from error
+    if str(options.get("model_type", "")).startswith("2dgs"):
+        raise CheckpointError(f"{file} says that the splats are flat (2DGS), a family that is recognized but not loaded")
+    return options, []
+
+
+def _trained(options: dict[str, Any], tagged: str | None) -> TrainedScale:
+    antialiased = "antialiased" if options.get("antialiased") else "classic"
+    resolution, near = _positive(options, "data_factor", TrainedScale.resolution), _positive(options, "near_plane", NEAR_PLANE)
+    return TrainedScale(tagged or antialiased, resolution=resolution, near_plane=near)
+
+
+def _positive(options: dict[str, Any], key: str, default: float) -> float:
+    value = options.get(key)
+    return value if isinstance(value, (int, float)) and value > 0 else default
+
+
+def _oddities(options: dict[str, Any], siblings: dict[str, Any], sh_degree: int) -> list[str]:
+    notes = []
+    if options.get("sh_degree", sh_degree) != sh_degree:
+        notes.append(f"the cfg says SH degree {options['sh_degree']}, but the splats have degree {sh_degree}; the splats are trusted")
+    if "pose_adjust" in siblings:
+        notes.append("the training moved its cameras (pose_opt); the cameras of the scene are rendered as they are given")
+    if options.get("camera_model", "pinhole") != "pinhole":
+        notes.append(f"trained with {options['camera_model']} cameras; here all cameras are pinholes")
+    return notes

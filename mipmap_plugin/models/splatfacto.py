@@ -1,0 +1,178 @@
+"""splatfacto of nerfstudio: the step-*.ckpt of its trainer, alone or in the folder of a run. Its config is read, never constructed."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import CheckpointError, OutputError, SceneError, ShapeError
+from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.columns import C0
+from mipmap_plugin.models.detect import RESULTS, detect
+from mipmap_plugin.models.tags import render_mode
+from mipmap_plugin.models.torch_file import load_torch, save_torch
+from mipmap_plugin.models.vanilla import OPACITY_MARGIN, Origin, VanillaModel, without_poison
+from mipmap_plugin.models.yaml_scalars import read_scalars, with_scalar
+
+PLACE, FILE = RESULTS["splatfacto"]
+
+# Where a state dict keeps the splats: with gauss_params since version 1.1, with `module` after a training on several GPUs.
+KEY = r"(?:module\.)?_model\.(?:module\.)?(?:gauss_params\.)?(means|scales|quats|features_dc|features_rest|opacities)"
+NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
+
+# World units (models/splatfacto.py hands it to gsplat).
+NEAR_PLANE = 0.01
+
+# What `background_color` shows when it renders; a training with "random" colors renders on the last.
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.1490, 0.1647, 0.2157)}
+
+# px: larger photographs are halved until they fit (data/dataparsers/nerfstudio_dataparser.py).
+MAX_SIDE = 1600
+
+
+@dataclass(frozen=True, eq=False)
+class SplatfactoHost:
+    """What a splatfacto checkpoint has besides its splats; the file itself is read again when a new one is written."""
+
+    source: Path
+    folder: Path | None = None  # of the run
+    step: int = 0
+    options: dict[str, Any] = field(default_factory=dict)  # of its config.yml
+    family = "splatfacto"
+
+    def write(self, path: Path, parameters: dict[str, Tensor], comments: Sequence[str], *, overwrite: bool) -> Path:
+        """Write one .ckpt file, or the folder of a run; return the .ckpt file.
+
+        Only the splats are exchanged in the original file, and the comments are added; the optimizers' moments stay, so that a
+        training cannot go on from it after splats were removed. Raises OutputExists, OutputError.
+        """
+        if path.suffix == ".ckpt":
+            _refuse_to_confuse(path)
+            return save_torch(path, self._content(parameters, comments), overwrite=overwrite)
+        refuse_to_lose(path, self.folder, holds=PLACE)
+        within = Path(PLACE, f"step-{self.step:09d}.ckpt")
+        with new_folder(path, overwrite) as fresh:
+            save_torch(fresh / within, self._content(parameters, comments), overwrite=False)
+            self._write_companions(fresh, path.name, render_mode(comments) or "classic")
+        return path / within
+
+    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None, means: Tensor) -> list[Camera]:
+        """Moved by dataparser_transforms.json, and at the size that nerfstudio shrinks large photographs to. Raises SceneError."""
+        frame = self._frame()
+        return [_shrunk(camera, self.options.get("downscale_factor")).moved(frame) for camera in cameras]
+
+    def _content(self, parameters: dict[str, Tensor], comments: Sequence[str]) -> dict[str, Any]:
+        content = load_torch(self.source)
+        stored = to_stored(parameters)
+        pipeline = {key: stored[name[1]] if (name := re.fullmatch(KEY, key)) else value for key, value in content["pipeline"].items()}
+        return {**content, "pipeline": pipeline, "comments": list(comments)}
+
+    def _frame(self) -> Tensor:
+        """[4, 4] float64 similarity from the world of the photographs to the checkpoint's. Raises SceneError."""
+        file = (self.folder or self.source.parent) / "dataparser_transforms.json"
+        try:
+            facts = json.loads(file.read_text(encoding="utf-8"))
+            scale, transform = float(facts["scale"]), torch.tensor(facts["transform"], dtype=torch.float64)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            advice = "without it the cameras of the scene cannot be placed; copy it from the folder of the training"
+            raise SceneError(f"{file} cannot be read ({error}): {advice}") from error
+        if tuple(transform.shape) != (3, 4) or not scale > 0:
+            raise SceneError(f"{file}: expected a 3 x 4 transform and a scale above 0; copy it again from the folder of the training")
+        frame = torch.eye(4, dtype=torch.float64)
+        frame[:3] = scale * transform
+        return frame
+
+    def _write_companions(self, folder: Path, name: str, screen_filter: str) -> None:
+        """The config finds its checkpoint by the name of the folder, which nerfstudio calls a timestamp."""
+        if self.folder is None:
+            return
+        for file in (self.folder / "config.yml", self.folder / "dataparser_transforms.json"):
+            if file.is_file():
+                text = file.read_text(encoding="utf-8")
+                if file.suffix == ".yml":
+                    text = with_scalar(with_scalar(text, "timestamp", json.dumps(name)), "rasterize_mode", screen_filter)
+                (folder / file.name).write_text(text, encoding="utf-8")
+
+
+def load_splatfacto(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
+    """Load a .ckpt file, or the newest step (or step `iteration`) of a run's folder. Raises CheckpointError."""
+    found = detect(path, iteration=iteration)
+    content = load_torch(found.path)
+    stored = _stored(content, found.path)
+    config = found.folder / "config.yml" if found.folder else None
+    options = read_scalars(config) if config and config.is_file() else {}
+    comments = tuple(content.get("comments", ()))
+    host = SplatfactoHost(found.path, found.folder, int(content.get("step", 0)), options)
+    origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, comments, host=host)
+    antialiased = "antialiased" if options.get("rasterize_mode") == "antialiased" else "classic"
+    background = BACKGROUNDS.get(str(options.get("background_color")))
+    trained = TrainedScale(render_mode(comments) or antialiased, background=background, near_plane=NEAR_PLANE)
+    try:
+        model = VanillaModel(to_parameters(stored), trained, origin, _oddities(content["pipeline"], options))
+    except (ShapeError, RuntimeError, IndexError) as error:  # what torch raises for a tensor with too few axes
+        raise CheckpointError(f"{found.path} holds tensors that do not fit together: {error}; copy it again") from error
+    return without_poison(model)
+
+
+def to_parameters(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Parameters as VanillaModel names them. At SH degree 0 splatfacto stores logits of colors, which are no SH."""
+    raw = {name: tensor.detach().float() for name, tensor in stored.items()}
+    dc, rest = raw["features_dc"], raw["features_rest"]
+    sh0 = dc if rest.shape[1] else ((dc.double().sigmoid() - 0.5) / C0).float()
+    opacities = raw["opacities"].squeeze(1)
+    return {"means": raw["means"], "scales": raw["scales"], "quats": raw["quats"], "opacities": opacities, "sh0": sh0[:, None], "shN": rest}
+
+
+def to_stored(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The inverse of `to_parameters`; colors that no logit gives are brought just inside 0..1."""
+    raw = {name: tensor.detach().cpu() for name, tensor in parameters.items()}
+    dc, rest = raw["sh0"].squeeze(1), raw["shN"]
+    features_dc = dc if rest.shape[1] else (dc.double() * C0 + 0.5).logit(eps=OPACITY_MARGIN).float()
+    attributes = {"means": raw["means"], "scales": raw["scales"], "quats": raw["quats"], "opacities": raw["opacities"][:, None]}
+    return {**attributes, "features_dc": features_dc, "features_rest": rest}
+
+
+def _stored(content: Any, path: Path) -> dict[str, Tensor]:
+    pipeline = content.get("pipeline") if isinstance(content, Mapping) else None
+    if not isinstance(pipeline, Mapping):
+        raise CheckpointError(f"{path} is no checkpoint of nerfstudio: it has no pipeline; give a step-*.ckpt of splatfacto")
+    named = ((re.fullmatch(KEY, str(key)), tensor) for key, tensor in pipeline.items())
+    stored = {name[1]: tensor for name, tensor in named if name and torch.is_tensor(tensor)}
+    if missing := [name for name in NAMES if name not in stored]:
+        advice = "it is another method of nerfstudio, or a variant that is not read"
+        raise CheckpointError(f"{path} lacks {', '.join(missing)} of splatfacto's splats; {advice}")
+    return stored
+
+
+def _oddities(pipeline: Mapping[str, Any], options: dict[str, Any]) -> list[str]:
+    notes = []
+    if not options:
+        notes.append("config.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter")
+    if any(key.endswith("camera_optimizer.pose_adjustment") for key in pipeline):
+        notes.append("the training moved its cameras (camera_optimizer); the cameras of the scene are rendered as they are given")
+    if options.get("use_bilateral_grid"):
+        notes.append("trained with a bilateral grid: nerfstudio regrades each training view by its own, which is not applied here")
+    return notes
+
+
+def _shrunk(camera: Camera, factor: Any) -> Camera:
+    """The size that nerfstudio trains at: divided by `downscale_factor`, or halved until it fits."""
+    if not isinstance(factor, (int, float)) or factor <= 0:
+        factor = 1
+        while max(camera.size) / factor > MAX_SIDE:
+            factor *= 2
+    return camera.resized(max(1, int(camera.width / factor)), max(1, int(camera.height / factor)))
+
+
+def _refuse_to_confuse(path: Path) -> None:
+    if path.parent.name == PLACE and not re.fullmatch(FILE, path.name):
+        raise OutputError(f"{path}: nerfstudio reads the step from every name in {PLACE}, and would stop at this one; choose another folder")

@@ -1,0 +1,258 @@
+"""gsplat checkpoints: every rank, every name, in and out again, and the normalized world found from COLMAP's points."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from oracle import brute_force
+from torch_checkpoints import gsplat_folder, splats
+
+from mipmap_plugin.errors import CheckpointError, OutputExists, SceneError
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.tags import provenance_of
+from mipmap_plugin.models.yaml_scalars import read_scalars
+from mipmap_plugin.wrap import wrap_model
+
+NAMES = ["means", "scales", "quats", "opacities", "sh0", "shN"]
+
+
+def equal(model, raw) -> bool:
+    return all(torch.equal(model.parameters()[name], raw[name]) for name in NAMES)
+
+
+def activated(raw) -> Gaussians:
+    """The float64 reading of FORMATS: exp, sigmoid, sh0 before shN; gsplat normalizes quaternions inside."""
+    wide = {name: tensor.double() for name, tensor in raw.items()}
+    sh = torch.cat([wide["sh0"], wide["shN"]], 1)
+    return Gaussians(wide["means"], wide["quats"], wide["scales"].exp(), 1 / (1 + (-wide["opacities"]).exp()), sh)
+
+
+@pytest.mark.parametrize("antialiased", ["true", "false"])
+def test_it_renders_as_an_independent_evaluation_in_float64(tmp_path, antialiased):
+    raw, camera = splats(), tiny.cameras()[0]
+    wrapped = wrap_model(gsplat_folder(tmp_path / "r", raw, antialiased=antialiased), backend="reference")
+    screen_filter = {"true": "antialiased", "false": "classic"}[antialiased]
+    expected, _ = brute_force(activated(raw), camera, screen_filter=screen_filter, near=0.01)
+    assert torch.allclose(wrapped.render(camera).image.double(), expected, atol=1e-5)
+
+
+def test_all_ranks_of_a_step_are_put_together_in_order(tmp_path):
+    raw = splats(31)
+    folder = gsplat_folder(tmp_path / "r", raw, ranks=11)  # rank 10 sorts before rank 2 by name
+    model = load_model(folder)
+    assert equal(model, raw)
+    assert (model.family, model.folder, model.source.name) == ("gsplat", folder, "ckpt_6999_rank0.pt")
+    assert "the splats of 11 ranks are put together" in " ".join(model.notes)
+    assert equal(load_model(folder / "ckpts/ckpt_6999_rank7.pt"), raw)
+
+
+def test_a_missing_rank_is_told(tmp_path):
+    folder = gsplat_folder(tmp_path / "r", splats(), ranks=3)
+    (folder / "ckpts/ckpt_6999_rank1.pt").unlink()
+    with pytest.raises(CheckpointError, match="rank 1 of step 6999 is missing"):
+        load_model(folder)
+
+
+def test_the_newest_step_or_the_one_asked_for(tmp_path):
+    raw, older = splats(), splats(seed=1)
+    folder = gsplat_folder(tmp_path / "r", raw, step=29_999)
+    gsplat_folder(tmp_path / "older", older, ranks=2)
+    for file in (tmp_path / "older/ckpts").iterdir():
+        file.rename(folder / "ckpts" / file.name)
+    assert equal(load_model(folder), raw)
+    assert equal(load_model(folder, iteration=6999), older)
+    with pytest.raises(CheckpointError, match="no checkpoint of step 5; it has 6999, 29999"):
+        load_model(folder, iteration=5)
+
+
+def test_the_options_are_read_past_the_tags_of_python_objects(tmp_path):
+    folder = gsplat_folder(tmp_path / "r", splats(), antialiased="true")
+    trained = load_model(folder).trained
+    assert (trained.screen_filter, trained.near_plane, trained.resolution) == ("antialiased", 0.01, 4)
+    options = read_scalars(folder / "cfg.yml")
+    assert options["far_plane"] == 1e10 and options["ckpt"] is None and options["data_dir"] == "data/360_v2/garden"
+    assert options["refine_every"] == 100 and "strategy" not in options and "save_steps" not in options
+
+
+def test_a_lone_file_is_classic_with_a_note(tmp_path):
+    torch.save({"step": 7, "splats": splats()}, tmp_path / "lone.pt")
+    model = load_model(tmp_path / "lone.pt")
+    assert model.trained.screen_filter == "classic"
+    assert "cfg.yml is not beside" in model.notes[0]
+
+
+@pytest.mark.parametrize("target", ["out", "out.pt"])
+def test_saving_and_loading_gives_the_same_numbers_and_what_the_trainer_reads(tmp_path, target):
+    raw = splats()
+    folder = gsplat_folder(tmp_path / "r", raw, ranks=2, antialiased="true")
+    saved = load_model(folder).save(tmp_path / target, provenance={"scale": 4})
+    assert equal(load_model(tmp_path / target), raw)
+    assert load_model(tmp_path / target).trained.screen_filter == "antialiased"
+    content = torch.load(saved, weights_only=True)  # as simple_trainer.py reads it
+    assert content["step"] == 6999 and set(content["splats"]) == set(NAMES)
+    assert content["splats"]["opacities"].dim() == 1
+    assert all(tensor.dtype == torch.float32 for tensor in content["splats"].values())
+    assert provenance_of(content["comments"]) == {"scale": 4}
+
+
+def test_poses_that_the_training_moved_are_carried_along(tmp_path):
+    torch.save({"step": 7, "splats": splats(), "pose_adjust": {"embeds.weight": torch.ones(2, 9)}}, tmp_path / "a.pt")
+    model = load_model(tmp_path / "a.pt")
+    assert "the training moved its cameras" in model.notes[-1]
+    saved = model.save(tmp_path / "b.pt", provenance={})
+    assert torch.equal(torch.load(saved)["pose_adjust"]["embeds.weight"], torch.ones(2, 9))
+
+
+def test_version_1_0_keeps_its_own_name_for_the_means_and_its_json(tmp_path):
+    raw = splats()
+    renamed = {"means3d" if name == "means" else name: tensor for name, tensor in raw.items()}
+    (tmp_path / "r/ckpts").mkdir(parents=True)
+    (tmp_path / "r/cfg.json").write_text(json.dumps({"antialiased": True, "data_factor": 2}))
+    torch.save({"step": 29_999, "splats": renamed}, tmp_path / "r/ckpts/ckpt_29999.pt")
+    model = load_model(tmp_path / "r")
+    assert equal(model, raw) and model.trained.screen_filter == "antialiased"
+    model.trained = type(model.trained)("classic")
+    saved = model.save(tmp_path / "s", provenance={})
+    assert set(torch.load(saved)["splats"]) == set(renamed)
+    assert json.loads((tmp_path / "s/cfg.json").read_text()) == {"antialiased": False, "data_factor": 2}
+
+
+@pytest.mark.parametrize("scale", [1 / 4, 4])
+def test_adapting_raises_the_quality_and_says_classic_in_the_cfg(tmp_path, scale):
+    folder, cameras = gsplat_folder(tmp_path / "r", splats(60), antialiased="true"), tiny.cameras()
+    before = (folder / "ckpts/ckpt_6999_rank0.pt").read_bytes()
+    base = wrap_model(folder, cameras=cameras, backend="reference")
+    adapted = base.adapt(scale, steps=16 if scale < 1 else 0, extra_views=2)
+    adapted.save(tmp_path / "out")
+    again = wrap_model(tmp_path / "out", cameras=cameras, backend="reference")
+    camera = cameras[0].zoomed(scale)
+    truth = base.render(camera, scale, supersampling=4).image if scale < 1 else upsampled(base, cameras[0], camera)
+    unadapted = base.render(camera, screen_filter="classic").image
+    assert psnr(again.render(camera).image, truth) > psnr(unadapted, truth) + 0.5
+    assert read_scalars(tmp_path / "out/cfg.yml")["antialiased"] is False
+    assert "  antialiased: null" in (folder / "cfg.yml").read_text()
+    assert (folder / "ckpts/ckpt_6999_rank0.pt").read_bytes() == before
+
+
+def upsampled(base, camera, zoomed):
+    image = base.render(camera).image.movedim(-1, 0)[None]
+    return torch.nn.functional.interpolate(image, zoomed.size, mode="bicubic", align_corners=False)[0].movedim(0, -1)
+
+
+def test_a_ply_is_written_where_one_is_asked_for(tmp_path):
+    raw = splats()
+    saved = load_model(gsplat_folder(tmp_path / "r", raw)).save(tmp_path / "out.ply", provenance={})
+    assert np.array_equal(read_ply(saved).columns["scale_1"], raw["scales"][:, 1].numpy())
+
+
+def test_nothing_is_lost_by_saving(tmp_path):
+    model = load_model(gsplat_folder(tmp_path / "r", splats()))
+    for target in ("r", "r/ckpts/ckpt_6999_rank0.pt"):
+        with pytest.raises(OutputExists):
+            model.save(tmp_path / target, provenance={})
+    with pytest.raises(OutputExists, match="the base checkpoint itself"):
+        model.save(tmp_path / "r", provenance={}, overwrite=True)
+
+
+class Hostile:
+    def __reduce__(self):
+        return print, ("executed",)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda s: {**s, "features": torch.zeros(30, 32), "colors": torch.zeros(30, 3)}, "trained with app_opt"),
+        (lambda s: {name: s[name] for name in NAMES[:-1]}, "expected are means"),
+        (lambda s: {**s, "opacities": s["opacities"][:, None]}, "opacities: expected shape"),
+        (lambda s: {**s, "shN": s["shN"][:, :2]}, "fit no SH degree"),
+        (lambda s: {**s, "means": s["means"] * math.nan}, "none of its 30 splats is finite"),
+        (lambda s: {**s, "means": 7}, "expected are means"),
+        (lambda s: [s], "no dictionary of splats"),
+        (lambda s: {**s, "hook": Hostile()}, "is not executed"),
+    ],
+)
+def test_what_is_no_gsplat_checkpoint_is_refused_in_one_sentence(tmp_path, change, sentence, capsys):
+    torch.save({"step": 1, "splats": change(splats())}, tmp_path / "a.pt")
+    with pytest.raises(CheckpointError, match=sentence):
+        load_model(tmp_path / "a.pt")
+    assert capsys.readouterr().out == ""
+
+
+def test_a_truncated_file_is_refused(tmp_path):
+    folder = gsplat_folder(tmp_path / "r", splats())
+    file = folder / "ckpts/ckpt_6999_rank0.pt"
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(CheckpointError):
+        load_model(folder)
+
+
+def test_flat_splats_are_refused(tmp_path):
+    folder = gsplat_folder(tmp_path / "r", splats())
+    (folder / "cfg.yml").write_text("model_type: 2dgs\n")
+    with pytest.raises(CheckpointError, match="flat"):
+        load_model(folder)
+
+
+# The normalized world
+
+
+def normalized_by_numpy(cameras, points):
+    """gsplat's own steps (FORMATS §2.3), in NumPy: similarity from the cameras, then principal axes of the points."""
+    c2w = np.stack([np.linalg.inv(camera.viewmat.numpy()) for camera in cameras])
+    t, R = c2w[:, :3, 3], c2w[:, :3, :3]
+    up = -R[:, :, 1].mean(0)
+    up /= np.linalg.norm(up)
+    target = np.array([0.0, -1.0, 0.0])
+    c, v = target @ up, np.cross(up, target)
+    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    align = np.eye(3) + skew + skew @ skew / (1 + c)
+    R, t = align @ R, t @ align.T
+    forward = R[:, :, 2]
+    nearest = t + (forward * -t).sum(-1)[:, None] * forward
+    shift = -np.median(nearest, axis=0)
+    scale = 1 / np.median(np.linalg.norm(t + shift, axis=-1))
+    first = np.eye(4)
+    first[:3, :3], first[:3, 3] = align * scale, shift * scale
+    moved = points @ first[:3, :3].T + first[:3, 3]
+    centroid = np.median(moved, axis=0)
+    values, vectors = np.linalg.eigh(np.cov(moved - centroid, rowvar=False))
+    vectors = vectors[:, values.argsort()[::-1]]
+    if np.linalg.det(vectors) < 0:
+        vectors[:, 0] *= -1
+    second = np.eye(4)
+    second[:3, :3], second[:3, 3] = vectors.T, -vectors.T @ centroid
+    return second @ first
+
+
+@pytest.mark.parametrize("turn", [(1, 1, 1), (1, -1, -1), (-1, -1, 1)])
+def test_the_normalized_world_is_found_again_whatever_half_turn_was_taken(tmp_path, turn):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500, 3)) ** 3 @ np.diag([3.0, 1.0, 2.0]) + [1.0, 2.0, 3.0]
+    cameras = tiny.cameras(5, width=128, height=96)
+    frame = np.diag([*turn, 1.0]) @ normalized_by_numpy(cameras, points)
+    raw = {**splats(500), "means": torch.tensor(points @ frame[:3, :3].T + frame[:3, 3], dtype=torch.float32)}
+    model = load_model(gsplat_folder(tmp_path / "r", raw))
+    placed = model.as_trained(cameras, torch.tensor(points))
+    for camera, new in zip(cameras, placed, strict=True):
+        pose = frame @ np.linalg.inv(camera.viewmat.numpy())
+        pose[:3, :3] /= np.linalg.norm(pose[0, :3])
+        assert np.allclose(new.viewmat.numpy(), np.linalg.inv(pose), atol=1e-6)
+        assert (new.width, new.height, new.fx) == (32, 24, camera.fx / 4)
+    with pytest.raises(SceneError, match="another than gsplat trained on"):
+        model.as_trained(cameras, torch.tensor(points) @ torch.diag(torch.tensor([1.0, 9.0, 1.0])).double())
+    with pytest.raises(SceneError, match="give the COLMAP scene"):
+        model.as_trained(cameras, None)
+
+
+def test_a_world_that_was_not_normalized_is_the_scenes_own(tmp_path):
+    model = load_model(gsplat_folder(tmp_path / "r", splats(), normalized="false"))
+    camera = tiny.cameras(1, width=128, height=96)[0]
+    [placed] = model.as_trained([camera], None)
+    assert torch.equal(placed.viewmat, camera.viewmat) and placed.size == (24, 32)
