@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
@@ -63,3 +64,18 @@ def choose_views(cameras: Sequence[Camera], gaussians: Gaussians, config: AdaptC
         extra = jittered(views, config.extra_views, generator)
         return views + extra, f"{len(views)} train views and {len(extra)} around them"
     return views, f"the {len(views)} {split} views"
+
+
+def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:
+    """The views of a moving scene, each at a time, and a sentence that says how.
+
+    Views without a time get times evenly spread over 0..1, both ends included, in a random order, so that the time does not
+    follow the path of the cameras.
+    """
+    timeless = [number for number, view in enumerate(views) if view.time is None]
+    if not timeless:
+        return list(views), "at their own times"
+    order = torch.randperm(len(timeless), generator=torch.Generator().manual_seed(seed)).tolist()
+    times = {number: place / max(1, len(timeless) - 1) for number, place in zip(timeless, order, strict=True)}
+    timed = [replace(view, time=times.get(number, view.time)) for number, view in enumerate(views)]
+    return timed, f"{len(timeless)} of them without a time, which are spread over 0..1"

@@ -19,6 +19,8 @@ MODELS = Registry(
         "3dgs": "mipmap_plugin.models.vanilla:load_vanilla",
         "gsplat": "mipmap_plugin.models.gsplat:load_gsplat",
         "splatfacto": "mipmap_plugin.models.splatfacto:load_splatfacto",
+        "deformable": "mipmap_plugin.models.deformable:load_deformable",
+        "4dgs": "mipmap_plugin.models.hexplane:load_hexplane",
     },
 )
 

@@ -92,7 +92,7 @@ def _detect_ply(path: Path) -> Checkpoint:
 def _around(ply: Path) -> tuple[Path | None, int | None]:
     """The model folder and iteration of `<folder>/point_cloud/iteration_<N>/point_cloud.ply`."""
     place = ply.absolute().parent
-    number = re.fullmatch(r"iteration_(\d+)", place.name)
+    number = re.fullmatch(r"(?:coarse_)?iteration_(\d+)", place.name)
     if number and place.parent.name == "point_cloud":
         return place.parent.parent, int(number[1])
     return (place if (place / "cfg_args").is_file() else None), None
@@ -116,13 +116,31 @@ def _family(path: Path, header: Header, folder: Path | None) -> str:
     return _family_of_companions(path, folder)
 
 
+def network_of(ply: Path, family: str) -> Path:
+    """Where the network of a moving scene lies: the one of the same iteration, for any other moves other splats."""
+    place = ply.absolute().parent
+    return place / "deformation.pth" if family == "4dgs" else place.parent.parent / "deform" / place.name / "deform.pth"
+
+
+def is_coarse(ply: Path) -> bool:
+    """Whether it is of the first stage of 4D Gaussians, in which nothing moves yet."""
+    return ply.absolute().parent.name.startswith("coarse_iteration_")
+
+
 def _family_of_companions(ply: Path, folder: Path | None) -> str:
-    if (ply.parent / "deformation.pth").exists() or re.match(r"coarse_iteration_\d+$", ply.parent.name):
+    if is_coarse(ply) or network_of(ply, "4dgs").exists():
         return "4dgs"
-    networks = sorted(folder.glob("deform/iteration_*/deform.pth")) if folder else []
-    if networks:
-        return "sc-gs" if "nodes" in names_in_torch_file(networks[-1], ("nodes",)) else "deformable"
+    for family, pattern in {"4dgs": "point_cloud/*iteration_*/deformation.pth", "deformable": "deform/iteration_*/deform.pth"}.items():
+        if folder is not None and any(folder.glob(pattern)):
+            return _family_of_network(ply, family)
     return "3dgs"
+
+
+def _family_of_network(ply: Path, family: str) -> str:
+    network = network_of(ply, family)
+    if not network.is_file():
+        raise CheckpointError(f"{ply} lacks the network that moves its splats; copy it to {network}, or choose another iteration")
+    return "sc-gs" if family == "deformable" and "nodes" in names_in_torch_file(network, ("nodes",)) else family
 
 
 def _family_of_filter_3d(folder: Path | None) -> str:
@@ -133,15 +151,16 @@ def _family_of_filter_3d(folder: Path | None) -> str:
 
 
 def _family_of_torch_file(path: Path) -> str:
-    found = names_in_torch_file(path, ("splats", "pipeline", "gauss_params", "linear.0.weight", "nodes", "param_groups"))
+    networks = {"linear.0.weight", "nodes", "deformation_net"}
+    found = names_in_torch_file(path, ("splats", "pipeline", "gauss_params", "param_groups", *networks))
     if "splats" in found:
         return "gsplat"
     if found & {"pipeline", "gauss_params"}:
         return "splatfacto"
-    if found & {"linear.0.weight", "nodes"}:
-        raise CheckpointError(f"{path} is a deformation network without its splats; give the model folder that holds both")
     if "param_groups" in found:
         raise CheckpointError(f"{path} is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it")
+    if found & networks:
+        raise CheckpointError(f"{path} is a deformation network without its splats; give the model folder that holds both")
     raise CheckpointError(f"{path} is a torch file that holds no known checkpoint; give a PLY file or a model folder")
 
 
