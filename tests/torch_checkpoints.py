@@ -6,6 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
 
 # What yaml.dump(vars(cfg)) of gsplat's simple_trainer leaves: a tag of a Python object, and lists, among plain lines.
 CFG_YML = """antialiased: {antialiased}
@@ -97,3 +101,9 @@ def splatfacto_folder(
     pipeline = {"_model.device_indicator_param": torch.zeros(0), **splatfacto_state(raw, prefix), "_model.lpips.net.lin0.weight": torch.ones(2)}
     torch.save(splatfacto_content(pipeline), folder / "nerfstudio_models/step-000029999.ckpt")
     return folder
+
+
+def aim(base, camera, scale: float) -> Tensor:
+    """What a zoomed view should show: the base's render at its own scale, resized."""
+    image, size = base.render(camera).image, camera.zoomed(scale).size
+    return resize(image, size, "pil-bicubic") if scale < 1 else UPSAMPLERS.get("bicubic")(image, size)
