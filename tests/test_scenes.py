@@ -306,12 +306,6 @@ def test_a_checkpoint_may_come_with_cameras_or_without(tmp_path):
     assert [camera.size for camera in model_cameras(tmp_path, {"resolution": 2})] == [(24, 32)]
 
 
-def test_a_colmap_folder_is_refused_with_advice(tmp_path):
-    (tmp_path / "sparse").mkdir()
-    with pytest.raises(SceneError, match=r"COLMAP scenes are not read by this version; give a cameras\.json or transforms file"):
-        load_scene(tmp_path)
-
-
 def test_an_empty_folder_is_refused(tmp_path):
     with pytest.raises(SceneError, match=r"holds neither cameras\.json nor transforms files"):
         load_scene(tmp_path)

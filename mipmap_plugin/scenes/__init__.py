@@ -9,16 +9,18 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
+from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
 from mipmap_plugin.scenes.trajectories import jittered, orbit
 from mipmap_plugin.scenes.transforms import read_transforms
 
-__all__ = ["Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_transforms", "write_cameras"]
+__all__ = ["Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms", "write_cameras"]
 
 
 def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
-    """The scene at `path`: a model folder with a cameras.json, that file itself, or a transforms file or its folder.
+    """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file or its folder, or a COLMAP scene.
 
-    `cfg` is the checkpoint's cfg_args, which tell a cameras.json's test split and training size (`read_cameras`).
+    `cfg` is the checkpoint's cfg_args, which tell the test split and training size (`read_cameras`, `read_colmap`). A folder with
+    both COLMAP's `sparse` and transforms files is read as graphdeco-inria does, from `sparse`.
     Raises SceneError.
     """
     path = Path(path)
@@ -28,11 +30,13 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         return read_transforms(path) if path.name.startswith("transforms") else _cameras_only(path, path, cfg)
     if (path / "cameras.json").is_file():
         return _cameras_only(path / "cameras.json", path, cfg)
+    if (path / "sparse").is_dir():
+        return read_colmap(path, cfg)
     if any(path.glob("transforms*.json")):
         return read_transforms(path)
-    if (path / "sparse").is_dir():
-        raise SceneError(f"{path}: COLMAP scenes are not read by this version; give a cameras.json or transforms file")
-    raise SceneError(f"{path}: holds neither cameras.json nor transforms files; give the folder or file that has the cameras")
+    if is_colmap(path):
+        return read_colmap(path, cfg)
+    raise SceneError(f"{path}: holds neither cameras.json nor transforms files nor a COLMAP model; give the folder or file that has the cameras")
 
 
 def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) -> list[Camera]:

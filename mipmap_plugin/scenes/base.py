@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
@@ -21,12 +22,26 @@ class Scene:
     images: dict[Camera, Path]  # may be empty
     source: Path
     notes: list[str] = field(default_factory=list)  # what was assumed or left out, one sentence each
+    points: Tensor | None = None  # [P, 3] float64, the points of structure from motion, where the files hold them
+    applied: Tensor | None = None  # [4, 4] float64, how nerfstudio had turned COLMAP's world before it wrote the file
 
     def split(self, name: str) -> list[Camera]:
         """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""
         if name not in ("train", "test"):
             raise SettingsError(f"there is no split {name!r}; ask for 'train' or 'test'")
         return [camera for camera in self.cameras if camera.split == name]
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> Scene:
+        """The scene seen by other cameras, one for each of its own; the photographs go with them."""
+        images = {new: self.images[old] for old, new in zip(self.cameras, cameras, strict=True) if old in self.images}
+        return replace(self, cameras=tuple(cameras), images=images)
+
+    def original(self) -> Scene:
+        """The scene in the world that COLMAP had given it."""
+        if self.applied is None:
+            return self
+        back = torch.linalg.inv(self.applied)
+        return replace(self.with_cameras([camera.moved(back) for camera in self.cameras]), applied=None)
 
     def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
         """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution.

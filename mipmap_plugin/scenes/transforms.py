@@ -47,7 +47,7 @@ def read_transforms(path: str | Path) -> Scene:
             notes.append(f"{file.name}: {absent} listed images are absent; {unsized} of their cameras are left out because the file has no w and h")
     if not cameras:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
-    return Scene(tuple(cameras), images, path, notes)
+    return Scene(tuple(cameras), images, path, notes, applied=_applied(transforms_files(path)[0][0]))
 
 
 def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
@@ -97,6 +97,16 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})")
             found.append((camera.resized(*actual), image))
     return found, absent
+
+
+def _applied(file: Path) -> Tensor | None:
+    """[4, 4] nerfstudio's `applied_transform`, by which it has turned COLMAP's world already."""
+    data = read_json(file)
+    if "applied_transform" not in data:
+        return None
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3] = numbers(data["applied_transform"][:3], (3, 4), f"{file}, applied_transform")
+    return matrix
 
 
 def _image(folder: Path, listed: str) -> Path | None:

@@ -1,0 +1,117 @@
+"""COLMAP scenes, read by pycolmap: cameras in the order of their names, every eighth for testing, as mip-NeRF 360 has it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes.base import Scene
+from mipmap_plugin.scenes.cameras_json import TEST_EVERY, trained_size
+from mipmap_plugin.scenes.images import image_size
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# Where the parts of a model lie, in the order that graphdeco-inria and gsplat look for them.
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+
+INSTALL = "install it with `pip install 'mipmap-plugin[colmap]'`"
+
+
+def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
+    """The scene of a folder with `sparse/0` and images, or of the folder of the model itself.
+
+    `cfg` is the checkpoint's cfg_args: its `images` names the folder of photographs and its `resolution` the training size; a
+    project that has cfg_args puts the principal point in the middle, and so is it done here. Without it the photographs of
+    `images` count at their full size. A camera whose photograph is absent stays a usable view; `notes` count them.
+
+    Raises:
+        SceneError: no pycolmap, no readable model, a lens with distortion, or a `resolution` that is none.
+    """
+    path, cfg = Path(path), cfg or {}
+    model = _read(path)
+    folder = _root(path) / str(cfg.get("images", "images"))
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    if not images:
+        raise SceneError(f"{path}: the COLMAP model has no image with a pose; run the mapper again")
+    _refuse_distortion(model, path)
+    cameras: list[Camera] = []
+    photographs: dict[Camera, Path] = {}
+    for index, image in enumerate(images):
+        camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
+        photograph = folder / image.name
+        if photograph.is_file():
+            camera = camera.resized(*trained_size(*image_size(photograph), {**cfg, "images": "images"}))
+            photographs[camera] = photograph
+        else:
+            camera = camera.resized(*trained_size(camera.width, camera.height, cfg))
+        cameras.append(camera)
+    return Scene(tuple(cameras), photographs, path, _notes(cameras, photographs, folder, cfg), points=_points(model))
+
+
+def is_colmap(path: Path) -> bool:
+    """Whether a folder holds a COLMAP model, or is one."""
+    return _model_folder(path) is not None
+
+
+def _model_folder(path: Path) -> Path | None:
+    places = [path / place for place in MODELS]
+    return next((place for place in places if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))), None)
+
+
+def _root(path: Path) -> Path:
+    """The folder that the photographs lie in, also where the model's own folder was given."""
+    here = path.absolute()
+    return next((place.parent for place in (here, here.parent) if place.name == "sparse"), path)
+
+
+def _read(path: Path) -> pycolmap.Reconstruction:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise SceneError(f"{path}: is a COLMAP scene, which pycolmap reads; {INSTALL}") from error
+    folder = _model_folder(path)
+    if folder is None:
+        raise SceneError(f"{path}: holds no COLMAP model (sparse/0 with cameras, images and points3D); give the folder that does")
+    try:
+        return pycolmap.Reconstruction(folder)
+    except Exception as error:  # pycolmap raises what its C++ does for a damaged file
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise SceneError(f"{folder}: is not a COLMAP model that pycolmap reads ({reason}); copy or export it again") from error
+
+
+def _refuse_distortion(model: pycolmap.Reconstruction, path: Path) -> None:
+    for number, camera in model.cameras.items():
+        bent = [camera.params[i] for i in camera.extra_params_idxs() if camera.params[i] != 0]
+        if bent or "FISHEYE" in camera.model.name or camera.model.name == "FOV":
+            advice = "undistort the images first: `colmap image_undistorter --image_path images --input_path sparse/0 --output_path undistorted`"
+            raise SceneError(f"{path}: camera {number} has distortion ({camera.model.name}), which no rasterizer here draws; {advice}")
+
+
+def _camera(model: pycolmap.Reconstruction, image: pycolmap.Image, split: Literal["train", "test"], *, centered: bool) -> Camera:
+    """The camera at COLMAP's size. `centered`: the principal point is taken to be the middle."""
+    lens = model.cameras[image.camera_id]
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3] = torch.as_tensor(image.cam_from_world().matrix())
+    cx, cy = (lens.width / 2, lens.height / 2) if centered else (lens.principal_point_x, lens.principal_point_y)
+    name = Path(image.name).with_suffix("").as_posix()
+    return Camera(lens.width, lens.height, lens.focal_length_x, lens.focal_length_y, cx, cy, viewmat, name, split)
+
+
+def _points(model: pycolmap.Reconstruction) -> Tensor | None:
+    places = [torch.as_tensor(model.points3D[number].xyz) for number in sorted(model.points3D)]
+    return torch.stack(places) if places else None
+
+
+def _notes(cameras: list[Camera], photographs: dict[Camera, Path], folder: Path, cfg: dict[str, Any]) -> list[str]:
+    notes = [f"{len(cameras)} cameras in the order of their names: every {TEST_EVERY}th is for testing, the others for training"]
+    if absent := len(cameras) - len(photographs):
+        notes.append(f"{absent} of {len(cameras)} photographs that the COLMAP model lists are not in {folder}; their cameras are views without one")
+    if cfg and not cfg.get("eval"):
+        notes.append("the checkpoint was trained without --eval, on the test views too, so that they are not held out")
+    return notes

@@ -1,0 +1,153 @@
+"""COLMAP scenes: the mip-NeRF 360 protocol, absent photographs, distortion, and a real phone capture."""
+
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes import load_scene
+
+pycolmap = pytest.importorskip("pycolmap", reason="COLMAP scenes are read by pycolmap, an extra")
+
+# FORMATS §13, T2: the quaternion (w, x, y, z) and shift of a world-to-camera pose, and its matrix.
+QUATERNION, SHIFT = (0.9, 0.1, -0.2, 0.3), (0.5, -0.25, 4.0)
+ROTATION = [[0.726315789, -0.610526316, -0.315789474], [0.526315789, 0.789473684, -0.315789474], [0.442105263, 0.063157895, 0.894736842]]
+
+
+def write_text_model(folder, names, model="PINHOLE", params="70 72 31 25", points=3):
+    """A model in COLMAP's text format, every image at the pose of T2, 64 x 48 px."""
+    folder.mkdir(parents=True)
+    length = math.sqrt(sum(q * q for q in QUATERNION))
+    pose = " ".join(str(q / length) for q in QUATERNION) + " " + " ".join(map(str, SHIFT))
+    (folder / "cameras.txt").write_text(f"1 {model} 64 48 {params}\n")
+    (folder / "images.txt").write_text("".join(f"{i + 1} {pose} 1 {name}\n\n" for i, name in enumerate(names)))
+    (folder / "points3D.txt").write_text("".join(f"{i + 1} {i} 2 3 255 0 0 0.5\n" for i in range(points)))
+
+
+def write_photographs(folder, names, size=(64, 48)):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.zeros((size[1], size[0], 3), np.uint8)).save(folder / name)
+
+
+def names(count):
+    """File names in an order that is not the alphabet's."""
+    return [f"{(7 * i) % count:03d}.png" for i in range(count)]
+
+
+def test_a_camera_is_where_colmap_says(tmp_path):
+    write_text_model(tmp_path / "sparse/0", ["a/left.png"])
+    scene = load_scene(tmp_path)
+    [camera] = scene.cameras
+    assert np.allclose(camera.viewmat[:3, :3].numpy(), ROTATION, atol=1e-8)
+    assert np.allclose(camera.viewmat[:3, 3].numpy(), SHIFT)
+    assert np.allclose(camera.center.numpy(), [-2, 0.25, -3.5])
+    assert (camera.name, camera.width, camera.height) == ("a/left", 64, 48)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (70, 72, 31, 25)
+    assert torch.equal(scene.points, torch.tensor([[0.0, 2, 3], [1, 2, 3], [2, 2, 3]], dtype=torch.float64))
+
+
+def test_every_eighth_of_the_sorted_names_is_a_test_view(tmp_path):
+    write_text_model(tmp_path / "sparse/0", names(20))
+    scene = load_scene(tmp_path)
+    assert [camera.name for camera in scene.cameras] == [f"{i:03d}" for i in range(20)]
+    assert [camera.name for camera in scene.split("test")] == ["000", "008", "016"]
+
+
+def test_photographs_of_another_folder_keep_the_field_of_view(tmp_path):
+    write_text_model(tmp_path / "sparse/0", names(2), points=0)
+    write_photographs(tmp_path / "images_2", ["000.png"], size=(32, 24))
+    scene = load_scene(tmp_path, {"images": "images_2", "eval": True})
+    there, absent = scene.cameras
+    assert there.size == absent.size == (24, 32)  # the absent one by the name of its folder
+    assert (there.fx, there.fy) == (absent.fx, absent.fy) == (35, 36)
+    assert list(scene.images) == [there]
+    assert scene.points is None
+
+
+@pytest.mark.parametrize(("resolution", "size"), [(1, (48, 64)), (2, (24, 32)), (8, (6, 8)), (-1, (48, 64)), (20, (15, 20))])
+def test_the_training_size_follows_r_with_photographs_and_without(tmp_path, resolution, size):
+    write_text_model(tmp_path / "sparse/0", names(2))
+    write_photographs(tmp_path / "images", ["000.png"])
+    scene = load_scene(tmp_path, {"resolution": resolution, "eval": True})
+    assert [camera.size for camera in scene.cameras] == [size, size]
+    assert scene.image(scene.cameras[0], (0, 0, 0)).shape == (48, 64, 3)
+
+
+def test_a_checkpoint_with_cfg_args_has_its_principal_point_in_the_middle(tmp_path):
+    write_text_model(tmp_path / "sparse/0", names(1))
+    camera = load_scene(tmp_path, {"resolution": 2, "eval": True}).cameras[0]
+    assert (camera.cx, camera.cy) == (16, 12)
+
+
+def test_what_was_assumed_is_told(tmp_path):
+    write_text_model(tmp_path / "sparse/0", names(9))
+    write_photographs(tmp_path / "images", ["000.png", "003.png"])
+    told = " ".join(load_scene(tmp_path, {"eval": False}).notes)
+    assert "every 8th is for testing" in told and "7 of 9 photographs" in told and "not held out" in told
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_the_model_is_found_where_programs_leave_it(tmp_path, place):
+    write_text_model(tmp_path / "s" / place, names(1)) if place != "." else write_text_model(tmp_path / "s", names(1))
+    assert len(load_scene(tmp_path / "s").cameras) == 1
+
+
+def test_the_models_own_folder_finds_the_photographs_too(tmp_path):
+    write_text_model(tmp_path / "sparse/0", names(1))
+    write_photographs(tmp_path / "images", names(1))
+    assert len(load_scene(tmp_path / "sparse/0").images) == 1
+
+
+BENT = {"SIMPLE_RADIAL": "70 32 24 0.1", "OPENCV": "70 72 32 24 0 0 0.01 0", "OPENCV_FISHEYE": "70 72 32 24 0 0 0 0"}
+
+
+@pytest.mark.parametrize(("model", "params"), BENT.items())
+def test_distortion_is_refused_with_advice(tmp_path, model, params):
+    write_text_model(tmp_path / "sparse/0", names(1), model, params)
+    with pytest.raises(SceneError, match=rf"distortion \({model}\).*colmap image_undistorter"):
+        load_scene(tmp_path)
+
+
+def test_a_lens_model_whose_distortion_is_zero_is_a_pinhole(tmp_path):
+    write_text_model(tmp_path / "sparse/0", names(1), "SIMPLE_RADIAL", "70 31 25 0")
+    camera = load_scene(tmp_path).cameras[0]
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (70, 70, 31, 25)
+
+
+def test_broken_models_are_refused_in_one_sentence(tmp_path):
+    (tmp_path / "empty/sparse").mkdir(parents=True)
+    with pytest.raises(SceneError, match="holds no COLMAP model"):
+        load_scene(tmp_path / "empty")
+    write_text_model(tmp_path / "bare/sparse/0", [])
+    with pytest.raises(SceneError, match="no image with a pose"):
+        load_scene(tmp_path / "bare")
+    (tmp_path / "torn/sparse/0").mkdir(parents=True)
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"torn/sparse/0/{name}.bin").write_bytes(b"\1\2\3")
+    with pytest.raises(SceneError, match="is not a COLMAP model that pycolmap reads"):
+        load_scene(tmp_path / "torn")
+
+
+def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
+    write_text_model(tmp_path / "sparse/0", names(1))
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(SceneError, match=r"pip install 'mipmap-plugin\[colmap\]'"):
+        load_scene(tmp_path)
+
+
+def test_a_real_capture_of_which_most_photographs_are_absent(shared_data):
+    scene = load_scene(shared_data / "colmap/llff_small")
+    assert (len(scene.cameras), len(scene.images), len(scene.split("test"))) == (184, 31, 23)
+    assert "153 of 184 photographs" in " ".join(scene.notes)
+    assert {camera.size for camera in scene.cameras} == {(960, 544)}
+    first = scene.cameras[0]
+    assert first in scene.images and scene.image(first, (0, 0, 0)).shape == (960, 544, 3)
+    assert scene.points.shape == (6271, 3)
+    seen = scene.points @ first.viewmat[:3, :3].T + first.viewmat[:3, 3]
+    across = first.fx * seen[:, 0] / seen[:, 2] + first.cx
+    assert ((seen[:, 2] > 0) & (across > 0) & (across < first.width)).float().mean() > 0.5  # a capture that looks at one place
