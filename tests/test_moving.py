@@ -1,0 +1,55 @@
+"""Times: which moment each view of a moving scene is adapted at."""
+
+from dataclasses import replace
+
+import moving
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.views import with_times
+from mipmap_plugin.cli import main
+from mipmap_plugin.models import load_model
+from mipmap_plugin.scenes import jittered
+from mipmap_plugin.wrap import wrap_model
+
+
+def test_views_without_a_time_get_all_times_evenly_in_random_order():
+    views, told = with_times(tiny.cameras(11), seed=0)
+    times = [view.time for view in views]
+    assert sorted(times) == pytest.approx([step / 10 for step in range(11)]) and times != sorted(times)
+    assert told == "11 of them without a time, which are spread over 0..1"
+    assert [view.time for view in with_times(tiny.cameras(11), seed=0)[0]] == times
+    assert [view.time for view in with_times(tiny.cameras(11), seed=1)[0]] != times
+
+
+def test_views_keep_the_times_that_they_have():
+    cameras = [replace(camera, time=0.25) for camera in tiny.cameras(3)]
+    assert with_times(cameras, seed=0) == (cameras, "at their own times")
+    mixed, told = with_times([*cameras, *tiny.cameras(1)], seed=0)
+    assert ([view.time for view in mixed], told[:4]) == ([0.25, 0.25, 0.25, 0.0], "1 of")
+
+
+def test_jittered_views_take_the_times_of_the_cameras():
+    cameras = [replace(camera, time=number / 3) for number, camera in enumerate(tiny.cameras(4))]
+    assert {view.time for view in jittered(cameras, 8, torch.Generator().manual_seed(0))} == {0.0, 1 / 3, 2 / 3, 1.0}
+
+
+def test_the_report_says_how_a_moving_scene_was_sampled_and_a_still_one_has_no_times(tmp_path):
+    moves = wrap_model(moving.write_deformable(tmp_path / "m"), backend="reference").adapt(4, recipe="instant")
+    assert moves.report.views == "4 train views and 100 around them, 104 of them without a time, which are spread over 0..1"
+    still = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(4, recipe="instant")
+    assert "time" not in still.report.views
+
+
+def test_a_model_on_another_device_moves_as_before(tmp_path):
+    model = load_model(moving.write_deformable(tmp_path / "m"))
+    assert torch.equal(model.to("cpu").gaussians(moving.at(0.5)).means, model.gaussians(moving.at(0.5)).means)
+
+
+@pytest.mark.parametrize("write", [moving.write_deformable, moving.write_hexplane])
+def test_inspect_says_that_the_scene_moves(tmp_path, capsys, write):
+    write(tmp_path / "m")
+    assert main(["inspect", str(tmp_path / "m")]) == 0
+    told = capsys.readouterr().out
+    assert "is frozen: they adapt as they are before they move" in told and "without a time shows the moment 0" in told
