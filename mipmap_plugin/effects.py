@@ -13,6 +13,10 @@ DILATION = 0.3
 NEAR_PLANE = 0.2
 
 
+# Screen filters that dim what they widen.
+COMPENSATED = frozenset({"antialiased", "mip"})
+
+
 @dataclass(frozen=True)
 class Effects:
     """How one image is rendered.
@@ -21,7 +25,7 @@ class Effects:
     """
 
     sh_degree: int = 3  # bands above it are not evaluated
-    screen_filter: str = "classic"  # "classic" dilates; "antialiased" dilates and keeps each splat's light
+    screen_filter: str = "classic"  # "classic" dilates; "antialiased", "mip" also keep a splat's light; "analytic" integrates over pixels
     eps2d: float = DILATION  # px²
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear RGB
     supersampling: int = 1  # N: N x N samples per pixel, averaged
@@ -39,11 +43,13 @@ class Effect:
 
 def explain(effects: Effects, gaussians: Gaussians) -> list[Effect]:
     """Every effect that rendering knows, on or off, with its reason."""
+    integrates = effects.screen_filter == "analytic"
+    size = "over the area of a pixel" if integrates else f"{effects.eps2d:g} px²"
     degree, room, n, given = effects.sh_degree, gaussians.sh_degree, effects.supersampling, gaussians.covariances is not None
     return [
         Effect("view-dependent color", degree > 0, f"SH up to degree {degree} of {room}: above it every coefficient is 0"),
-        Effect("screen filter", effects.eps2d > 0, f"{effects.screen_filter}, {effects.eps2d:g} px²"),
-        Effect("compensation", effects.screen_filter == "antialiased", f"the screen filter is {effects.screen_filter}"),
+        Effect("screen filter", effects.eps2d > 0 or integrates, f"{effects.screen_filter}, {size}"),
+        Effect("compensation", effects.screen_filter in COMPENSATED, f"the screen filter is {effects.screen_filter}"),
         Effect("supersampling", n > 1, f"{n * n} sample{'s' if n > 1 else ''} a pixel"),
         Effect("covariances", given, "the model gives them" if given else "quaternions and scales suffice"),
     ]

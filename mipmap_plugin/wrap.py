@@ -22,6 +22,7 @@ from mipmap_plugin.adaptation.resume import load_run, save_run
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.backends import choose_backend, supersample
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
+from mipmap_plugin.backends.filters import USUAL_EPS2D
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig, Recipe
 from mipmap_plugin.config import recipe as make_config
@@ -29,7 +30,7 @@ from mipmap_plugin.effects import DILATION, Effects, explain
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import write_json
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import SplatModel, TrainedScale
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import model_cameras
 
@@ -62,9 +63,9 @@ class Adapted:
 class Wrapped:
     """A frozen base model with its cameras, ready to be adapted to any scale."""
 
-    def __init__(self, model: SplatModel, cameras: Sequence[Camera], backend: str, background: tuple[float, float, float] | None) -> None:
-        self.model, self.cameras, self._backend = model, list(cameras), backend
-        self.background = background or model.trained.background or (0.0, 0.0, 0.0)
+    def __init__(self, model: SplatModel, cameras: Sequence[Camera], backend: str, trained: TrainedScale) -> None:
+        self.model, self.cameras, self._backend, self.trained = model, list(cameras), backend, trained
+        self.background = trained.background or (0.0, 0.0, 0.0)
 
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1) -> Effects:
         """How this model is rendered at `scale`.
@@ -72,12 +73,12 @@ class Wrapped:
         `screen_filter`: None for what it was trained with, a filter's name, or "scaled" for the training-free filter
         whose dilation keeps its size in the world.
         """
-        trained = self.model.trained
+        trained = self.trained
         degree = self.model.gaussians(self.any_camera()).used_sh_degree()
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
-        return Effects(degree, screen_filter, DILATION, self.background, supersampling, trained.near_plane)
+        return Effects(degree, screen_filter, USUAL_EPS2D.get(screen_filter, DILATION), self.background, supersampling, trained.near_plane)
 
     def backend(self, *, gradients: bool = False, screen_filter: str | None = None) -> tuple[Backend, str]:
         """The backend that serves this model, and why it was taken."""
@@ -124,12 +125,22 @@ def wrap_model(
     cameras: Sequence[Camera] | None = None,
     backend: str = "auto",
     background: tuple[float, float, float] | None = None,
+    screen_filter: str | None = None,
 ) -> Wrapped:
-    """Wrap a loaded model, or the checkpoint at a path. `cameras`: views of the scale it was trained at; by default those
-    beside the checkpoint. `background`: linear RGB; by default what the checkpoint says, else black."""
+    """Wrap a loaded model, or the checkpoint at a path.
+
+    `cameras`: views of the scale it was trained at; by default those beside the checkpoint. `background`: linear RGB; by
+    default what the checkpoint says, else black. `screen_filter`: what it was trained with, where its files do not say
+    ("classic", "antialiased", "mip", "analytic"). Raises CheckpointError, and SettingsError for an unknown filter.
+    """
     if isinstance(model, (str, Path)):
         model = load_model(model)
-    return Wrapped(model, own_cameras(model) if cameras is None else cameras, backend, background)
+    trained = replace(model.trained, background=background or model.trained.background)
+    if screen_filter is not None:
+        if screen_filter not in USUAL_EPS2D:
+            raise SettingsError(f"there is no screen filter {screen_filter!r}; known are {', '.join(USUAL_EPS2D)}")
+        trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
+    return Wrapped(model, own_cameras(model) if cameras is None else cameras, backend, trained)
 
 
 def own_cameras(model: SplatModel) -> list[Camera]:
@@ -144,7 +155,7 @@ class _Adaptation:
         self.base, self.scale, self.config = wrapped.model, scale, config
         self.backend, self.why = wrapped.backend(gradients=config.steps > 0)
         self.trained = wrapped.effects()
-        self.effects = replace(self.trained, screen_filter="classic", eps2d=DILATION)
+        self.effects = self.trained if wrapped.trained.keeps_filter else replace(self.trained, screen_filter="classic", eps2d=DILATION)
         self.views, self.which = choose_views(cameras, self.base.gaussians(wrapped.any_camera()).detach(), config)
         if getattr(self.base, "moves", False):
             self.views, when = with_times(self.views, config.seed)
@@ -177,7 +188,7 @@ class _Adaptation:
     @torch.no_grad()
     def _start_closed_form(self, student: SplatModel) -> None:
         began = time.perf_counter()
-        student.reshape(lambda gaussians: closed_form(gaussians, self.views, self.scale, self.trained), self.views)
+        student.reshape(lambda gaussians: closed_form(gaussians, self.views, self.scale, self.trained, self.effects), self.views)
         self.seconds["closed form"] = time.perf_counter() - began
 
     def _render(self, model: SplatModel, camera: Camera) -> Tensor:
@@ -203,7 +214,7 @@ class _Adaptation:
             settings=self.config,
             backend=self.why,
             views=self.which,
-            filters=f"pseudo truth {truth}; base {self.trained.screen_filter} {self.trained.eps2d:g} px²; file classic {DILATION:g} px²",
+            filters=f"pseudo truth {truth}; base {_filter(self.trained)}; file {_filter(self.effects)}",
             effects=[f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(self.effects, before)],
             gaussians_before=len(before),
             gaussians_after=len(student.gaussians(self.views[0])),
@@ -212,6 +223,10 @@ class _Adaptation:
             curve=curve,
             versions=versions(),
         )
+
+
+def _filter(effects: Effects) -> str:
+    return f"{effects.screen_filter} {effects.eps2d:g} px²"
 
 
 def _digest(model: SplatModel) -> str:

@@ -30,8 +30,8 @@ def show(gaussians: Gaussians, scale: float, eps2d: float = DILATION, screen_fil
     return BACKEND.render(gaussians, VIEW.zoomed(scale), Effects(0, screen_filter, eps2d)).image
 
 
-def adapted(gaussians: Gaussians, scale: float, effects: Effects = Effects(0)) -> Gaussians:  # noqa: B008
-    scales, opacities = closed_form(gaussians, [VIEW], scale, effects)
+def adapted(gaussians: Gaussians, scale: float, base: Effects = Effects(0), target: Effects = Effects(0)) -> Gaussians:  # noqa: B008
+    scales, opacities = closed_form(gaussians, [VIEW], scale, base, target)
     return replace(gaussians, scales=scales, opacities=opacities)
 
 
@@ -45,7 +45,7 @@ def test_zoom_in_equals_the_scaled_filter(scale, size):
 def test_zoom_in_keeps_the_compensation_that_the_base_was_trained_with():
     splat = disc(1.0, 0.4)
     trained = Effects(0, "antialiased")
-    new = adapted(splat, 4, effects=trained)
+    new = adapted(splat, 4, base=trained)
     torch.testing.assert_close(show(new, 4), show(splat, 4, DILATION * 16, "antialiased"), atol=1e-6, rtol=0)
 
 
@@ -79,7 +79,7 @@ def test_hostile_splats_stay_finite(scale):
 @pytest.mark.parametrize("scale", [1 / 4, 4])
 def test_views_that_see_nothing_give_finite_splats(scale):
     away = VIEW.looking_from(torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])), "away")
-    scales, opacities = closed_form(disc(1.0, 1.0), [away], scale, Effects(0))
+    scales, opacities = closed_form(disc(1.0, 1.0), [away], scale, Effects(0), Effects(0))
     assert scales.isfinite().all() and opacities.isfinite().all()
 
 
@@ -101,3 +101,27 @@ def test_a_pixel_is_that_of_the_closest_view_that_sees_the_splat():
     closer = VIEW.looking_from(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]]), "closer")
     means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [30.0, 0.0, 4.0]])  # both see it; only the first does; none does
     torch.testing.assert_close(pixel_size(means, [VIEW, closer]), torch.tensor([2.0, 1.0, 2.0]) / FOCAL)
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize(("drawn", "eps2d"), [("classic", 0.3), ("mip", 0.1)])
+def test_zoom_in_of_a_mip_base_equals_its_scaled_filter_in_either_file(scale, drawn, eps2d):
+    splat = disc(1.0, 0.4)
+    new = adapted(splat, scale, Effects(0, "mip", 0.1), Effects(0, drawn, eps2d))
+    if drawn == "classic":  # 0.3 target px² is more than 0.1 base px² at x2, but not more than the splat and that together
+        assert (new.scales[:, :2] > 0.1 * PIXEL).all()
+    torch.testing.assert_close(show(new, scale, eps2d, drawn), show(splat, scale, 0.1 * scale**2, "mip"), atol=1e-6, rtol=0)
+
+
+def test_a_filter_that_keeps_light_needs_nothing_at_zoom_out():
+    splat, mip = disc(0.3, 0.05), Effects(0, "mip", 0.1)
+    new = adapted(splat, 1 / 8, mip, mip)
+    assert torch.equal(new.scales, splat.scales) and torch.equal(new.opacities, splat.opacities)
+
+
+def test_zoom_in_of_an_analytic_base_is_its_picture_made_larger():
+    splat, analytic = disc(1.5, 0.8), Effects(0, "analytic", 0.0)
+    small = show(splat, 1, 0.0, "analytic")
+    large = show(adapted(splat, 3, analytic, analytic), 3, 0.0, "analytic")
+    torch.testing.assert_close(large[1::3, 1::3], small, atol=5e-3, rtol=0)  # the same points; a square against a Gaussian of its variance
+    assert (show(splat, 3, 0.0, "analytic")[1::3, 1::3] - small).abs().max() > 0.02

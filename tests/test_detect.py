@@ -252,7 +252,6 @@ def test_real_companions_are_named(shared_data):
     for path, sentence in {
         "octree_mlps/color_mlp.pt": "TorchScript",
         "deform/deform.pth": "deformation network",
-        "filter3d_2000": "Mip-Splatting checkpoint",
         "lod_tiles": "4 PLY files",
         "yashica-t4/yashica-t4-top8192.spz": "SPZ",
         "yashica-t4/yashica-t4-top8192.sog": "SOG",

@@ -1,13 +1,16 @@
-"""The start that needs no optimisation: what a classic renderer's fixed dilation does wrong at another scale, solved for.
+"""The start that needs no optimisation: what a screen filter of fixed size in pixels does wrong at another scale, solved for.
 
-A checkpoint trained with a dilation of e px² shows Σ + e·ρ², where ρ is the size of a base pixel at the splat's distance, in
-world units. At scale s a pixel measures ρ/s, and a classic renderer adds e·(ρ/s)² instead. So the splat itself has to become
+A checkpoint trained with a filter of e px² shows Σ + e·ρ², where ρ is the size of a base pixel at the splat's distance, in
+world units. At scale s a pixel measures ρ/s, and the filter of the adapted file, of e' px², adds e'·(ρ/s)² instead. So the splat
+itself has to become
 
-    Σ' = Σ + e·ρ² - e·(ρ/s)².
+    Σ' = Σ + e·ρ² - e'·(ρ/s)².
 
 Zoom-in (s > 1) widens. Zoom-out narrows, and an axis cannot become narrower than nothing: what is left too wide is paid for in
-opacity. The distance is that of the closest view, which saw the finest detail that training could hold (as the 3D filter of
-Mip-Splatting argues); the mean distance costs 0.3 to 0.7 dB at zoom-in on lego and the demo scene.
+opacity. A file whose own filter keeps each splat's light needs nothing at zoom-out: that filter does it, view by view.
+
+The distance is that of the closest view, which saw the finest detail that training could hold (as the 3D filter of Mip-Splatting
+argues); the mean distance costs 0.3 to 0.7 dB at zoom-in on lego and the demo scene.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.filters import footprint
+from mipmap_plugin.backends.filters import footprint, keeps_light, widening
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -35,22 +38,25 @@ AREA_POWER = 1.25
 ENOUGH_VIEWS = 12
 
 
-def closed_form(gaussians: Gaussians, views: Sequence[Camera], scale: float, effects: Effects) -> tuple[Tensor, Tensor]:
-    """Scales [N, 3] and opacities [N] that look right at `scale` in a classic renderer.
+def closed_form(gaussians: Gaussians, views: Sequence[Camera], scale: float, base: Effects, target: Effects) -> tuple[Tensor, Tensor]:
+    """Scales [N, 3] and opacities [N] that look right at `scale`.
 
-    `views` are cameras of the base scale, `effects` is how the base was trained.
+    `views` are cameras of the base scale, `base` is how the base was trained, `target` how the result is rendered.
     """
+    if scale <= 1 and keeps_light(target.screen_filter):
+        return gaussians.scales, gaussians.opacities
     views = views[:: -(-len(views) // ENOUGH_VIEWS)]
     base_pixel = pixel_size(gaussians.means, views)
     target_pixel = base_pixel / scale
-    change = effects.eps2d * (base_pixel**2 - target_pixel**2)
+    change = _width(base) * base_pixel**2 - _width(target) * target_pixel**2
     thinnest = (THINNEST * target_pixel)[:, None]
     scales = (gaussians.scales.square() + change[:, None]).clamp_min(0).sqrt().maximum(thinnest)
-    opacities = gaussians.opacities * _compensation(gaussians, views, effects)
-    if scale > 1:
-        return scales, opacities
-    kept = _area_ratio(gaussians, replace(gaussians, scales=scales), views, scale, effects)
-    return scales, opacities * kept**AREA_POWER
+    new = replace(gaussians, scales=scales)
+    opacities = gaussians.opacities * _light(gaussians, views, base)
+    if scale <= 1:
+        opacities = opacities * _area_ratio(gaussians, new, views, scale, (base, target)) ** AREA_POWER
+    # What the target's renderer takes off by itself is added before.
+    return scales, (opacities / _light(new, [view.zoomed(scale) for view in views], target)).clamp_max(1)
 
 
 def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
@@ -67,22 +73,30 @@ def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
     return torch.where(finest.isfinite(), finest, anywhere)
 
 
-def _compensation(gaussians: Gaussians, views: Sequence[Camera], effects: Effects) -> Tensor | float:
-    """[N], at most 1: the share of its opacity that the base shows of a splat, which a classic renderer would not take off."""
-    if effects.screen_filter != "antialiased":
+def _width(effects: Effects) -> float:
+    """px²: the variance that the screen filter adds."""
+    return widening(effects.screen_filter, effects.eps2d)
+
+
+def _light(gaussians: Gaussians, views: Sequence[Camera], effects: Effects) -> Tensor | float:
+    """[N], at most 1: the share of its opacity that the screen filter leaves to a splat."""
+    if not keeps_light(effects.screen_filter):
         return 1.0
+    # An integral over the pixel dims as a Gaussian of the pixel's variance does.
+    name = "mip" if effects.screen_filter == "analytic" else effects.screen_filter
     ones = torch.ones_like(gaussians.opacities)
-    return _mean_in_front(gaussians, views, effects.near_plane, lambda _, shown: footprint(shown, ones, "antialiased", effects.eps2d).opacities)
+    return _mean_in_front(gaussians, views, effects.near_plane, lambda _, shown: footprint(shown, ones, name, _width(effects)).opacities)
 
 
-def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: float, effects: Effects) -> Tensor:
-    """[N], at most 1: the area that the target shows of a splat over the area that a classic renderer will draw."""
+def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: float, effects: tuple[Effects, Effects]) -> Tensor:
+    """[N], at most 1: the area that the base shows of a splat over the area that the target will draw; `effects` of both."""
+    base, target = effects
 
     def ratio(camera: Camera, shown: Projected) -> Tensor:
-        drawn = project(new, camera, effects.near_plane)
-        return (_det(shown, effects.eps2d * scale**2) / _det(drawn, effects.eps2d)).sqrt().clamp_max(1)
+        drawn = project(new, camera, target.near_plane)
+        return (_det(shown, _width(base) * scale**2) / _det(drawn, _width(target))).sqrt().clamp_max(1)
 
-    return _mean_in_front(old, [view.zoomed(scale) for view in views], effects.near_plane, ratio)
+    return _mean_in_front(old, [view.zoomed(scale) for view in views], base.near_plane, ratio)
 
 
 def _mean_in_front(gaussians: Gaussians, views: Sequence[Camera], near: float, of: Callable[[Camera, Projected], Tensor]) -> Tensor:

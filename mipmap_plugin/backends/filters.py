@@ -23,6 +23,20 @@ USUAL_EPS2D = {"classic": DILATION, "antialiased": DILATION, "mip": 0.1, "analyt
 SCREEN_FILTERS = frozenset(USUAL_EPS2D)
 
 
+# px², the variance of a square of one pixel.
+SQUARE_VARIANCE = 1 / 12
+
+
+def widening(screen_filter: str, eps2d: float) -> float:
+    """px²: the variance that a filter adds to a splat, along every direction."""
+    return SQUARE_VARIANCE if screen_filter == "analytic" else eps2d
+
+
+def keeps_light(screen_filter: str) -> bool:
+    """Whether a filter that widens a splat dims it too, so that its light stays what it was."""
+    return screen_filter != "classic"
+
+
 @dataclass(frozen=True, eq=False)
 class Footprint:
     """A splat as the pixels see it: alpha = opacity · exp(-q/2) with q = dy²/yy + (dx - shear·dy)²/across.
@@ -68,6 +82,6 @@ def footprint(projected: Projected, opacities: Tensor, screen_filter: str, eps2d
         return pixel_integral(projected, opacities)
     xx, yy = projected.xx + eps2d, projected.yy + eps2d
     det = projected.det + eps2d * (projected.xx + projected.yy) + eps2d**2  # = xx·yy - xy² without its cancellation
-    if screen_filter != "classic":
+    if keeps_light(screen_filter):
         opacities = opacities * (projected.det / det).clamp_min(LEAST_LIGHT[screen_filter] ** 2).sqrt()
     return Footprint(yy, projected.xy / yy, det / yy, xx, opacities)

@@ -17,10 +17,11 @@ MODELS = Registry(
     "mipmap_plugin.models",
     {
         "3dgs": "mipmap_plugin.models.vanilla:load_vanilla",
-        "gsplat": "mipmap_plugin.models.gsplat:load_gsplat",
-        "splatfacto": "mipmap_plugin.models.splatfacto:load_splatfacto",
+        **dict.fromkeys(("mip", "gof", "analytic"), "mipmap_plugin.models.mip:load_mip"),
         "deformable": "mipmap_plugin.models.deformable:load_deformable",
         "4dgs": "mipmap_plugin.models.hexplane:load_hexplane",
+        "gsplat": "mipmap_plugin.models.gsplat:load_gsplat",
+        "splatfacto": "mipmap_plugin.models.splatfacto:load_splatfacto",
     },
 )
 

@@ -14,7 +14,6 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, NEAR_PLANE
 from mipmap_plugin.gaussians import Gaussians
 
-
 # The name, among a model's parameters, of columns that go with their rows when rows are removed, and that never move: an anchor's
 # level, for example.
 CARRIED = "carried"
@@ -29,6 +28,7 @@ class TrainedScale:
     resolution: float = -1  # INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px
     background: tuple[float, float, float] | None = None  # linear RGB; None: the checkpoint does not say
     near_plane: float = NEAR_PLANE  # world units
+    keeps_filter: bool = False  # an adapted file is for its own project, and keeps this filter; else it is classic, for any viewer
 
 
 class SplatModel(Protocol):

@@ -12,7 +12,7 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.cfg_args import read_cfg_args
 from mipmap_plugin.models.magic import kind_of, names_in_torch_file
 from mipmap_plugin.models.ply import Header, read_header
-from mipmap_plugin.models.tags import render_mode
+from mipmap_plugin.models.tags import provenance_of, render_mode
 
 # Every family that is recognized, loaded or not, by the name that `register_model` takes.
 FAMILIES = {
@@ -107,7 +107,7 @@ def _family(path: Path, header: Header, folder: Path | None) -> str:
         if column in names:
             return family
     if "filter_3D" in names:
-        return _family_of_filter_3d(folder)
+        return _family_of_filter_3d(folder, (provenance_of(header.comments) or {}).get("family"))
     if ({"scale_0", "scale_1", "rot_0"} <= names and "scale_2" not in names) or render_mode(header.comments) == "2dgs":
         return "2dgs"
     if not {"opacity", "scale_0", "rot_0"} <= names:
@@ -143,8 +143,11 @@ def _family_of_network(ply: Path, family: str) -> str:
     return "sc-gs" if family == "deformable" and "nodes" in names_in_torch_file(network, ("nodes",)) else family
 
 
-def _family_of_filter_3d(folder: Path | None) -> str:
+def _family_of_filter_3d(folder: Path | None, told: str | None) -> str:
+    """By the options that each saves; a bare file that was written here tells its family."""
     options: dict[str, Any] = read_cfg_args(folder / "cfg_args") if folder and (folder / "cfg_args").is_file() else {}
+    if not options and told in {"mip", "gof", "analytic"}:
+        return told
     if "use_decoupled_appearance" in options:
         return "gof"
     return "analytic" if "load_allres" in options and "kernel_size" not in options else "mip"

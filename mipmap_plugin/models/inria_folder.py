@@ -35,11 +35,23 @@ def trained_scale(options: dict[str, Any], screen_filter: str | None) -> Trained
     resolution, white = options.get("resolution"), options.get("white_background")
     if not isinstance(resolution, (int, float)) or isinstance(resolution, bool):
         resolution = TrainedScale.resolution
+    screen_filter, eps2d = _screen_filter(options, screen_filter)
     return TrainedScale(
-        screen_filter=screen_filter or TrainedScale.screen_filter,
+        screen_filter=screen_filter,
+        eps2d=eps2d,
         resolution=resolution,
         background=(float(white),) * 3 if isinstance(white, bool) else None,
     )
+
+
+def _screen_filter(options: dict[str, Any], tag: str | None) -> tuple[str, float]:
+    """Mip-Splatting and what follows it save their kernel_size; Analytic-Splatting has its multi-scale option without one."""
+    kernel_size = options.get("kernel_size")
+    if tag != "classic" and isinstance(kernel_size, (int, float)) and not isinstance(kernel_size, bool):
+        return "mip", float(kernel_size)
+    if tag is None and "load_allres" in options and kernel_size is None:
+        return "analytic", 0.0
+    return tag or TrainedScale.screen_filter, TrainedScale.eps2d
 
 
 def companion_notes(folder: Path | None, options: dict[str, Any], sh_degree: int) -> list[str]:

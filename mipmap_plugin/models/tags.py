@@ -28,8 +28,9 @@ def render_mode(comments: Iterable[str]) -> str | None:
 def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any]) -> list[str]:
     """Foreign comments, then our own two lines in place of any older ones."""
     foreign = [text for text in comments if not _tag(text) and not text.startswith(PROVENANCE + " {")]
-    mode = "mip" if screen_filter == "antialiased" else "default"
-    return [*foreign, f"SplatRenderMode: {mode}", f"{PROVENANCE} {json.dumps(provenance, default=str)}"]
+    mode = {"classic": "default", "antialiased": "mip", "mip": "mip"}.get(screen_filter)  # no tag stands for any other
+    tags = [f"SplatRenderMode: {mode}"] if mode else []
+    return [*foreign, *tags, f"{PROVENANCE} {json.dumps(provenance, default=str)}"]
 
 
 def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:

@@ -31,6 +31,9 @@ MIN_SCALE = 1e-18
 # An opacity is kept this far from 0 and 1, where its logit is infinite: a thousandth of what 8 bits show, and exact in float32.
 OPACITY_MARGIN = 1e-6
 
+# A fused file of Mip-Splatting has the columns of 3DGS; only its usual name tells it apart.
+FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting trained it, say so, for it looks right with the screen filter mip only"
+
 
 @dataclass(frozen=True, eq=False)
 class Origin:
@@ -83,6 +86,15 @@ class VanillaModel:
 
     def __len__(self) -> int:
         return len(self._parameters["means"])
+
+    @property
+    def extras(self) -> dict[str, np.ndarray]:
+        """The columns [N] of its file that 3DGS does not know."""
+        return dict(self._origin.extras)
+
+    def with_extras(self, extras: dict[str, np.ndarray]) -> VanillaModel:
+        """The same splats, over the same tensors, with these columns [N] behind those of 3DGS."""
+        return self._with(self._parameters, replace(self._origin, extras=extras))
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated: exp, sigmoid, unit quaternions. `camera` is not looked at."""
@@ -193,6 +205,8 @@ def read_vanilla(found: Checkpoint) -> VanillaModel:
         model.notes.append(f"the header says that the splats were trained {screen_filter}, so they are rendered so")
     if extras:
         model.notes.append(f"extra columns are carried along: {', '.join(extras)}")
+    if "fused" in found.path.stem and model.trained.screen_filter == "classic" and screen_filter is None:
+        model.notes.append(FUSED)
     return without_poison(model)
 
 

@@ -1,0 +1,186 @@
+"""Families whose PLY has a column `filter_3D`: Mip-Splatting, Gaussian Opacity Fields and Analytic-Splatting.
+
+Everything else is stored as 3DGS does. The 3D filter keeps a splat from being thinner than what the training cameras resolved.
+It stays with its row: scales and opacities were fitted with it, so that another value would change the image. It has to be
+recomputed (`MipModel.refilter`) only for the original project to go on training after centers moved, and that project does so itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import NEAR_PLANE
+from mipmap_plugin.errors import CheckpointError, ShapeError
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import CARRIED, TrainedScale
+from mipmap_plugin.models.detect import detect, not_loaded
+from mipmap_plugin.models.health import drop
+from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+
+COLUMN = "filter_3D"
+
+# How each family renders: the screen filter, and the dilation in px² where no cfg_args tells the kernel_size.
+SCREEN_FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
+
+NOTES = {
+    "mip": [],
+    "gof": ["Gaussian Opacity Fields evaluates splats along rays in 3D; here they are projected first (EWA), which is close but not the same"],
+    "analytic": [f"{COLUMN} is kept but not applied: Analytic-Splatting uses it only with its flag --filter3d, which no file records"],
+}
+
+# Mip-Splatting's compute_3D_filter: the variance in px² at the finest sampling, and how far beyond the image's edge a center may lie.
+FILTER_VARIANCE = 0.2
+FRAME_MARGIN = 0.15  # of the width and the height
+
+# No splat can be thinner than its filter; one that should be keeps this share of it, for a logarithm has to be finite.
+THINNEST_SHARE = 0.1
+
+
+class MipModel:
+    """Splats of 3DGS, each smoothed by its own 3D filter.
+
+    Parameters: those of `VanillaModel`, and the filters [N] in world units, which are carried along with their rows and never move.
+    """
+
+    def __init__(self, family: str, splats: VanillaModel, filter_3d: Tensor) -> None:
+        """Take the tensors as they are. Raises ShapeError."""
+        if filter_3d.shape != (len(splats),):
+            raise ShapeError(f"{COLUMN}: expected shape [{len(splats)}], got {list(filter_3d.shape)}")
+        self.family, self.splats, self.filter_3d = family, splats, filter_3d
+        self.source, self.folder, self.digest, self.notes = splats.source, splats.folder, splats.digest, splats.notes
+
+    @property
+    def trained(self) -> TrainedScale:
+        return self.splats.trained
+
+    @trained.setter
+    def trained(self, trained: TrainedScale) -> None:
+        self.splats.trained = trained
+
+    def __len__(self) -> int:
+        return len(self.splats)
+
+    def gaussians(self, camera: Camera | None = None) -> Gaussians:
+        """All splats, activated and smoothed. `camera` is not looked at."""
+        raw = self.splats.gaussians(camera)
+        if not self._smooths:
+            return raw
+        scales, opacities = smooth_3d(raw.scales, raw.opacities, self.filter_3d.detach())
+        return replace(raw, scales=scales, opacities=opacities)
+
+    def parameters(self) -> dict[str, Tensor]:
+        return {**self.splats.parameters(), CARRIED: self.filter_3d}
+
+    def shared_parameters(self) -> dict[str, Tensor]:
+        """None: every parameter belongs to a splat."""
+        return {}
+
+    def copy(self) -> MipModel:
+        return MipModel(self.family, self.splats.copy(), self.filter_3d.detach().clone().requires_grad_())
+
+    def to(self, device: torch.device | str) -> MipModel:
+        return MipModel(self.family, self.splats.to(device), self.filter_3d.detach().to(device, copy=True))
+
+    def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
+        self.splats.replace_parameters({name: tensor for name, tensor in parameters.items() if name != CARRIED})
+        self.filter_3d = parameters[CARRIED]
+
+    def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
+        """Give the smoothed splats the scales [N, 3] and opacities [N] that `form` finds, as far as the filter allows."""
+        scales, opacities = form(self.gaussians().detach())
+        if self._smooths:
+            scales, opacities = sharpen_3d(scales, opacities, self.filter_3d.detach())
+        self.splats.reshape(lambda _: (scales, opacities))
+
+    def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
+        return self.gaussians().opacities.detach()
+
+    @torch.no_grad()
+    def refilter(self, cameras: Sequence[Camera]) -> None:
+        """Recompute the 3D filter from the training cameras, and the raw scales and opacities so that the splats look as before."""
+        shown = self.gaussians()
+        self.filter_3d.copy_(filter_3d_of(shown.means, cameras))
+        self.reshape(lambda _: (shown.scales, shown.opacities))
+
+    def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
+        """Write a PLY or a model folder as `VanillaModel.save` does, with filter_3D as the last column. Raises OutputExists."""
+        filter_3d = self.filter_3d.detach().to("cpu", torch.float32).numpy()
+        told = {**provenance, "family": self.family, "kernel_size": self.trained.eps2d}  # a bare PLY has no cfg_args
+        return self.splats.with_extras({**self.splats.extras, COLUMN: filter_3d}).save(path, provenance=told, overwrite=overwrite)
+
+    @property
+    def _smooths(self) -> bool:
+        return self.family != "analytic"
+
+
+def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
+    """Load a PLY with `filter_3D`, or the model folder around one. Splats that are not finite are dropped, with a note.
+
+    Raises CheckpointError for what is damaged, of another family, or no checkpoint.
+    """
+    found = detect(path, iteration=iteration)
+    if found.family not in SCREEN_FILTERS:
+        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
+    splats = read_vanilla(found)
+    unsound = torch.from_numpy(~(splats.extras[COLUMN] >= 0) | (splats.extras[COLUMN] == torch.inf))
+    if unsound.all():
+        raise CheckpointError(f"{found.path}: none of its {len(splats):,} splats has a {COLUMN} that is a length; export it again")
+    if unsound.any():
+        splats = drop(splats, unsound)
+        splats.notes.append(f"these had a {COLUMN} that is no length")
+    filter_3d = torch.from_numpy(splats.extras[COLUMN]).float()
+    splats = splats.with_extras({name: column for name, column in splats.extras.items() if name != COLUMN})
+    splats.trained = _trained(found.family, splats.trained)
+    splats.notes += NOTES[found.family]
+    return MipModel(found.family, splats, filter_3d)
+
+
+def smooth_3d(scales: Tensor, opacities: Tensor, filter_3d: Tensor) -> tuple[Tensor, Tensor]:
+    """Scales [N, 3] and opacities [N] after the 3D filter [N] of Mip-Splatting: every splat convolved with a ball, its mass kept.
+
+    s' = sqrt(s² + f²) and o' = o · Π s / s'; a product of ratios, since Πs² / Πs'² under- and overflows.
+    """
+    scales = scales.clamp_min(torch.finfo(scales.dtype).tiny)  # the root of 0² + 0² has no gradient
+    smoothed = torch.hypot(scales, filter_3d[:, None])
+    return smoothed, opacities * (scales / smoothed).prod(dim=1)
+
+
+def sharpen_3d(scales: Tensor, opacities: Tensor, filter_3d: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse of `smooth_3d`, as near as scales above the filter and opacities up to 1 allow."""
+    ball = filter_3d[:, None]
+    sharp = ((scales - ball).clamp_min(0) * (scales + ball)).sqrt().maximum(THINNEST_SHARE * ball)
+    light = smooth_3d(sharp, torch.ones_like(opacities), filter_3d)[1]
+    return sharp, (opacities / light).clamp_max(1)
+
+
+def filter_3d_of(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """[N] world units, the filter that Mip-Splatting gives to splats at `means` [N, 3] for its training `cameras` (compute_3D_filter).
+
+    z/f·sqrt(0.2) with z the least depth among the cameras that see a center, and f the longest focal length of all cameras;
+    a center that none sees takes the largest z. Raises CheckpointError without a camera that sees one.
+    """
+    nearest = torch.full_like(means[:, 0], torch.inf)
+    for camera in cameras:
+        viewmat = camera.viewmat.to(means)
+        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
+        across, down = (camera.fx * x / z + camera.cx) / camera.width, (camera.fy * y / z + camera.cy) / camera.height
+        inside = (torch.stack([across, down]) - 0.5).abs().amax(0) <= 0.5 + FRAME_MARGIN
+        nearest = torch.where((z > NEAR_PLANE) & inside, torch.minimum(nearest, z), nearest)
+    seen = nearest.isfinite()
+    if not seen.any():
+        raise CheckpointError("no training camera sees a splat, so that there is no 3D filter for them; give the cameras that it was trained with")
+    return torch.where(seen, nearest, nearest[seen].max()) / max(camera.fx for camera in cameras) * FILTER_VARIANCE**0.5
+
+
+def _trained(family: str, told: TrainedScale) -> TrainedScale:
+    """The family's filter. Only its own project renders it right, so an adapted file keeps it."""
+    screen_filter, eps2d = SCREEN_FILTERS[family]
+    eps2d = told.eps2d if told.screen_filter == screen_filter else eps2d
+    return replace(told, screen_filter=screen_filter, eps2d=eps2d, keeps_filter=True)

@@ -1,0 +1,221 @@
+"""The families with a `filter_3D` column: against FORMATS.md's formulas, there and back, and adapted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import ply_files
+import pytest
+import tiny
+import torch
+from oracle import brute_force
+
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.base import CARRIED, TrainedScale
+from mipmap_plugin.models.mip import MipModel, filter_3d_of, sharpen_3d, smooth_3d
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.wrap import wrap_model
+
+MIP = "kernel_size=0.1, ray_jitter=False, resample_gt_image=False, load_allres=False, sample_more_highres=False"
+OPTIONS = {"mip": MIP, "gof": "kernel_size=0.0, use_decoupled_appearance=False", "analytic": "load_allres=False, sample_more_highres=False"}
+FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
+
+
+def splats(count: int = 40, bands: int = 3) -> dict[str, np.ndarray]:
+    """Raw columns of a ball of small splats around the origin, the 3D filter of each last."""
+    random = np.random.default_rng(3)
+    columns = ply_files.splat_columns(count, bands)
+    for name in ("scale_0", "scale_1", "scale_2"):
+        columns[name] = random.uniform(-5, -2, count).astype(np.float32)
+    for name in ("x", "y", "z"):
+        columns[name] = (0.5 * columns[name]).astype(np.float32)
+    return {**columns, "filter_3D": random.uniform(0.01, 0.1, count).astype(np.float32)}
+
+
+def folder(path: Path, family: str = "mip", columns: dict[str, np.ndarray] | None = None) -> Path:
+    """A model folder as the family's project leaves it."""
+    ply = path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    ply.parent.mkdir(parents=True)
+    ply_files.write(ply, splats() if columns is None else columns)
+    (path / "cfg_args").write_text(f"Namespace(sh_degree=1, resolution=1, white_background=False, {OPTIONS[family]})")
+    return path
+
+
+def by_formats_md(columns: dict[str, np.ndarray], smooth: bool = True) -> Gaussians:
+    """FORMATS.md 1.2 and 6.2 in float64."""
+    wide = {name: torch.from_numpy(column.astype(np.float64)) for name, column in columns.items()}
+    pick = lambda *names: torch.stack([wide[name] for name in names], -1)  # noqa: E731
+    s, f = pick("scale_0", "scale_1", "scale_2").exp(), wide["filter_3D"] if smooth else torch.zeros_like(wide["x"])
+    larger = s**2 + f[:, None] ** 2
+    opacities = torch.sigmoid(wide["opacity"]) * (s.square().prod(1) / larger.prod(1)).sqrt()
+    bands = [pick(*(f"f_rest_{c * 3 + j}" for c in range(3))) for j in range(3)]
+    sh = torch.stack([pick("f_dc_0", "f_dc_1", "f_dc_2"), *bands], 1)
+    return Gaussians(pick("x", "y", "z"), pick("rot_0", "rot_1", "rot_2", "rot_3"), larger.sqrt(), opacities, sh)
+
+
+def ball(family: str = "mip", count: int = 60) -> MipModel:
+    """The tiny scene, half of whose splats are thinner than their filter."""
+    screen_filter, eps2d = FILTERS[family]
+    base = tiny.gaussians(count)
+    trained = TrainedScale(screen_filter, eps2d, keeps_filter=True)
+    return MipModel(family, VanillaModel.from_gaussians(base, trained), base.scales.min(1).values.clamp(0.02, 0.04))
+
+
+def test_t4_smoothing():
+    scales = torch.tensor([[0.2, 0.1, 0.05]], dtype=torch.float64)
+    smoothed, opacities = smooth_3d(scales, torch.sigmoid(scales.new_ones(1)), scales.new_tensor([0.03]))
+    torch.testing.assert_close(smoothed, scales.new_tensor([[0.202237484, 0.104403065, 0.058309519]]), atol=1e-9, rtol=0)
+    torch.testing.assert_close(opacities, scales.new_tensor([0.593796750]), atol=1e-9, rtol=0)
+
+
+def test_smoothing_has_a_finite_gradient_everywhere():
+    scales = torch.tensor([[0.0, 0.0, 0.0], [1e-30, 1e-30, 1e-30], [1e30, 1e-3, 1.0]], requires_grad=True)
+    for ball in (torch.zeros(3), torch.full((3,), 1e-3)):
+        smoothed, opacities = smooth_3d(scales, torch.ones(3), ball)
+        gradient = torch.autograd.grad(smoothed.sum() + opacities.sum(), scales)[0]
+        assert torch.isfinite(smoothed).all() and torch.isfinite(opacities).all() and torch.isfinite(gradient).all()
+
+
+def test_sharpening_undoes_smoothing():
+    rng = torch.Generator().manual_seed(0)
+    scales, opacities, ball = (torch.rand(50, *shape, generator=rng) / 5 for shape in ((3,), (), ()))
+    scales += 0.2 * ball[:, None]
+    back = sharpen_3d(*smooth_3d(scales, opacities, ball), ball)
+    torch.testing.assert_close(back[0], scales, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(back[1], opacities, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("family", FILTERS)
+def test_rendered_as_an_independent_sum_of_the_files_own_numbers(tmp_path, family):
+    model = load_model(folder(tmp_path / "model", family))
+    assert (model.family, (model.trained.screen_filter, model.trained.eps2d)) == (family, FILTERS[family])
+    view = tiny.cameras(1)[0]
+    image = wrap_model(model, cameras=[view], backend="reference").render(view).image
+    expected = brute_force(by_formats_md(splats(), family != "analytic"), view, FILTERS[family][1], screen_filter=FILTERS[family][0])[0]
+    assert expected.max() > 0.2
+    torch.testing.assert_close(image.double(), expected, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("family", FILTERS)
+@pytest.mark.parametrize("name", ["again", "again.ply"])
+def test_saved_and_loaded_again(tmp_path, family, name):
+    model = load_model(folder(tmp_path / "model", family))
+    saved = model.save(tmp_path / name, provenance={"scale": 1})
+    again = load_model(tmp_path / name)
+    assert (again.family, again.trained.screen_filter, again.trained.eps2d) == (family, *FILTERS[family])
+    for key, tensor in model.parameters().items():
+        assert torch.equal(again.parameters()[key], tensor), key
+    columns = list(read_ply(saved).columns)
+    assert columns == [*ply_files.splat_names(3), "filter_3D"]  # its reader counts f_rest, and asks for filter_3D
+    if name == "again":
+        assert (tmp_path / name / "cfg_args").read_text() == (tmp_path / "model" / "cfg_args").read_text()
+
+
+# At x4 the filter of GOF, of no size at any scale, leaves the closed form nothing to do.
+@pytest.mark.parametrize(("family", "scale", "least"), [*((family, 1 / 4, 1) for family in FILTERS), ("mip", 4, 3), ("analytic", 4, 3)])
+def test_adapted_in_its_own_filter_it_is_closer_to_the_resized_base(tmp_path, family, scale, least):
+    base = ball(family)
+    raw = {name: tensor.clone() for name, tensor in base.parameters().items()}
+    wrapped = wrap_model(base, cameras=tiny.cameras(), backend="reference")
+    adapted = wrapped.adapt(scale, steps=20 if scale < 1 else 0, extra_views=4)
+    assert quality(adapted, wrapped, scale) > quality(wrapped, wrapped, scale) + least
+    assert (adapted.effects.screen_filter, adapted.effects.eps2d) == FILTERS[family]
+    assert all(torch.equal(base.parameters()[name], tensor) for name, tensor in raw.items())
+    loaded = wrap_model(adapted.save(tmp_path / "adapted.ply"), cameras=[], backend="reference")
+    small = wrapped.cameras[0].zoomed(scale)
+    torch.testing.assert_close(loaded.render(small).image, adapted.render(small).image, atol=1e-5, rtol=0)
+
+
+def quality(shown, base, scale):
+    """dB against the base's own pictures, resized."""
+    pairs = [(shown.render(view.zoomed(scale)).image, base.render(view).image.clamp(0, 1)) for view in base.cameras]
+    return sum(psnr(image.clamp(0, 1), resize(truth, image.shape[:2], "pil-bicubic").clamp(0, 1)) for image, truth in pairs) / len(pairs)
+
+
+def test_the_filters_go_with_their_rows_and_do_not_move():
+    base = ball()
+    adapted = wrap_model(base, cameras=tiny.cameras(), backend="reference").adapt(0.25, steps=12, extra_views=0, prune_every=5, min_opacity=0.3)
+    left = adapted.model.parameters()[CARRIED].detach()
+    assert 0 < len(left) < len(base)
+    assert torch.isin(left, base.filter_3d).all() and len(left) == len(adapted.model.parameters()["means"])
+
+
+def test_recomputed_filters_are_those_of_the_format_and_change_no_image():
+    base, views = ball(), tiny.cameras(3)
+    with torch.no_grad():
+        base.splats.parameters()["means"].add_(0.05)
+    means = base.parameters()["means"].double()
+    nearest = [min((z for z in (seen_depth(mean, view) for view in views) if z), default=None) for mean in means]
+    known = [z for z in nearest if z]
+    expected = [(z or max(known)) / max(view.fx for view in views) * math.sqrt(0.2) for z in nearest]
+    torch.testing.assert_close(filter_3d_of(means, views), torch.tensor(expected, dtype=torch.float64), atol=1e-12, rtol=1e-9)
+    before = base.gaussians()
+    base.refilter(views)
+    torch.testing.assert_close(base.filter_3d.double(), torch.tensor(expected, dtype=torch.float64), atol=1e-6, rtol=0)
+    wide = (before.scales > base.filter_3d[:, None]).all(1)
+    assert wide.any()
+    torch.testing.assert_close(base.gaussians().scales[wide], before.scales[wide], rtol=1e-4, atol=1e-6)
+
+
+def seen_depth(mean, view):
+    """The depth of a point inside the image and 15 % around it, else None."""
+    x, y, z = (view.viewmat[:3, :3] @ mean + view.viewmat[:3, 3]).tolist()
+    u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+    w, h = view.width, view.height
+    return z if z > 0.2 and -0.15 * w <= u <= 1.15 * w and -0.15 * h <= v <= 1.15 * h else None
+
+
+def test_rows_whose_filter_is_no_length_are_dropped(tmp_path):
+    columns = splats()
+    columns["filter_3D"][[3, 7, 9]] = np.nan, np.inf, -1
+    model = load_model(folder(tmp_path / "model", columns=columns))
+    assert len(model) == 37 and any("3 of 40 splats were dropped" in note for note in model.notes)
+    columns["filter_3D"][:] = np.nan
+    with pytest.raises(CheckpointError, match="none of its 40 splats"):
+        load_model(folder(tmp_path / "broken", columns=columns))
+
+
+def test_filters_that_no_camera_sees_are_refused():
+    with pytest.raises(CheckpointError, match="no training camera"):
+        ball().refilter([])
+
+
+def test_a_fused_file_is_told_apart(tmp_path):
+    """It has the columns of 3DGS: known by the options around it, or by what the user says; adapted, it is for any viewer."""
+    plain = {name: column for name, column in splats().items() if name != "filter_3D"}
+    inside = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras())
+    assert inside.model.family == "3dgs" and (inside.effects().screen_filter, inside.effects().eps2d) == ("mip", 0.1)
+    bare = load_model(ply_files.write(tmp_path / "fused.ply", plain))
+    assert bare.trained.screen_filter == "classic" and any("fused" in note for note in bare.notes)
+    told = wrap_model(bare, cameras=tiny.cameras(), screen_filter="mip", backend="reference")
+    assert (told.effects().screen_filter, told.effects().eps2d) == ("mip", 0.1)
+    adapted = told.adapt(0.25, steps=0)
+    assert adapted.effects.screen_filter == adapted.model.trained.screen_filter == "classic"
+    assert "base mip 0.1 px²; file classic 0.3 px²" in adapted.report.filters
+    with pytest.raises(SettingsError, match="no screen filter 'soft'"):
+        wrap_model(bare, screen_filter="soft")
+
+
+def test_an_adapted_file_in_a_folder_of_mip_splatting_stays_classic(tmp_path):
+    plain = {name: column for name, column in splats().items() if name != "filter_3D"}
+    adapted = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras()).adapt(0.25, steps=0)
+    adapted.save(tmp_path / "adapted")
+    assert load_model(tmp_path / "adapted").trained.screen_filter == "classic"
+
+
+def test_real_files(shared_data):
+    filtered = load_model(shared_data / "checkpoints" / "filter3d_2000")
+    column = read_ply(shared_data / "checkpoints" / "filter3d_2000" / "point_cloud.ply").columns["filter_3D"]
+    assert filtered.family == "mip" and (filtered.gaussians().scales.amin(1) >= torch.from_numpy(column.copy())[: len(filtered)] * 0.999).all()
+    fused = load_model(shared_data / "checkpoints" / "donut_mip_fused" / "fused.ply")
+    assert fused.family == "3dgs" and any("fused" in note for note in fused.notes)
+    view = replace(tiny.cameras(1)[0])
+    assert torch.isfinite(wrap_model(fused, cameras=[view], screen_filter="mip").render(view).image).all()
