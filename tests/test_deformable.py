@@ -1,5 +1,7 @@
 """Deformable 3D Gaussians: what it reads, shows, adapts and writes."""
 
+import zipfile
+
 import moving
 import numpy as np
 import pytest
@@ -161,9 +163,9 @@ def test_a_single_ply_has_no_room_for_the_network(tmp_path):
 # Adapting
 
 
-@pytest.mark.parametrize(("scale", "settings"), [(1 / 4, dict(steps=30, extra_views=4)), (4, dict(recipe="instant"))])
+@pytest.mark.parametrize(("scale", "settings"), [(1 / 4, dict(steps=15, extra_views=4)), (4, dict(recipe="instant"))])
 def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, scale, settings):
-    wrapped = wrap_model(moving.write_deformable(tmp_path / "m"), backend="reference")
+    wrapped = wrap_model(moving.write_deformable(tmp_path / "m", moving.deform_state(width=64)), backend="reference")
     before = {name: tensor.clone() for name, tensor in wrapped.model.parameters().items()}
     adapted = wrapped.adapt(scale, **settings)
     base, now = moving.decibels(wrapped, adapted, [moving.at(time) for time in (0.0, 0.5, 1.0)])
@@ -231,6 +233,21 @@ def test_a_truncated_network_is_refused(tmp_path):
     network.write_bytes(network.read_bytes()[:5000])
     with pytest.raises(CheckpointError, match="damaged"):
         load_model(tmp_path / "m")
+
+
+def test_another_archive_in_its_place_is_refused(tmp_path):
+    network = moving.write_deformable(tmp_path / "m") / "deform/iteration_40000/deform.pth"
+    with zipfile.ZipFile(network, "w") as archive:
+        archive.writestr("readme.txt", "not a network")
+    with pytest.raises(CheckpointError, match="damaged"):
+        load_model(tmp_path / "m")
+
+
+def test_the_published_recipe_clones_and_splits_before_the_splats_move(tmp_path):
+    wrapped = wrap_model(moving.write_deformable(tmp_path / "m", moving.deform_state(width=64)), backend="reference")
+    adapted = wrapped.adapt(1 / 4, recipe="paper", steps=3, prune_every=2, densify_gradient=1e-9)
+    assert adapted.report.gaussians_after > 60
+    assert all(bool(tensor.isfinite().all()) for tensor in adapted.model.parameters().values())
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def test_what_is_saved_loads_again_and_is_laid_out_as_the_project_reads_it(tmp_p
     assert torch.equal(base.gaussians(moving.at(0.6)).sh, again.gaussians(moving.at(0.6)).sh)
 
 
-@pytest.mark.parametrize(("scale", "settings"), [(1 / 4, dict(steps=30, extra_views=4)), (4, dict(recipe="instant"))])
+@pytest.mark.parametrize(("scale", "settings"), [(1 / 4, dict(steps=15, extra_views=4)), (4, dict(recipe="instant"))])
 def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, scale, settings):
     wrapped = wrap_model(moving.write_hexplane(tmp_path / "m", ALL_ON), backend="reference")
     adapted = wrapped.adapt(scale, **settings)
@@ -131,6 +131,12 @@ def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, scale, settin
     camera = moving.at(0.3).zoomed(scale)
     again = wrap_model(tmp_path / "out", backend="reference").render(camera).image
     torch.testing.assert_close(again, adapted.render(camera).image)
+
+
+def test_a_folder_without_cameras_adapts_on_an_orbit_at_all_times(tmp_path):
+    (moving.write_hexplane(tmp_path / "m") / "cameras.json").unlink()  # which the project never writes
+    adapted = wrap_model(tmp_path / "m", backend="reference").adapt(1 / 32, recipe="instant", extra_views=3)
+    assert adapted.report.views.endswith("(the checkpoint came without cameras), 3 of them without a time, which are spread over 0..1")
 
 
 def test_the_coarse_stage_is_plain_splats(tmp_path):

@@ -55,6 +55,8 @@ def kind_of(path: Path) -> str:
             return kind
     if head.startswith(b"PK\x03\x04"):
         return _kind_of_zip(path)
+    if head.lstrip().startswith(b"{"):
+        return _kind_of_json(head)
     size = path.stat().st_size
     if head.startswith(b"\x00\x01\x00\x00") and size >= 5120 and int.from_bytes(head[20:22], "little") <= 2:
         return "ksplat"
@@ -66,6 +68,8 @@ def names_in_torch_file(path: Path, wanted: tuple[str, ...]) -> set[str]:
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             pickles = [name for name in archive.namelist() if name.endswith("data.pkl")]
+            if not pickles:
+                return set()
             with archive.open(pickles[0]) as file:
                 text = file.read(MAX_PICKLE)
     else:
@@ -78,6 +82,13 @@ def _inflated(head: bytes) -> bytes:
         return zlib.decompressobj(wbits=31).decompress(head, 4)
     except zlib.error:
         return b""
+
+
+def _kind_of_json(head: bytes) -> str:
+    """The meta.json of an unpacked SOG names its pictures, and the lod-meta.json of a streamed one its parts."""
+    if b"KHR_gaussian_splatting" in head:
+        return "glb"
+    return "sog" if b".webp" in head or b"meta.json" in head else "unknown"
 
 
 def _kind_of_zip(path: Path) -> str:
