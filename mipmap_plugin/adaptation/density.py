@@ -58,8 +58,11 @@ def prune(model: SplatModel, optimizer: torch.optim.Adam, keep: Tensor) -> None:
 def densify(model: SplatModel, optimizer: torch.optim.Adam, grown: Tensor, extent: float, shown: Gaussians, generator: torch.Generator) -> None:
     """Clone the small and split the large among the rows where `grown` [N] is True. `shown`: the model's activated splats.
 
-    Works on families whose parameters are a plain splat's (means, log scales and the rest by row).
+    Works on families whose parameters are a plain splat's (means, log scales and the rest by row); anchors, which never move,
+    have no gradient to grow by.
     """
+    if not grown.any():
+        return
     large = shown.scales.max(dim=1).values > SPLIT_EXTENT * extent
     split, clone = grown & large, grown & ~large
     rows = torch.cat([(~split).nonzero()[:, 0], clone.nonzero()[:, 0], split.nonzero()[:, 0].repeat(2)])

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -46,12 +47,15 @@ def extent(views: Sequence[Camera]) -> float:
     return radius if radius > 0 else 1.0
 
 
-def choose_views(cameras: Sequence[Camera], gaussians: Gaussians, config: AdaptConfig) -> tuple[list[Camera], str]:
-    """The base-scale cameras to adapt on, and a sentence that says which. Raises SettingsError when the policy finds none."""
+def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: AdaptConfig) -> tuple[list[Camera], str]:
+    """The base-scale cameras to adapt on, and a sentence that says which. `means` [N, 3]: what an orbit goes around.
+
+    Raises SettingsError when the policy finds none.
+    """
     generator = torch.Generator().manual_seed(config.seed)
     if config.views == "orbit" or not cameras:
         pixels = math.ceil(2 * math.tan(ORBIT_FOV / 2) * cameras[0].fx) if cameras else ORBIT_PIXELS  # the cameras' own focal length
-        views = orbit(gaussians, (pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
+        views = orbit(means, (pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
         why = "asked for" if cameras else "the checkpoint came without cameras"
         return views, f"{len(views)} views of a generated orbit at {pixels} px ({why})"
     if config.views == "given":

@@ -22,6 +22,8 @@ MODELS = Registry(
         "4dgs": "mipmap_plugin.models.hexplane:load_hexplane",
         "gsplat": "mipmap_plugin.models.gsplat:load_gsplat",
         "splatfacto": "mipmap_plugin.models.splatfacto:load_splatfacto",
+        "scaffold": "mipmap_plugin.models.scaffold:load_scaffold",
+        "octree": "mipmap_plugin.models.octree:load_octree",
     },
 )
 

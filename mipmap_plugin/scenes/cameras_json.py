@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,8 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
     cameras = []
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
         camera = _camera(entry, name, "test" if index < tests else "train", f"{path}, entry {index} ({name})")
-        cameras.append(camera.resized(*trained_size(camera.width, camera.height, cfg)))
+        resized = camera.resized(*trained_size(camera.width, camera.height, cfg))
+        cameras.append(replace(resized, index=index - tests) if index >= tests else resized)
     return cameras
 
 

@@ -1,0 +1,143 @@
+"""Octree-GS: its levels follow distance and zoom as in its own project; the rest it shares with Scaffold-GS."""
+
+import anchor_checkpoints as checkpoints
+import anchor_oracle as oracle
+import numpy as np
+import ply_files
+import pytest
+import torch
+from anchor_checkpoints import STANDARD, VOXEL, Layout
+from test_scaffold import VIEWS, agrees, gain, is_same, refused, state_of
+
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.torchscript import read_torchscript
+
+ALL = ("opacity_mlp", "cov_mlp", "color_mlp")
+
+LAYOUTS = {
+    "plain": Layout("octree"),
+    "floor, distance": Layout("octree", distance=ALL, to_level="floor"),
+    "ceil, level": Layout("octree", level=True, to_level="ceil"),
+    "progressive, bank": Layout("octree", bank=True, to_level="progressive"),
+    "everything": Layout("octree", distance=("color_mlp",), level=True, bank=True, appearance=(4, 2), united=True, to_level="progressive"),
+}
+
+
+def load(tmp_path, layout, **options):
+    checkpoints.write(tmp_path / "model", layout, **options)
+    return load_model(tmp_path / "model")
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("zoom", [1, 0.5, 3])
+def test_decoding_agrees_with_the_formulas_in_float64(tmp_path, name, zoom):
+    layout, view = LAYOUTS[name], VIEWS[1].zoomed(zoom)
+    states = checkpoints.weights(layout)
+    appearance = states["appearance"]["embedding.weight"].astype(np.float64).mean(0) if layout.appearance else None
+    columns = checkpoints.columns(layout, count=80)
+    agrees(load(tmp_path, layout, count=80).gaussians(view), oracle.decode(columns, states, layout, view, appearance))
+
+
+def test_zoom_chooses_the_levels_and_size_does_not(tmp_path):
+    model, view = load(tmp_path, LAYOUTS["plain"], count=80), VIEWS[0]
+    counts = [len(model.gaussians(view.zoomed(zoom))) for zoom in (1 / 8, 1 / 4, 1 / 2, 1, 2)]
+    assert counts == sorted(counts) and counts[0] < counts[-1] / 2
+    assert len(model.gaussians(view.resized(view.width // 4, view.height // 4))) == counts[3]
+
+
+def test_real_networks_decode(tmp_path, shared_data):
+    """The networks of a published checkpoint over anchors of ours, since nobody publishes both."""
+    layout = Layout("octree", features=32, splats=10)
+    ply = checkpoints.write(tmp_path / "model", layout)
+    for name in ALL:
+        (ply.parent / f"{name}.pt").write_bytes((shared_data / "checkpoints/octree_mlps" / f"{name}.pt").read_bytes())
+    states = {name: {key: held.numpy() for key, held in read_torchscript(ply.parent / f"{name}.pt").items()} for name in ALL}
+    agrees(load_model(tmp_path / "model").gaussians(VIEWS[0]), oracle.decode(checkpoints.columns(layout), states, layout, VIEWS[0]))
+
+
+# Which networks take what
+
+
+@pytest.mark.parametrize("bank", [False, True])
+@pytest.mark.parametrize("level", [False, True])
+@pytest.mark.parametrize("distance", [(), ("opacity_mlp",), ALL])
+def test_the_inputs_follow_from_shapes_and_options(tmp_path, distance, level, bank):
+    notes = load(tmp_path, Layout("octree", distance=distance, level=level, bank=bank)).notes
+    told = [note for note in notes if " goes into " in note]
+    takers = ", ".join(name for name in ALL if name in distance)
+    wanted = [f"the distance of the camera goes into {takers}"] if distance else []
+    assert told == wanted + ([f"the anchor's level goes into {', '.join(ALL)}{', feature_bank_mlp' * bank}"] if level else [])
+
+
+def test_without_options_a_doubt_is_said_and_shapes_decide_where_they_can(tmp_path):
+    refused(checkpoints.write(tmp_path / "a", Layout("octree", level=True), cfg=False), "may be the distance or the level; put the cfg_args")
+    model = load(tmp_path, Layout("octree", level=True, bank=True), cfg=False)
+    assert any("level goes into opacity_mlp" in note for note in model.notes)
+    assert any("the original's defaults are taken: fork 2, round" in note for note in model.notes)
+
+
+# Adapting and saving
+
+
+@pytest.mark.parametrize(("scale", "least"), [(1 / 4, 0.8), (4, 1.0)])
+def test_adapting_gains_and_leaves_the_base_and_what_is_frozen(tmp_path, scale, least):
+    model = load(tmp_path, LAYOUTS["plain"])
+    before = state_of(model)
+    gained, adapted = gain(model, scale, steps=40 if scale < 1 else 25)
+    after = state_of(adapted)
+    assert gained > least
+    assert is_same(before, state_of(model))
+    assert {name for name in before if not torch.equal(before[name], after[name])} == {"features", "scales"}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_round_trip_repeats_the_rows_and_the_networks_byte_for_byte(tmp_path, name):
+    model = load(tmp_path, LAYOUTS[name])
+    model.copy().save(tmp_path / "saved", provenance={})
+    first, second = (place / "point_cloud" / "iteration_30000" for place in (tmp_path / "model", tmp_path / "saved"))
+    for file in first.iterdir():
+        assert (second / file.name).read_bytes().split(b"end_header")[-1] == file.read_bytes().split(b"end_header")[-1]
+    assert is_same(state_of(model), state_of(load_model(tmp_path / "saved")))
+
+
+def test_the_constants_survive_the_loss_of_their_rows(tmp_path):
+    student = load(tmp_path, LAYOUTS["ceil, level"]).copy()
+    keep = torch.arange(40) >= 2
+    student.replace_parameters({name: held.detach()[keep] for name, held in student.parameters().items()})
+    ply = read_ply(student.save(tmp_path / "saved", provenance={}))
+    assert ply.columns["info"].tolist() == [np.float32(VOXEL), np.float32(STANDARD), *[0.0] * 36]
+    assert list(ply.columns)[:7] == ["x", "y", "z", "level", "extra_level", "info", "f_offset_0"]
+    assert ply.columns["level"].tolist() == checkpoints.columns(LAYOUTS["ceil, level"])["level"][2:].tolist()
+    again = load_model(tmp_path / "saved").gaussians(VIEWS[0])
+    assert torch.equal(again.means, student.gaussians(VIEWS[0]).means.detach())
+
+
+def test_a_single_anchor_cannot_hold_the_constants(tmp_path):
+    student = load(tmp_path, LAYOUTS["plain"]).copy()
+    student.replace_parameters({name: held.detach()[:1] for name, held in student.parameters().items()})
+    with pytest.raises(SettingsError, match="needs two anchors"):
+        student.save(tmp_path / "saved", provenance={})
+
+
+def test_a_folder_without_cfg_args_gets_what_the_original_asks_for(tmp_path):
+    load(tmp_path, LAYOUTS["everything"], cfg=False).save(tmp_path / "saved", provenance={})
+    text = (tmp_path / "saved/cfg_args").read_text()
+    for option in ("fork=2", "add_level=True", "dist2level='round'", "appearance_dim=2", "use_feat_bank=True", "add_color_dist=True"):
+        assert option in text
+
+
+# What is damaged
+
+
+@pytest.mark.parametrize("info", [[0.0, 1.0], [1.0, np.nan], [-1.0, 1.0]])
+def test_constants_that_are_none_are_refused(tmp_path, info):
+    columns = checkpoints.columns(LAYOUTS["plain"])
+    columns["info"][:2] = info
+    ply = checkpoints.write(tmp_path / "model", LAYOUTS["plain"])
+    refused(ply_files.write(ply, columns), "no voxel size and standard distance")
+
+
+def test_options_that_make_no_levels_are_refused(tmp_path):
+    refused(checkpoints.write(tmp_path / "model", Layout("octree", to_level="sideways")), "dist2level='sideways', which make no levels")
