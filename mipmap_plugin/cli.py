@@ -22,6 +22,7 @@ from mipmap_plugin.files import refuse_existing, write_json
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.anchors import AnchorModel
 from mipmap_plugin.models.health import examine
+from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.scenes.images import write_image
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -82,7 +83,7 @@ def adapt(
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. Several scales: a folder for all of them.
         recipe: default; paper (the published code, quirk by quirk); instant (closed form only).
         views: Which views to adapt to; by default what the recipe says.
-        cameras: A cameras.json or transforms file, where the checkpoint has none beside it.
+        cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         steps: Optimizer steps at most.
         time_budget_s: Seconds at most.
         resize: Filter that makes the base image smaller.
@@ -136,7 +137,7 @@ def render(
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
         screen_filter: trained: what the checkpoint was trained with; scaled: the training-free filter for this scale.
         supersampling: N: N x N samples a pixel.
-        cameras: A cameras.json or transforms file, where the checkpoint has none beside it.
+        cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         background: Of the scene; by default what the checkpoint says, else black.
         backend: A backend's name; auto takes the fastest that can do it.
         overwrite: Replace pictures that exist.
@@ -171,7 +172,7 @@ def evaluate(
 
     Args:
         checkpoint: A PLY or a model folder; its cameras tell the base scale.
-        images: Folder of the scene (transforms_*.json and the images).
+        images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images).
         scale: Target over base, such as 1/4 or 4; 1 is the base itself. May be given several times.
         recipe: Adapt with this recipe, once on views that are not judged on and once on those that are; may be given several times.
         protocol: How a photograph becomes the truth at another scale: P1 box, truncated; P2, P3 Pillow's bicubic.
@@ -238,7 +239,7 @@ def demo(output: Path = Path("mipmap-demo"), scale: tyro.conf.UseAppendAction[tu
 def _wrap(checkpoint: Path, cameras: Path | None, background: Background | None, backend: str) -> Wrapped:
     if backend != "auto":
         BACKENDS.get(backend)
-    given = None if cameras is None else load_scene(cameras).cameras
+    given = None if cameras is None else load_scene(cameras, read_options(checkpoint)[0])
     color = {None: None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}[background]
     return wrap_model(checkpoint, cameras=given, backend=backend, background=color)
 

@@ -44,6 +44,7 @@ class AdaptConfig(BaseModel):
 
     resize: ResizeFilter = Field("pil-bicubic", description="How the base image is made smaller; the filter of the protocol that is aimed at.")
     upsampler: str = Field("bicubic", description="How the base image is made larger, by name in the registry.")
+    compare_at: Literal["target", "base"] = Field("target", description="Zoom-in: the upsampled base is the truth, or images shrink to the base.")
     quantize_truth: bool = Field(False, description="Round the pseudo truth to 8 bits, as files of PNG do.")
     truth_oversampling: int | None = Field(None, gt=0, description="Render the base at most this many times finer than the target; None: at its own.")
 
@@ -76,8 +77,11 @@ _DEFAULT_OUT = dict(
 )  # fmt: skip
 
 # Towards a bicubic or Lanczos target every step loses real dB against the closed form: the target knows nothing that the
-# base does not, and adds the kernel's ringing.
-_DEFAULT_IN = dict(steps=0)
+# base does not, and adds the kernel's ringing. So the image is shrunk and compared with the base itself, at gentle rates.
+_DEFAULT_IN = dict(
+    steps=200, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
+    rates=LearningRates(means=1.6e-4, opacities=0.02),
+)  # fmt: skip
 
 
 def recipe(name: Recipe, scale: float, **overrides: Any) -> AdaptConfig:

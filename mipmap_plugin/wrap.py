@@ -32,7 +32,8 @@ from mipmap_plugin.files import write_json
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel, TrainedScale
 from mipmap_plugin.models.inria_folder import read_options
-from mipmap_plugin.scenes import model_cameras
+from mipmap_plugin.models.live import adopt
+from mipmap_plugin.scenes import Scene, model_cameras
 
 
 class Interrupted(KeyboardInterrupt):
@@ -115,32 +116,49 @@ class Wrapped:
         """The checkpoint's cameras, or a generated orbit where it came without any."""
         return self.cameras or choose_views([], self.model.parameters()["means"], AdaptConfig())[0]
 
+    def place(self, scene: Scene) -> Scene:
+        """The scene as the model was trained on it (`placed`); its cameras become those of a checkpoint that came without any."""
+        here = placed(self.model, scene)
+        if here is not scene and not self.cameras:
+            self.cameras = list(here.cameras)
+        return here
+
     def any_camera(self) -> Camera:
         return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 
 def wrap_model(
-    model: SplatModel | str | Path,
+    model: SplatModel | str | Path | Any,
     *,
-    cameras: Sequence[Camera] | None = None,
+    cameras: Sequence[Camera] | Scene | None = None,
     backend: str = "auto",
     background: tuple[float, float, float] | None = None,
     screen_filter: str | None = None,
 ) -> Wrapped:
-    """Wrap a loaded model, or the checkpoint at a path.
+    """Wrap a loaded model, the checkpoint at a path, or another project's live model, which is copied (`models.live.adopt`).
 
-    `cameras`: views of the scale it was trained at; by default those beside the checkpoint. `background`: linear RGB; by
-    default what the checkpoint says, else black. `screen_filter`: what it was trained with, where its files do not say
-    ("classic", "antialiased", "mip", "analytic"). Raises CheckpointError, and SettingsError for an unknown filter.
+    `cameras`: views of the scale it was trained at, or the scene that it was trained on; by default those beside the
+    checkpoint. `background`: linear RGB; by default what the checkpoint says, else black. `screen_filter`: what it was trained
+    with, where its files do not say ("classic", "antialiased", "mip", "analytic"). Raises CheckpointError, SceneError, and
+    SettingsError for an unknown filter or an object that is no model.
     """
-    if isinstance(model, (str, Path)):
-        model = load_model(model)
+    model = load_model(model) if isinstance(model, (str, Path)) else adopt(model)
     trained = replace(model.trained, background=background or model.trained.background)
     if screen_filter is not None:
         if screen_filter not in USUAL_EPS2D:
             raise SettingsError(f"there is no screen filter {screen_filter!r}; known are {', '.join(USUAL_EPS2D)}")
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
+    if isinstance(cameras, Scene):
+        cameras = placed(model, cameras).cameras
     return Wrapped(model, own_cameras(model) if cameras is None else cameras, backend, trained)
+
+
+def placed(model: SplatModel, scene: Scene) -> Scene:
+    """The scene as the model was trained on it: gsplat and splatfacto have a frame and a size of their own. Raises SceneError."""
+    if getattr(model, "host", None) is None:
+        return scene
+    scene = scene.original()
+    return scene.with_cameras(model.as_trained(scene.cameras, scene.points))  # type: ignore[attr-defined]
 
 
 def own_cameras(model: SplatModel) -> list[Camera]:

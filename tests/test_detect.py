@@ -1,7 +1,6 @@
 """Detection: every family and exchange format by its bytes, and the right file of a model folder."""
 
 import gzip
-import zipfile
 
 import numpy as np
 import pytest
@@ -88,48 +87,6 @@ def test_result_folders_of_gsplat_and_splatfacto(tmp_path):
             (tmp_path / family / name).touch()
         found = detect(tmp_path / family)
         assert (found.family, found.path, found.iteration) == (family, tmp_path / family / names[0], 29_999)
-
-
-def splat_record() -> bytes:
-    return bytes.fromhex("7a72abc1b6e792c1f011b5c1b6cbe23f9f59683f0c309c4075c9fffff779599a")
-
-
-EXCHANGE = {
-    "spz v4": (b"NGSP" + bytes(28), "SPZ"),
-    "spz v2": (gzip.compress(b"NGSP" + bytes(12)), "SPZ"),
-    "ksplat": (b"\0\1\0\0" + bytes(6000), "KSPLAT"),
-    "splat": (splat_record() * 3, "SPLAT"),
-}
-
-
-@pytest.mark.parametrize("case", EXCHANGE)
-def test_exchange_formats_are_answered_with_a_command(tmp_path, case):
-    content, name = EXCHANGE[case]
-    path = tmp_path / "my scene.bin"
-    path.write_bytes(content)
-    with pytest.raises(CheckpointError) as caught:
-        load_model(path)
-    assert f"is {name}, an exchange format" in str(caught.value)
-    assert str(caught.value).endswith(f"splat-transform '{path}' '{tmp_path / 'my scene.ply'}'")
-
-
-@pytest.mark.parametrize("name", ["a.compressed.ply", "a.ply"])
-def test_compressed_ply_is_not_told_to_convert_onto_itself(tmp_path, name):
-    write(tmp_path / name, {"packed_position": np.zeros(1, np.int32)})
-    with pytest.raises(CheckpointError, match=r"compressed PLY, an exchange format; convert it first: splat-transform (\S+) (?!\1$)\S+\.ply"):
-        detect(tmp_path / name)
-
-
-def test_sog_file_and_folder(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
-        archive.writestr("meta.json", "{}")
-        archive.writestr("means_l.webp", "")
-    (tmp_path / "folder").mkdir()
-    for name in ("meta.json", "means_l.webp"):
-        (tmp_path / "folder" / name).touch()
-    for path in (tmp_path / "a.sog", tmp_path / "folder"):
-        with pytest.raises(CheckpointError, match=r"SOG, an exchange format; .*splat-transform"):
-            detect(path)
 
 
 @pytest.mark.parametrize(
@@ -253,8 +210,6 @@ def test_real_companions_are_named(shared_data):
         "octree_mlps/color_mlp.pt": "TorchScript",
         "deform/deform.pth": "deformation network",
         "lod_tiles": "4 PLY files",
-        "yashica-t4/yashica-t4-top8192.spz": "SPZ",
-        "yashica-t4/yashica-t4-top8192.sog": "SOG",
     }.items():
         with pytest.raises(CheckpointError, match=sentence):
             load_model(folder / path)

@@ -8,7 +8,7 @@ import pytest
 import tiny
 import torch
 from oracle import brute_force
-from torch_checkpoints import aim, gsplat_folder, splats
+from torch_checkpoints import aim, gsplat_folder, normalized_by_numpy, splats
 
 from mipmap_plugin.errors import CheckpointError, OutputExists, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
@@ -194,34 +194,6 @@ def test_flat_splats_are_refused(tmp_path):
 
 
 # The normalized world
-
-
-def normalized_by_numpy(cameras, points):
-    """gsplat's own steps (FORMATS §2.3), in NumPy: similarity from the cameras, then principal axes of the points."""
-    c2w = np.stack([np.linalg.inv(camera.viewmat.numpy()) for camera in cameras])
-    t, R = c2w[:, :3, 3], c2w[:, :3, :3]
-    up = -R[:, :, 1].mean(0)
-    up /= np.linalg.norm(up)
-    target = np.array([0.0, -1.0, 0.0])
-    c, v = target @ up, np.cross(up, target)
-    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    align = np.eye(3) + skew + skew @ skew / (1 + c)
-    R, t = align @ R, t @ align.T
-    forward = R[:, :, 2]
-    nearest = t + (forward * -t).sum(-1)[:, None] * forward
-    shift = -np.median(nearest, axis=0)
-    scale = 1 / np.median(np.linalg.norm(t + shift, axis=-1))
-    first = np.eye(4)
-    first[:3, :3], first[:3, 3] = align * scale, shift * scale
-    moved = points @ first[:3, :3].T + first[:3, 3]
-    centroid = np.median(moved, axis=0)
-    values, vectors = np.linalg.eigh(np.cov(moved - centroid, rowvar=False))
-    vectors = vectors[:, values.argsort()[::-1]]
-    if np.linalg.det(vectors) < 0:
-        vectors[:, 0] *= -1
-    second = np.eye(4)
-    second[:3, :3], second[:3, 3] = vectors.T, -vectors.T @ centroid
-    return second @ first
 
 
 @pytest.mark.parametrize("turn", [(1, 1, 1), (1, -1, -1), (-1, -1, 1)])

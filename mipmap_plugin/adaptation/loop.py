@@ -13,6 +13,7 @@ from mipmap_plugin.adaptation import density
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, reason_to_stop
 from mipmap_plugin.adaptation.interrupt import interruptible
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
+from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.views import Rounds, extent
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -82,6 +83,8 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         camera = view.zoomed(task.scale)
         target = task.truth(view)  # r(x̂): the frozen base, resized
         image = task.render(run.student, camera)  # x: the student at the new scale
+        if image.shape != target.shape:
+            image = resize(image, (target.shape[0], target.shape[1]), config.resize)  # compared at the base's scale
         loss = (image - target).square().mean()
         loss.backward()
         run.square_error += float(loss.detach()) / len(views)

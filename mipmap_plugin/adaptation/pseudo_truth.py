@@ -17,7 +17,10 @@ from mipmap_plugin.models.base import SplatModel
 
 
 class PseudoTruth:
-    """The base model's view of a camera, resized to the wanted scale, [H, W, 3] float, cached by camera."""
+    """The base model's view of a camera, resized to the wanted scale, [H, W, 3] float, cached by camera.
+
+    With `compare_at="base"` a zoom-in's truth keeps the base's size: all that is known is what the wanted image must shrink to.
+    """
 
     def __init__(self, base: SplatModel, backend: Backend, effects: Effects, scale: float, config: AdaptConfig) -> None:
         """`effects`: how the base is rendered at the scale that it was trained at. Raises SettingsError for an unknown upsampler."""
@@ -34,7 +37,9 @@ class PseudoTruth:
     @torch.no_grad()
     def _make(self, view: Camera) -> Tensor:
         size = view.zoomed(self._scale).size
-        if self._scale > 1:
+        if self._scale > 1 and self._config.compare_at == "base":
+            target = self._render(view, 1.0)
+        elif self._scale > 1:
             target = self._enlarge(self._render(view, 1.0), size)
         else:
             target = resize(self._render(view, self._finest()), size, self._config.resize)

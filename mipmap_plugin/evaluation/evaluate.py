@@ -81,6 +81,7 @@ def evaluate(model: Wrapped, scene: Scene, scales: Sequence[float], recipes: Seq
     "held out": adapted on the checkpoint's training poses, and around them if the recipe says so; the honest row, for a user
     zooms to views that nobody adapted to. "scored": adapted on the very views that are judged, as the paper does.
     """
+    scene = model.place(scene)
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
     judged = test_views(scene, model.cameras[0], model.background)

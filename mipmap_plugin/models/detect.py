@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.anchor_networks import missing_networks
 from mipmap_plugin.models.cfg_args import read_cfg_args
+from mipmap_plugin.models.exchange import EXCHANGE, conversion
 from mipmap_plugin.models.magic import kind_of, names_in_torch_file
 from mipmap_plugin.models.ply import Header, read_header
 from mipmap_plugin.models.tags import provenance_of, render_mode
@@ -31,8 +31,6 @@ FAMILIES = {
     "gsplat": "gsplat",
     "splatfacto": "splatfacto (nerfstudio)",
 }
-
-EXCHANGE = {"spz": "SPZ", "sog": "SOG", "ksplat": "KSPLAT", "splat": "SPLAT", "compressed": "compressed PLY"}
 
 # The files in the result folders of projects that save with torch: the folder they lie in, and their names.
 GSPLAT_FILE = r"ckpt_(?P<step>\d+)(?:_rank(?P<rank>\d+))?\.pt"
@@ -170,8 +168,7 @@ def _family_of_torch_file(path: Path) -> str:
 
 def _why_not(path: Path, kind: str) -> str:
     if kind in EXCHANGE:
-        plain = path.with_name(path.name.split(".")[0] + (".ply" if path.suffix != ".ply" or path.name.endswith(".compressed.ply") else "-plain.ply"))
-        return f"{path} is {EXCHANGE[kind]}, an exchange format; convert it first: splat-transform {shlex.quote(str(path))} {shlex.quote(str(plain))}"
+        return conversion(path, kind)
     return {
         "glb": f"{path} is glTF, which is not read here, nor by splat-transform; export a PLY from the program that made it",
         "torchscript": f"{path} is a TorchScript network, one companion of an anchor model; give the model folder that holds its point_cloud.ply",
@@ -188,8 +185,9 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
             return _detect_step(family, folder, steps, iteration)
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
-    if (folder / "meta.json").is_file() and any(folder.glob("*.webp")):
-        raise CheckpointError(_why_not(folder / "meta.json", "sog"))
+    for name in ("meta.json", "lod-meta.json"):
+        if (folder / name).is_file() and kind_of(folder / name) == "sog":
+            raise CheckpointError(_why_not(folder / name, "sog"))
     clouds = sorted(folder.glob("*.ply"))
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]

@@ -64,6 +64,7 @@ class VanillaModel:
         _check(parameters)
         self._parameters = dict(parameters)
         self._origin = origin
+        self.host = origin.host
         if origin.host:
             self.family = origin.host.family
         self.source, self.folder, self.digest = origin.source, origin.folder, origin.digest

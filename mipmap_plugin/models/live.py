@@ -1,0 +1,78 @@
+"""Live models of other projects, recognized by their attributes: their tensors are copied, and nothing of theirs is imported or changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models import gsplat, splatfacto
+from mipmap_plugin.models.base import SplatModel, TrainedScale
+from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
+
+# INRIA's GaussianModel and its descendants: attribute by our name.
+INRIA = {
+    "means": "_xyz",
+    "scales": "_scaling",
+    "quats": "_rotation",
+    "opacities": "_opacity",  # [N, 1]
+    "sh0": "_features_dc",
+    "shN": "_features_rest",
+}
+
+# Attributes of descendants that hold more than these tensors, and what they are.
+MORE = {
+    "_anchor": "anchors with networks (Scaffold-GS, Octree-GS)",
+    "_deformation": "a deformation network (4D Gaussians)",
+    "filter_3D": "a 3D filter (Mip-Splatting, GOF)",
+    "_trbf_center": "splats that move (SpacetimeGaussians)",
+}
+
+
+def adopt(model: Any) -> SplatModel:
+    """A model of this package as it is, or a copy of another project's live one.
+
+    Taken are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it otherwise, gsplat's `splats` (a dict or a
+    ParameterDict), and splatfacto's model or its `gauss_params`. The copy stays on the original's device. Raises SettingsError
+    for another object, ShapeError for tensors that do not fit together.
+    """
+    if callable(getattr(model, "gaussians", None)):
+        return model
+    if found := [what for name, what in MORE.items() if hasattr(model, name)]:
+        raise SettingsError(f"this {_name(model)} has {found[0]}, which are read from files only; save it, and give the path")
+    if all(hasattr(model, name) for name in INRIA.values()):
+        raw = _copied(model, {name: getattr(model, attribute) for name, attribute in INRIA.items()})
+        raw["opacities"] = raw["opacities"].reshape(-1)
+        return _adopted(model, raw, TrainedScale(), Origin())
+    tensors = _mapping(getattr(model, "gauss_params", model))
+    if set(splatfacto.NAMES) <= set(tensors):
+        raw = splatfacto.to_parameters(_copied(model, {name: tensors[name] for name in splatfacto.NAMES}))
+        return _adopted(model, raw, TrainedScale(near_plane=splatfacto.NEAR_PLANE), Origin())
+    if set(gsplat.NAMES) == set(tensors):
+        return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE), Origin(host=gsplat.GsplatHost()))
+    told = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
+    raise SettingsError(f"a {_name(model)}{told} is no model that is known; give a path, a GaussianModel, or gsplat's dictionary of splats")
+
+
+def _mapping(model: Any) -> dict[str, Any]:
+    return dict(model.items()) if isinstance(model, (Mapping, torch.nn.ParameterDict)) else {}
+
+
+def _copied(model: Any, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Contiguous float32 copies. Raises SettingsError for what is no tensor, or still empty."""
+    if bare := [name for name, tensor in tensors.items() if not torch.is_tensor(tensor)]:
+        raise SettingsError(f"this {_name(model)} holds no tensor for {', '.join(bare)}; load or train it first")
+    if any(len(tensor) == 0 for tensor in tensors.values()):
+        raise SettingsError(f"this {_name(model)} has no splats yet; load or train it first")
+    return {name: tensor.detach().to(torch.float32, copy=True, memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
+
+
+def _adopted(model: Any, raw: dict[str, Tensor], trained: TrainedScale, origin: Origin) -> VanillaModel:
+    return without_poison(VanillaModel(raw, trained, origin, [f"copied from a live {_name(model)}"]))
+
+
+def _name(model: Any) -> str:
+    return type(model).__name__
