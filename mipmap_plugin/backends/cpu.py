@@ -23,7 +23,7 @@ class CpuBackend:
     api_version = API_VERSION
     speed = 10
     capabilities = Capabilities(
-        devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased", "mip"})
+        devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased", "mip", "analytic"})
     )
 
     def lacking(self, needs: Needs) -> list[str]:

@@ -7,9 +7,14 @@ RED, GREEN, BLUE = 6, 7, 8
 REACH_Y = 9  # px from Y to the last row where alpha reaches 1/255
 TIP = 10  # px from Y to the row where the splat reaches furthest right; as far the other way, furthest left
 SPREAD = 11  # 1 / FALL_X
-COLUMNS = 16  # the rest is air, so that a row is one cache line
+# Of a splat that is integrated over pixels (`integrals`), those are of an ellipse around it, and it is itself in
+MASS = FALL_X  # opacity · 2π · both standard deviations, px²
+COS, SIN, PER_LONG, PER_SHORT = 12, 13, 14, 15  # the direction of its longer axis, and 1 / standard deviation, 1/px
+COLUMNS = 16  # a row is one cache line
 
 # The gradient table [pairs, PULLS] float32, one row per splat and tile. With s = alpha · dLoss/dalpha of a pixel, the sums over the
 # tile of s, s·u, s·dy, s·u², s·u·dy and s·dy², then dLoss/dcolor in RED, GREEN and BLUE.
 SUM, SUM_U, SUM_Y, SUM_UU, SUM_UY, SUM_YY = range(6)
+# Integrated over pixels, the five are s times the derivatives of log alpha by u/long, v/short, log long, log short and the angle.
+BY_LONG, BY_SHORT, GROW_LONG, GROW_SHORT, TURN = range(1, 6)
 PULLS = 9

@@ -1,6 +1,6 @@
 """Front-to-back "over" inside tiles, forward and backward: splat by splat, over the rows of its ellipse, 16 pixels at a time.
 
-A tile's pixels lie in planes of TILE_ROWS rows, each WIDTH longer than the tile, so that no run of 16 lanes needs an end of its own.
+What happens to the pixels themselves is in `planes`.
 """
 
 # numba gives calls and operators a meaning of its own.
@@ -8,9 +8,9 @@ A tile's pixels lie in planes of TILE_ROWS rows, each WIDTH longer than the tile
 
 import numpy as np
 
-from mipmap_plugin.backends.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
+from mipmap_plugin.backends.compositing import MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import inner, kernel
+from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, SLACK, TILE_COLUMNS, TILE_ROWS, tile_grid
 from mipmap_plugin.backends.cpu_kernels.lanes import (
     WIDTH,
@@ -26,25 +26,12 @@ from mipmap_plugin.backends.cpu_kernels.lanes import (
     minimum,
     prefetch,
     ramp,
-    select,
     spread,
     sqrt,
     store,
     total,
 )
-
-STRIDE = TILE_COLUMNS + WIDTH
-PLANE = TILE_ROWS * STRIDE
-
-# Where planes begin in a tile's state: red, green and blue (in the backward pass dLoss/dimage), then
-LIGHT = 3 * PLANE  # transmittance
-ENDS = 4 * PLANE  # the place in the tile's list at which a pixel stopped
-BEHIND = 5 * PLANE  # what lies behind the splat at hand, dotted with dLoss/dimage
-
-# and, of the splat at hand, by rows: see `trace`.
-BEGIN = 6 * PLANE
-END, RIDGE, CREST = BEGIN + TILE_ROWS, BEGIN + 2 * TILE_ROWS, BEGIN + 3 * TILE_ROWS
-STATE = BEGIN + 4 * TILE_ROWS
+from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, BEHIND, CREST, END, ENDS, LIGHT, PLANE, RIDGE, STATE, STRIDE, cover, uncover
 
 # Splats between two looks at whether the tile is finished.
 PATIENCE = 16
@@ -79,8 +66,8 @@ def trace(table, i, box, state):
 
 
 @kernel
-def composite(start, stop, table, lists, frame, image):
-    """Render the tiles start..stop: fill the frame and the image [H, W, 3]."""
+def composite(start, stop, integrated, table, lists, frame, image):
+    """Render the tiles start..stop: fill the frame and the image [H, W, 3]. `integrated`: splats are, over each pixel's square."""
     starts, members, _ = lists
     background, through, stops = frame
     height, width = through.shape
@@ -94,7 +81,10 @@ def composite(start, stop, table, lists, frame, image):
                 break
             at = starts[tile] + n
             prefetch(table, members[min(at + AHEAD, len(members) - 1)])
-            lay(table, members[at], n, box, state)
+            if integrated:
+                lay_integral(table, members[at], n, box, state)
+            else:
+                lay(table, members[at], n, box, state)
         close_tile(box, state, background, image, through, stops)
 
 
@@ -121,7 +111,7 @@ def finished(state):
 @inner
 def lay(table, i, n, box, state):
     """Lay splat i, the n-th of its tile, behind what is there."""
-    fall, red, green, blue = table[i, col.FALL_X], table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]
+    fall, color = table[i, col.FALL_X], (table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE])
     rows = trace(table, i, box, state)
     while rows != 0:
         r = lowest(rows)
@@ -131,19 +121,25 @@ def lay(table, i, n, box, state):
         while column <= end:
             u = ramp(column - ridge)
             power = fma(u * u, -fall, peak)
-            alpha = minimum(exp2(power), MAX_ALPHA)
-            before = load(state, LIGHT + at)
-            after = before * (1 - alpha)
-            bright = power >= LOG_MIN_ALPHA
-            shown = both(bright, after >= MIN_TRANSMITTANCE)
-            stopping = both(both(bright, before >= MIN_TRANSMITTANCE), after < MIN_TRANSMITTANCE)
-            weight = select(shown, before * alpha, 0)
-            store(state, at, fma(weight, red, load(state, at)))
-            store(state, PLANE + at, fma(weight, green, load(state, PLANE + at)))
-            store(state, 2 * PLANE + at, fma(weight, blue, load(state, 2 * PLANE + at)))
-            store(state, LIGHT + at, select(shown, after, select(stopping, 0 - before, before)))
-            if bits(stopping) != 0:
-                store(state, ENDS + at, select(stopping, n, load(state, ENDS + at)))
+            cover(exp2(power), power >= LOG_MIN_ALPHA, color, n, at, state)
+            column += WIDTH
+            at += WIDTH
+
+
+@inner
+def lay_integral(table, i, n, box, state):
+    """As `lay`, of a splat that is integrated over pixels; what `trace` finds is an ellipse around it."""
+    color = table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]
+    rows = trace(table, i, box, state)
+    while rows != 0:
+        r = lowest(rows)
+        rows &= rows - 1
+        column, end = state[BEGIN + r], state[END + r]
+        at = r * STRIDE + int(column)
+        center, dy = table[i, col.X] - box[0] - 0.5, box[1] + r + 0.5 - table[i, col.Y]
+        while column <= end:
+            alpha = integrals.alpha(table, i, ramp(column - center), dy)
+            cover(alpha, alpha >= MIN_ALPHA, color, n, at, state)
             column += WIDTH
             at += WIDTH
 
@@ -163,7 +159,7 @@ def close_tile(box, state, background, image, through, stops):
 
 
 @kernel
-def composite_back(start, stop, table, lists, frame, d_frame, pulls):
+def composite_back(start, stop, integrated, table, lists, frame, d_frame, pulls):
     """Walk the lists of the tiles start..stop back to front and write each splat's pull in each tile into its slot.
 
     d_frame: the gradients of the image [H, W, 3] and of its alpha [H, W].
@@ -182,7 +178,10 @@ def composite_back(start, stop, table, lists, frame, d_frame, pulls):
         for n in range(used - 1, -1, -1):
             at = starts[tile] + n
             prefetch(table, members[max(at - AHEAD, 0)])
-            lift(table, members[at], n, box, state, pulls, slots[at])
+            if integrated:
+                lift_integral(table, members[at], n, box, state, pulls, slots[at])
+            else:
+                lift(table, members[at], n, box, state, pulls, slots[at])
 
 
 @inner
@@ -207,7 +206,7 @@ def reopen_tile(box, background, through, stops, d_image, d_alpha, state):
 @inner
 def lift(table, i, n, box, state, pulls, slot):
     """Take splat i, the n-th of its tile, off again and write its pull."""
-    fall, red, green, blue = table[i, col.FALL_X], table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]
+    fall, color = table[i, col.FALL_X], (table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE])
     sum_1 = sum_u = sum_y = sum_uu = sum_uy = sum_yy = sum_red = sum_green = sum_blue = spread(0)
     rows = trace(table, i, box, state)
     while rows != 0:
@@ -219,17 +218,7 @@ def lift(table, i, n, box, state, pulls, slot):
         while column <= end:
             u = ramp(column - ridge)
             power = fma(u * u, -fall, peak)
-            raw = exp2(power)
-            shown = both(power >= LOG_MIN_ALPHA, n < load(state, ENDS + at))
-            alpha = select(shown, minimum(raw, MAX_ALPHA), 0)
-            before = load(state, LIGHT + at) / (1 - alpha)
-            d_red, d_green, d_blue = load(state, at), load(state, PLANE + at), load(state, 2 * PLANE + at)
-            behind = load(state, BEHIND + at)
-            gain = fma(d_red, red, fma(d_green, green, d_blue * blue)) - behind
-            weight = before * alpha
-            store(state, LIGHT + at, before)
-            store(state, BEHIND + at, fma(alpha, gain, behind))
-            s = select(raw < MAX_ALPHA, weight * gain, 0)
+            s, weight, d_red, d_green, d_blue = uncover(exp2(power), power >= LOG_MIN_ALPHA, color, n, at, state)
             s_u, s_y = s * u, s * dy
             sum_1, sum_u, sum_y = sum_1 + s, sum_u + s_u, sum_y + s_y
             sum_uu, sum_uy, sum_yy = fma(s_u, u, sum_uu), fma(s_u, dy, sum_uy), fma(s_y, dy, sum_yy)
@@ -238,4 +227,30 @@ def lift(table, i, n, box, state, pulls, slot):
             at += WIDTH
     pulls[slot, col.SUM], pulls[slot, col.SUM_U], pulls[slot, col.SUM_Y] = total(sum_1), total(sum_u), total(sum_y)
     pulls[slot, col.SUM_UU], pulls[slot, col.SUM_UY], pulls[slot, col.SUM_YY] = total(sum_uu), total(sum_uy), total(sum_yy)
+    pulls[slot, col.RED], pulls[slot, col.GREEN], pulls[slot, col.BLUE] = total(sum_red), total(sum_green), total(sum_blue)
+
+
+@inner
+def lift_integral(table, i, n, box, state, pulls, slot):
+    """As `lift`, of a splat that is integrated over pixels."""
+    color = table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]
+    sum_1 = sum_long = sum_short = sum_grow_long = sum_grow_short = sum_turn = sum_red = sum_green = sum_blue = spread(0)
+    rows = trace(table, i, box, state)
+    while rows != 0:
+        r = lowest(rows)
+        rows &= rows - 1
+        column, end = state[BEGIN + r], state[END + r]
+        at = r * STRIDE + int(column)
+        center, dy = table[i, col.X] - box[0] - 0.5, box[1] + r + 0.5 - table[i, col.Y]
+        while column <= end:
+            alpha, by_long, by_short, grow_long, grow_short, turn = integrals.slopes(table, i, ramp(column - center), dy)
+            s, weight, d_red, d_green, d_blue = uncover(alpha, alpha >= MIN_ALPHA, color, n, at, state)
+            sum_1, sum_long, sum_short = sum_1 + s, fma(s, by_long, sum_long), fma(s, by_short, sum_short)
+            sum_grow_long, sum_grow_short = fma(s, grow_long, sum_grow_long), fma(s, grow_short, sum_grow_short)
+            sum_turn = fma(s, turn, sum_turn)
+            sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
+            column += WIDTH
+            at += WIDTH
+    pulls[slot, col.SUM], pulls[slot, col.BY_LONG], pulls[slot, col.BY_SHORT] = total(sum_1), total(sum_long), total(sum_short)
+    pulls[slot, col.GROW_LONG], pulls[slot, col.GROW_SHORT], pulls[slot, col.TURN] = total(sum_grow_long), total(sum_grow_short), total(sum_turn)
     pulls[slot, col.RED], pulls[slot, col.GREEN], pulls[slot, col.BLUE] = total(sum_red), total(sum_green), total(sum_blue)

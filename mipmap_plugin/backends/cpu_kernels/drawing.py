@@ -47,7 +47,7 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
     lists = Lists(*binning.fill_lists(binning.depth_order(depths, counts), slots, tiles, columns * rows))
 
     image, frame = _empty(height, width, 3), Frame(np.array(effects.background, np.float32), _empty(height, width), _empty(height, width))
-    _share(compositing.composite, columns * rows, table, lists, frame, image)
+    _share(compositing.composite, columns * rows, view.integrated, table, lists, frame, image)
     return image, Drawing(view, table, slots, lists, frame)
 
 
@@ -55,7 +55,7 @@ def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np
     """The gradients of the splats from those of the image [H, W, 3] and its alpha [H, W]."""
     view, table, slots, lists, frame = drawing
     pulls = _empty(len(lists.members), col.PULLS)
-    _share(compositing.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), pulls)
+    _share(compositing.composite_back, len(lists.starts) - 1, view.integrated, table, lists, frame, (d_image, d_alpha), pulls)
     grads = Splats(*(_empty(*array.shape) for array in splats))
     _share(projection.project_back, len(splats.means), view, splats, table, slots, pulls, grads)
     return grads
@@ -81,7 +81,8 @@ def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
         height=camera.height,
         near=float(effects.near_plane),
         eps2d=float(effects.eps2d),
-        least_light=LEAST_LIGHT[effects.screen_filter],
+        least_light=LEAST_LIGHT.get(effects.screen_filter, 1.0),
+        integrated=effects.screen_filter == "analytic",
         sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from mipmap_plugin.backends.compositing import MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, kernel
+from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, integrals, kernel
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, blend, dot, minus, plus, row, set_row, times
 
@@ -43,8 +43,22 @@ def project(start, stop, view, splats, table, depths, counts):
 def fill_shape(view, p, flat, opacity, table, i):
     """Write what a splat's ellipse is on the image; False where there is none to draw."""
     x, y = view.fx * p[0] / p[2] + view.cx, view.fy * p[1] / p[2] + view.cy
-    (xx, xy, yy, det), light = ellipses.screen_filter(view, flat)
-    opacity *= light
+    if not view.integrated:
+        dilated, light = ellipses.screen_filter(view, flat)
+        return fill_ellipse(x, y, dilated, opacity * light, table, i)
+    along = integrals.axes(flat)
+    if not integrals.brightest(along, opacity) >= MIN_ALPHA:
+        return False
+    wider, bound = integrals.around(flat, along, opacity)
+    drawn = fill_ellipse(x, y, wider, bound, table, i)
+    integrals.fill(along, opacity, table, i)
+    return drawn
+
+
+@inner
+def fill_ellipse(x, y, shape, opacity, table, i):
+    """Write the ellipse alpha >= 1/255 of a shape; False where it is not finite, or not bright enough."""
+    xx, xy, yy, det = shape
     small = abs(x) < FAR and abs(y) < FAR and xx < FAR and yy < FAR and opacity < FAR
     sharp = yy * FAR > 1 and det * FAR > yy
     if not (small and sharp and opacity >= MIN_ALPHA):  # NaN passes no comparison
@@ -131,6 +145,8 @@ def add_up(pulls, first, last, pull):
 @inner
 def pull_shape(view, flat, opacity, pull):
     """Gradients of the shape before the screen filter, of the opacity, and of the place on the image."""
+    if view.integrated:
+        return pull_integral(flat, opacity, pull)
     dilated, light = ellipses.screen_filter(view, flat)
     _, xy, yy, det = dilated
     shear, per_yy, per_across = xy / yy, 1 / yy, yy / det
@@ -144,6 +160,15 @@ def pull_shape(view, flat, opacity, pull):
     d_dilated = 0.0, d_shear * per_yy, d_yy, -d_per_across * per_across / det
     d_flat = ellipses.pull_screen_filter(view, flat, dilated, light, d_dilated, pull[col.SUM] / light)
     return d_flat, pull[col.SUM] / opacity, d_x, d_y
+
+
+@inner
+def pull_integral(flat, opacity, pull):
+    """As `pull_shape`, of a splat that is integrated over pixels."""
+    cos, sin, long, short = integrals.axes(flat)
+    d_flat = integrals.pull_axes(flat, pull[col.GROW_LONG], pull[col.GROW_SHORT], pull[col.TURN])
+    d_u, d_v = pull[col.BY_LONG] / long, pull[col.BY_SHORT] / short
+    return d_flat, pull[col.SUM] / opacity, sin * d_v - cos * d_u, -sin * d_u - cos * d_v
 
 
 @inner

@@ -26,6 +26,7 @@ class View(NamedTuple):
     near: float
     eps2d: float
     least_light: float  # the share of its opacity that compensation leaves at least; 1: there is no compensation
+    integrated: bool  # over each pixel's square, instead of dilated
     sh_degree: int
 
 
