@@ -14,13 +14,14 @@ from pathlib import Path
 import tyro
 
 from mipmap_plugin import load_scene, wrap_model
+from mipmap_plugin.config import Recipe
 from mipmap_plugin.evaluation.evaluate import Row, evaluate
 from mipmap_plugin.evaluation.report import records, table
 from mipmap_plugin.files import write_json
 
 # The scales that each base was trained for the study of; see its own page.
 SCALES = {"lego_200": (1, 1 / 2, 1 / 4, 1 / 8), "chair_400": (1, 1 / 2, 1 / 4, 1 / 8), "lego_100": (1, 2, 4, 8), "chair_100": (1, 2, 4, 8)}
-RECIPES = ("instant", "paper", "default")
+RECIPES: tuple[Recipe, ...] = ("instant", "paper", "default")
 
 
 def main(
