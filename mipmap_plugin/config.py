@@ -87,7 +87,7 @@ _DEFAULT_IN = dict(
 def recipe(name: Recipe, scale: float, **overrides: Any) -> AdaptConfig:
     """The settings of a recipe at `scale`, with `overrides`. Raises SettingsError for an unknown name or a value out of range."""
     default = _DEFAULT_OUT if scale < 1 else _DEFAULT_IN
-    known = {"default": default, "paper": _PAPER, "instant": _INSTANT}
+    known: dict[str, dict[str, Any]] = {"default": default, "paper": _PAPER, "instant": _INSTANT}
     if name not in known:
         raise SettingsError(f"there is no recipe {name!r}; known are {', '.join(known)}")
     try:

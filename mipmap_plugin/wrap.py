@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ class Wrapped:
         whose dilation keeps its size in the world.
         """
         trained = self.trained
-        degree = self.model.gaussians(self.any_camera()).used_sh_degree()
+        degree = self._needs.sh_degree
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
@@ -83,8 +84,8 @@ class Wrapped:
 
     def backend(self, *, gradients: bool = False, screen_filter: str | None = None) -> tuple[Backend, str]:
         """The backend that serves this model, and why it was taken."""
-        gaussians = self.model.gaussians(self.any_camera())
-        return choose_backend(self._backend, Needs.of(gaussians, self.effects(screen_filter=screen_filter), gradients=gradients))
+        needs = replace(self._needs, gradients=gradients, screen_filter=self.effects(screen_filter=screen_filter).screen_filter)
+        return choose_backend(self._backend, needs)
 
     def render(self, camera: Camera, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1) -> Rendered:
         """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did."""
@@ -122,6 +123,13 @@ class Wrapped:
         if here is not scene and not self.cameras:
             self.cameras = list(here.cameras)
         return here
+
+    @cached_property
+    def _needs(self) -> Needs:
+        """What the base asks of a backend; asked once, for the base never changes."""
+        with torch.no_grad():
+            gaussians = self.model.gaussians(self.any_camera())
+        return Needs.of(gaussians, Effects(gaussians.used_sh_degree(), self.trained.screen_filter), gradients=False)
 
     def any_camera(self) -> Camera:
         return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
