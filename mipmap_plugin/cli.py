@@ -14,7 +14,7 @@ import tyro
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.cli_outputs import adapted_path, picture_names
-from mipmap_plugin.cli_types import Background, Checkpoint, Scale, Scales
+from mipmap_plugin.cli_types import Background, Checkpoint, Scale, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import Recipe, ResizeFilter, ViewPolicy
 from mipmap_plugin.effects import explain
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
@@ -31,16 +31,17 @@ app = tyro.extras.SubcommandApp()
 
 
 @app.command
-def inspect(checkpoint: Checkpoint, iteration: int | None = None, json: bool = False) -> None:
+def inspect(checkpoint: Checkpoint, iteration: int | None = None, screen_filter: ScreenFilter | None = None, json: bool = False) -> None:
     """Say what a checkpoint is, what it calls for, and what is wrong with it.
 
     Args:
         checkpoint: A PLY or a model folder.
         iteration: Which iteration of a model folder; the newest by default.
+        screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         json: Print JSON instead of sentences.
     """
     model = load_model(checkpoint, iteration=iteration)
-    wrapped = wrap_model(model)
+    wrapped = wrap_model(model, screen_filter=screen_filter)
     view = wrapped.views()[0]
     gaussians = model.gaussians(view)
     facts = {
@@ -48,7 +49,7 @@ def inspect(checkpoint: Checkpoint, iteration: int | None = None, json: bool = F
         "family": model.family,
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
-        "trained with": f"{model.trained.screen_filter}, {model.trained.eps2d:g} px², background {wrapped.background}",
+        "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
         "cameras": _summary(wrapped.cameras),
         "effects": [f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(wrapped.effects(), gaussians)],
         "health": examine(model.bake(view) if isinstance(model, AnchorModel) else model).sentences() or ["nothing found"],
@@ -70,6 +71,7 @@ def adapt(
     resize: ResizeFilter | None = None,
     upsampler: str | None = None,
     background: Background | None = None,
+    screen_filter: ScreenFilter | None = None,
     backend: str = "auto",
     seed: int = 0,
     overwrite: bool = False,
@@ -89,15 +91,16 @@ def adapt(
         resize: Filter that makes the base image smaller.
         upsampler: What makes the base image larger, by name.
         background: Of the scene; by default what the checkpoint says, else black.
+        screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
         seed: Everything random follows from it.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    wrapped = _wrap(checkpoint, cameras, background, backend)
+    wrapped = _wrap(checkpoint, cameras, background, backend, screen_filter)
     chosen: dict[str, Any] = dict(views=views, steps=steps, time_budget_s=time_budget_s, resize=resize, upsampler=upsampler)
     settings = {name: value for name, value in chosen.items() if value is not None}
-    scales = _each_once(scale)
+    scales = each_once(scale)
     targets = [adapted_path(checkpoint, output, each, len(scales) > 1) for each in scales]
     for target in targets:
         refuse_existing(target, overwrite)
@@ -121,7 +124,7 @@ def render(
     output: Path,
     scale: Scale = 1.0,
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    screen_filter: Literal["trained", "scaled", "classic", "antialiased"] = "trained",
+    screen_filter: Literal["trained", "scaled", "classic", "antialiased", "mip", "analytic"] = "trained",
     supersampling: int = 1,
     cameras: Path | None = None,
     background: Background | None = None,
@@ -162,6 +165,7 @@ def evaluate(
     protocol: Literal["P1", "P2", "P3"] = "P3",
     steps: int | None = None,
     background: Background | None = None,
+    screen_filter: ScreenFilter | None = None,
     backend: str = "auto",
     seed: int = 0,
     output: Path | None = None,
@@ -178,6 +182,7 @@ def evaluate(
         protocol: How a photograph becomes the truth at another scale: P1 box, truncated; P2, P3 Pillow's bicubic.
         steps: Optimizer steps at most, instead of the recipe's.
         background: Of the scene; by default what the checkpoint says, else black.
+        screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
         seed: Everything random follows from it.
         output: Also write the rows as JSON to this file.
@@ -189,9 +194,9 @@ def evaluate(
 
     if output:
         refuse_existing(output, overwrite)
-    wrapped = _wrap(checkpoint, None, background, backend)
+    wrapped = _wrap(checkpoint, None, background, backend, screen_filter)
     overrides: dict[str, Any] = {"seed": seed} | ({} if steps is None else {"steps": steps})
-    rows = rows_of(wrapped, load_scene(images), _each_once(scale), recipe, protocol, **overrides)
+    rows = rows_of(wrapped, load_scene(images), each_once(scale), recipe, protocol, **overrides)
     if output:
         write_json(output, records(rows), overwrite)
     if json:
@@ -236,12 +241,14 @@ def demo(output: Path = Path("mipmap-demo"), scale: tyro.conf.UseAppendAction[tu
     print(run_demo(output, scale or (0.25, 4.0), overwrite=overwrite))
 
 
-def _wrap(checkpoint: Path, cameras: Path | None, background: Background | None, backend: str) -> Wrapped:
+def _wrap(
+    checkpoint: Path, cameras: Path | None, background: Background | None, backend: str, screen_filter: ScreenFilter | None = None
+) -> Wrapped:
     if backend != "auto":
         BACKENDS.get(backend)
     given = None if cameras is None else load_scene(cameras, read_options(checkpoint)[0])
     color = {None: None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}[background]
-    return wrap_model(checkpoint, cameras=given, backend=backend, background=color)
+    return wrap_model(checkpoint, cameras=given, backend=backend, background=color, screen_filter=screen_filter)
 
 
 def _summary(cameras: Sequence[Camera]) -> str:
@@ -259,12 +266,6 @@ def _named(wrapped: Wrapped, names: Sequence[str]) -> list[Camera]:
         some = ", ".join(c.name for c in cameras[:5])
         raise SettingsError(f"there is no view {', '.join(sorted(missing))}; the first of {len(cameras)} are {some}")
     return found
-
-
-def _each_once(scales: Sequence[float]) -> list[float]:
-    if not scales:
-        raise SettingsError("no scale is given; pass --scale 1/4 or --scale 4, for example")
-    return list(dict.fromkeys(scales))
 
 
 def _tell(facts: Any, as_json: bool) -> None:

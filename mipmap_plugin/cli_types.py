@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+
+from mipmap_plugin.errors import SettingsError
 
 
 def read_scale(text: str) -> float:
@@ -18,6 +21,13 @@ def read_scale(text: str) -> float:
     if scale <= 0:
         raise ValueError(f"{text} is no zoom; give a number above 0, such as 1/4 or 4")
     return scale
+
+
+def each_once(scales: Sequence[float]) -> list[float]:
+    """The scales in their order, without repetitions. Raises SettingsError for none."""
+    if not scales:
+        raise SettingsError("no scale is given; pass --scale 1/4 or --scale 4, for example")
+    return list(dict.fromkeys(scales))
 
 
 Scale = Annotated[
@@ -32,4 +42,5 @@ Scale = Annotated[
 ]
 Scales = tyro.conf.UseAppendAction[list[Scale]]
 Background = Literal["white", "black"]
+ScreenFilter = Literal["classic", "antialiased", "mip", "analytic"]
 Checkpoint = tyro.conf.Positional[Path]

@@ -61,7 +61,7 @@ class AdaptConfig(BaseModel):
     reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
 
 
-# The published code (METHODS.md §1): every quirk a named setting. Its centres never move, because its loader leaves the
+# The published code (renaissanceee/Mipmap-GS): every quirk a named setting. Its centres never move, because its loader leaves the
 # rate's factor at 0; its zoom-out target is a bilinear resize without a prefilter, stored in 8 bits; on white it resets
 # all opacities at step 2; its zoom-in and zoom-out both take 1000 steps.
 _PAPER = dict(

@@ -14,6 +14,7 @@ import torch
 from oracle import brute_force
 
 from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.gaussians import Gaussians
@@ -219,3 +220,12 @@ def test_real_files(shared_data):
     assert fused.family == "3dgs" and any("fused" in note for note in fused.notes)
     view = replace(tiny.cameras(1)[0])
     assert torch.isfinite(wrap_model(fused, cameras=[view], screen_filter="mip").render(view).image).all()
+
+
+def test_the_command_line_is_told_the_filter(tmp_path, capsys):
+    plain = {name: column for name, column in splats().items() if name != "filter_3D"}
+    fused = ply_files.write(tmp_path / "fused.ply", plain)
+    assert main(["inspect", str(fused), "--screen-filter", "mip"]) == 0
+    assert "mip, 0.1 px²" in capsys.readouterr().out
+    assert main(["adapt", str(fused), "--scale", "4", "--screen-filter", "mip", "--steps", "0"]) == 0
+    assert "base mip 0.1 px²; file classic 0.3 px²" in capsys.readouterr().out

@@ -16,7 +16,7 @@ from mipmap_plugin.scenes import Scene
 
 @dataclass(frozen=True)
 class Protocol:
-    """One way to make the truth, as the papers do it (METHODS.md §2.1)."""
+    """One way to make the truth, as the papers do it."""
 
     name: str
     resize: str  # of the photograph, already composited on the background

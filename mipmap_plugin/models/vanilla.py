@@ -32,7 +32,7 @@ MIN_SCALE = 1e-18
 OPACITY_MARGIN = 1e-6
 
 # A fused file of Mip-Splatting has the columns of 3DGS; only its usual name tells it apart.
-FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting trained it, say so, for it looks right with the screen filter mip only"
+FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting trained it, say so (--screen-filter mip)"
 
 
 @dataclass(frozen=True, eq=False)
