@@ -60,12 +60,14 @@ def columns(layout: Layout, count: int = 40, seed: int = 0, **changed: np.ndarra
     if layout.family == "octree":
         found |= {"level": random.integers(0, 4, count).astype(float), "extra_level": 0.3 * normal(), "info": np.zeros(count)}
         found["level"][:4], found["info"][:2] = [0, 1, 2, 3], [VOXEL, STANDARD]
+        smaller = np.log(2) * found["level"]
     else:
         found |= {name: np.zeros(count) for name in ("nx", "ny", "nz")}
+        smaller = 0.0
     found |= {f"f_offset_{i}": 0.5 * normal() for i in range(3 * layout.splats)}
     found |= {f"f_anchor_feat_{i}": normal() for i in range(layout.features)}
     found |= {"opacity": np.full(count, -2.1972246)}
-    found |= {f"scale_{i}": (np.log(0.1) if i < 3 else np.log(0.08)) + 0.5 * normal() for i in range(6)}
+    found |= {f"scale_{i}": np.log(0.1 if i < 3 else 0.08) - smaller + 0.5 * normal() for i in range(6)}
     found |= {f"rot_{i}": (i == 0) + 0.3 * normal() for i in range(4)}
     return {name: column.astype(np.float32) for name, column in (found | changed).items()}
 

@@ -12,6 +12,7 @@ import torch
 from anchor_checkpoints import Layout
 
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.cli import main
 from mipmap_plugin.config import LearningRates, recipe
@@ -127,9 +128,15 @@ def gain(model, scale, **settings):
     """dB against the pseudo truth over the base's own render at the new scale, on the views adapted to; and the adapted model."""
     wrapped = wrap_model(model, cameras=VIEWS, backend="reference")
     adapted = wrapped.adapt(scale, views="given", check_every=10, **{"steps": 30, **settings})
-    truth = PseudoTruth(model, adapted.backend, wrapped.effects(), scale, recipe("default", scale))
-    gained = [psnr(adapted.render(v.zoomed(scale)).image, truth(v)) - psnr(wrapped.render(v.zoomed(scale)).image, truth(v)) for v in VIEWS[:2]]
-    return sum(gained) / len(gained), adapted.model
+    config = recipe("default", scale)
+    truth = PseudoTruth(model, adapted.backend, wrapped.effects(), scale, config)
+
+    def decibel(image, view):
+        return psnr(resize(image, truth(view).shape[:2], config.resize), truth(view))
+
+    views = VIEWS[:2]
+    gained = [decibel(adapted.render(v.zoomed(scale)).image, v) - decibel(wrapped.render(v.zoomed(scale)).image, v) for v in views]
+    return sum(gained) / len(views), adapted.model
 
 
 @pytest.mark.parametrize(("scale", "least"), [(1 / 4, 1.0), (4, 4.0)])
