@@ -25,6 +25,7 @@ from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.tags import provenance_of
 
 QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
+NO_STEP = ["--backend", "reference", "--steps", "0"]
 
 
 @pytest.fixture
@@ -97,7 +98,7 @@ def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
 
 def test_adapt_writes_beside_the_checkpoint_unless_told_otherwise(run, tmp_path):
     base = tiny.ply(tmp_path / "base.ply")
-    code, out, _ = run("adapt", base, "--scale", "4", "--backend", "reference", "--json")
+    code, out, _ = run("adapt", base, "--scale", "4", *NO_STEP, "--json")
     assert code == 0
     [report] = json.loads(out)
     assert report["file"] == str(tmp_path / "base_x4.ply") and report["settings"]["recipe"] == "default"
@@ -121,7 +122,7 @@ def test_adapt_takes_cameras_from_elsewhere(run, tmp_path):
 
 
 def test_the_same_scale_twice_is_one_scale(run, model_folder, tmp_path):
-    code, out, _ = run("adapt", model_folder, "--scale", "4", "--scale", "4/1", "--output", tmp_path / "a.ply", "--backend", "reference")
+    code, out, _ = run("adapt", model_folder, "--scale", "4", "--scale", "4/1", "--output", tmp_path / "a.ply", *NO_STEP)
     assert code == 0 and out.count("x4:") == 1
 
 
@@ -132,7 +133,7 @@ def test_an_output_that_exists_needs_overwrite_and_is_refused_before_any_work(ru
     refused(run("adapt", base, "--scale", "2", "--scale", "4"), "base_x4.ply exists already; pass --overwrite")
     monkeypatch.undo()
     assert (tmp_path / "base_x4.ply").read_text() == "precious" and not (tmp_path / "base_x2.ply").exists()
-    assert run("adapt", base, "--scale", "4", "--overwrite", "--backend", "reference")[0] == 0
+    assert run("adapt", base, "--scale", "4", "--overwrite", *NO_STEP)[0] == 0
     assert len(load_model(tmp_path / "base_x4.ply")) == 60
 
 
@@ -326,14 +327,14 @@ def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path,
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("mipmap_plugin.files.os.replace", full)
-    words = ["--output", output, "--overwrite", "--backend", "reference"]
+    words = ["--output", output, "--overwrite", *NO_STEP]
     refused(run("adapt", base, "--scale", "4", *words), "new.ply cannot be written: No space left on device")
     assert output.read_text() == "precious" and sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply"]
 
 
 def test_an_output_below_a_file_ends_in_one_sentence(run, tmp_path):
     base = tiny.ply(tmp_path / "base.ply")
-    refused(run("adapt", base, "--scale", "4", "--output", base / "new.ply", "--backend", "reference"), "new.ply")
+    refused(run("adapt", base, "--scale", "4", "--output", base / "new.ply", *NO_STEP), "new.ply")
 
 
 @pytest.mark.parametrize("words", ["", "fly", "adapt", "adapt a.ply --scale 0", "adapt a.ply --scale 1/0", "inspect a --what"])
