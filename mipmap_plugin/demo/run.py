@@ -33,7 +33,7 @@ SAMPLES = {True: 64, False: 4}  # zoomed out, zoomed in
 SHOWN = 480
 
 # Seconds for each scale; the demo should end within three minutes, whichever backend it finds.
-BUDGET_S = 30.0
+BUDGET_S = 40.0
 
 
 class WorldView:
