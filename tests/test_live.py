@@ -1,11 +1,13 @@
 """Live objects of other projects: copied by their attributes, never changed, adapted like a file."""
 
+import anchor_checkpoints as checkpoints
 import pytest
 import tiny
 import torch
+from anchor_checkpoints import Layout
 from torch_checkpoints import splatfacto_state, splats
 
-from mipmap_plugin.errors import SettingsError, ShapeError
+from mipmap_plugin.errors import CheckpointError, SettingsError, ShapeError
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.wrap import wrap_model
@@ -133,3 +135,80 @@ def test_other_objects_are_refused_in_one_sentence(thing, sentence):
 def test_flat_splats_are_refused():
     with pytest.raises(ShapeError, match=r"scales: expected shape \[30, 3\], got \[30, 2\]"):
         adopt(GaussianModel({**splats(), "scales": torch.zeros(30, 2)}))
+
+
+# Scaffold-GS
+
+LAYOUTS = [Layout(), Layout(bank=True, distance=("opacity_mlp", "color_mlp"), appearance=(3, 2))]
+
+
+class ScaffoldGaussianModel:
+    """What Scaffold-GS's class holds after training, with the numbers that the generator writes."""
+
+    def __init__(self, layout):
+        columns = {name: torch.from_numpy(column) for name, column in checkpoints.columns(layout).items()}
+        stack = lambda prefix: torch.stack([columns[name] for name in columns if name.startswith(prefix)], 1)  # noqa: E731
+        self._anchor = torch.nn.Parameter(torch.stack([columns[name] for name in "xyz"], 1))
+        self._offset = torch.nn.Parameter(stack("f_offset_").unflatten(1, (3, -1)).transpose(1, 2))
+        self._anchor_feat, self._scaling = torch.nn.Parameter(stack("f_anchor_feat_")), torch.nn.Parameter(stack("scale_"))
+        self._rotation, self._opacity = stack("rot_"), stack("opacity")
+        self.embedding_appearance = None
+        for name, state in checkpoints.weights(layout).items():
+            state = {key: torch.from_numpy(held) for key, held in state.items()}
+            if name == "appearance":
+                network, attribute = checkpoints.Embedding(*layout.appearance), "embedding_appearance"
+            else:
+                hidden, count = state["0.weight"].shape[0], len(state["2.bias"])
+                network = torch.nn.Sequential(torch.nn.Linear(layout.inputs(name), hidden), torch.nn.ReLU(True), torch.nn.Linear(hidden, count))
+                attribute = "mlp_" + name.removesuffix("_mlp")
+            network.load_state_dict(state)
+            setattr(self, attribute, network)
+
+    def tensors(self):
+        held = vars(self).values()
+        return [each for each in held if torch.is_tensor(each)] + [p for each in held if isinstance(each, torch.nn.Module) for p in each.parameters()]
+
+
+def is_same(one, other):
+    """Whether two models show the same splats, bit by bit, to a camera of the training and to one of none."""
+    shown = [(one.gaussians(camera), other.gaussians(camera)) for camera in tiny.cameras()]
+    parts = ("means", "scales", "quats", "opacities", "sh")
+    return all(len(a) == len(b) > 5 and all(torch.equal(getattr(a, part), getattr(b, part)) for part in parts) for a, b in shown)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_live_anchors_decode_as_those_of_the_file(layout, tmp_path):
+    checkpoints.write(tmp_path / "model", layout)
+    assert is_same(adopt(ScaffoldGaussianModel(layout)), load_model(tmp_path / "model"))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_adapting_live_anchors_leaves_them_and_a_saved_one_loads_the_same(layout, tmp_path):
+    thing = ScaffoldGaussianModel(layout)
+    before = [(tensor.detach().clone(), tensor._version, tensor.data_ptr()) for tensor in thing.tensors()]
+    adapted = wrap_model(thing, cameras=tiny.cameras(), backend="reference").adapt(1 / 4, steps=2, extra_views=1)
+    for tensor, (value, version, place) in zip(thing.tensors(), before, strict=True):
+        assert torch.equal(tensor, value) and (tensor._version, tensor.data_ptr(), tensor.grad) == (version, place, None)
+    adapted.model.save(tmp_path / "saved", provenance={})
+    assert not is_same(adapted.model, adopt(thing)) and is_same(adapted.model, load_model(tmp_path / "saved"))
+
+
+def test_live_networks_are_saved_as_the_torchscript_that_the_original_loads(tmp_path):
+    thing = ScaffoldGaussianModel(LAYOUTS[0])
+    ply = adopt(thing).save(tmp_path / "saved", provenance={})
+    features = torch.linspace(-1, 1, 2 * LAYOUTS[0].inputs("opacity_mlp")).reshape(2, -1)
+    assert torch.allclose(torch.jit.load(ply.parent / "opacity_mlp.pt")(features), thing.mlp_opacity(features).tanh())
+
+
+def test_live_anchors_that_do_not_fit_are_refused():
+    thing, octree = ScaffoldGaussianModel(Layout()), ScaffoldGaussianModel(Layout())
+    octree._level = torch.zeros(40, 1)
+    with pytest.raises(SettingsError, match=r"has anchors with levels .* give the path"):
+        adopt(octree)
+    thing._scaling = thing._scaling[:, :3]
+    with pytest.raises(ShapeError, match=r"_scaling: expected shape \[40, 6\], got \[40, 3\]"):
+        adopt(thing)
+    thing = ScaffoldGaussianModel(Layout())
+    thing.mlp_cov = thing.mlp_opacity
+    with pytest.raises(CheckpointError, match="ScaffoldGaussianModel: cov_mlp gives 3 numbers, but anchors with 3 splats need 21"):
+        adopt(thing)

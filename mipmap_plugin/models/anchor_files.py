@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
 from mipmap_plugin.files import new_file, sha256
-from mipmap_plugin.models.anchor_networks import Weights, check_sizes, read_networks
+from mipmap_plugin.models.anchor_networks import Weights, check_networks, read_networks
 from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.cfg_args import format_cfg_args
 from mipmap_plugin.models.columns import NORMAL, POSITION, QUATERNION, numbered, stacked
@@ -30,7 +30,7 @@ SCALES = tuple(f"scale_{i}" for i in range(6))
 
 @dataclass(frozen=True, eq=False)
 class AnchorFile:
-    """What was read: of the PLY, its companions and its folder."""
+    """What was read: of the PLY, its companions and its folder, or of a live object."""
 
     parameters: dict[str, Tensor]  # of the finite anchors
     carried: tuple[str, ...]  # the names of the columns in `parameters[CARRIED]`
@@ -54,13 +54,18 @@ def read_anchors(path: str | Path, family: str, iteration: int | None) -> Anchor
     ply = read_ply(found.path)
     parameters, carried = to_parameters(ply.columns, found.path)
     weights, companions = read_networks(found.path.parent)
-    check_sizes(weights, parameters["features"].shape[1], parameters["offsets"].shape[1], found.path.parent)
+    parameters, dropped = _sound(parameters, weights, found.path)
     first = {name: column[:2].copy() for name, column in ply.columns.items()}
     options, notes = read_options(found.folder)
-    parameters, dropped = _finite(parameters, found)
     origin = _origin(found, ply.comments)
     every_note = (*found.notes, *ply.notes, *notes, *dropped)
     return AnchorFile(parameters, carried, weights, companions, options, trained_scale(options, None), origin, first, every_note)
+
+
+def anchors_in_memory(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, name: str) -> AnchorFile:
+    """As `read_anchors`, of tensors that came from no file; `name` tells whose they are. Raises CheckpointError."""
+    parameters, dropped = _sound(parameters, weights, name)
+    return AnchorFile(parameters, carried, weights, {}, {}, trained_scale({}, None), Origin(), notes=(f"copied from a live {name}", *dropped))
 
 
 def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
@@ -127,13 +132,20 @@ def _origin(found: Checkpoint, comments: tuple[str, ...]) -> Origin:
     return Origin(found.path, sha256(found.path), found.folder, found.iteration, comments)
 
 
-def _finite(parameters: dict[str, Tensor], found: Checkpoint) -> tuple[dict[str, Tensor], list[str]]:
+def _sound(parameters: dict[str, Tensor], weights: Weights, where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
+    """The finite anchors, whose networks fit them, and a note when these are not all."""
+    folder = where.parent if isinstance(where, Path) else where
+    check_networks(weights, parameters["features"].shape[1], parameters["offsets"].shape[1], folder)
+    return _finite(parameters, where)
+
+
+def _finite(parameters: dict[str, Tensor], where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
     """The anchors that are finite once activated, and a note when these are not all."""
     values = [*parameters.values(), parameters["scales"].exp()]
     sound = torch.stack([value.flatten(1).isfinite().all(1) for value in values]).all(0)
     if sound.all():
         return parameters, []
     if not sound.any():
-        raise CheckpointError(f"{found.path}: none of its {len(sound):,} anchors is finite; the training or the export failed")
+        raise CheckpointError(f"{where}: none of its {len(sound):,} anchors is finite; the training or the export failed")
     lost = f"{int((~sound).sum()):,} of {len(sound):,} anchors are not finite and were dropped"
     return {name: tensor[sound] for name, tensor in parameters.items()}, [lost]

@@ -46,13 +46,13 @@ def read_networks(folder: Path) -> tuple[Weights, dict[str, bytes]]:
         weights, files = {name: read_torchscript(file) for name, file in split.items()}, list(split.values())
     else:
         weights, files = _read_united(folder / UNITED), [folder / UNITED]
-    for name, state in weights.items():
-        _check(name, state, files[0].parent)
     return weights, {file.name: file.read_bytes() for file in files}
 
 
-def check_sizes(weights: Weights, features: int, splats: int, folder: Path) -> None:
-    """Raise CheckpointError unless the networks fit anchors of `features` numbers and `splats` splats each."""
+def check_networks(weights: Weights, features: int, splats: int, folder: Path | str) -> None:
+    """Raise CheckpointError unless the networks are sound and fit anchors of `features` numbers and `splats` splats each."""
+    for name, state in weights.items():
+        _check(name, state, folder)
     rows = {"opacity_mlp": splats, "cov_mlp": 7 * splats, "color_mlp": 3 * splats, "feature_bank_mlp": 3}
     for name, count in rows.items():
         if name in weights and len(weights[name]["2.weight"]) != count:
@@ -76,12 +76,12 @@ def packed(weights: Weights, read: Weights, files: Mapping[str, bytes]) -> dict[
     """The `files` of `weights`, of which those whose network is still as it was `read` stay byte for byte.
 
     Others take the form that they had: one file of state dicts, or the TorchScript that the original loads, for which networks
-    are built and traced here, so that no program of the original files runs.
+    are built and traced here, so that no program of the original files runs. Those that came from no file become TorchScript.
     """
     moved = {name for name, state in weights.items() if any(not torch.equal(held.cpu(), read[name][key].cpu()) for key, held in state.items())}
     if UNITED in files:
         return {UNITED: _united(weights)} if moved else dict(files)
-    return {FILES[name]: _traced(name, state) if name in moved else files[FILES[name]] for name, state in weights.items()}
+    return {FILES[name]: _traced(name, state) if name in moved or FILES[name] not in files else files[FILES[name]] for name, state in weights.items()}
 
 
 def _united(weights: Weights) -> bytes:
@@ -124,7 +124,7 @@ def _read_united(path: Path) -> Weights:
     return {name: dict(states[name]) for name in FILES if name in states}
 
 
-def _check(name: str, state: dict[str, Tensor], folder: Path) -> None:
+def _check(name: str, state: dict[str, Tensor], folder: Path | str) -> None:
     wanted = {EMBEDDING} if name == "appearance" else LAYERS
     if state.keys() != wanted or not all(isinstance(held, Tensor) and held.dtype == torch.float32 for held in state.values()):
         raise CheckpointError(f"{folder}: {name} holds {', '.join(sorted(state)) or 'nothing'}, not {', '.join(sorted(wanted))} in 32 bits")

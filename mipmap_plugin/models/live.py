@@ -8,9 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.models import gsplat, splatfacto
-from mipmap_plugin.models.base import SplatModel, TrainedScale
+from mipmap_plugin.models.anchor_networks import NEEDED, Weights
+from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale
+from mipmap_plugin.models.scaffold import scaffold_in_memory
 from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
 
 # INRIA's GaussianModel and its descendants: attribute by our name.
@@ -23,9 +25,26 @@ INRIA = {
     "shN": "_features_rest",
 }
 
+# Scaffold-GS's GaussianModel: attribute by our name, and how the shape of each goes on after N; 0 is any number.
+ANCHORS = {
+    "means": ("_anchor", (3,)),
+    "offsets": ("_offset", (0, 3)),
+    "features": ("_anchor_feat", (0,)),
+    "scales": ("_scaling", (6,)),
+    "opacities": ("_opacity", (1,)),
+    "quats": ("_rotation", (4,)),
+}
+
+# Its networks; those of the second line are None or missing where they are not used.
+NETWORKS = {
+    **{"opacity_mlp": "mlp_opacity", "cov_mlp": "mlp_cov", "color_mlp": "mlp_color"},
+    **{"feature_bank_mlp": "mlp_feature_bank", "appearance": "embedding_appearance"},
+}
+
 # Attributes of descendants that hold more than these tensors, and what they are.
 MORE = {
-    "_anchor": "anchors with networks (Scaffold-GS, Octree-GS)",
+    "_level": "anchors with levels (Octree-GS)",
+    "_anchor": "anchors with networks other than those of Scaffold-GS",
     "_deformation": "a deformation network (4D Gaussians)",
     "filter_3D": "a 3D filter (Mip-Splatting, GOF)",
     "_trbf_center": "splats that move (SpacetimeGaussians)",
@@ -35,13 +54,17 @@ MORE = {
 def adopt(model: Any) -> SplatModel:
     """A model of this package as it is, or a copy of another project's live one.
 
-    Taken are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it otherwise, gsplat's `splats` (a dict or a
-    ParameterDict), and splatfacto's model or its `gauss_params`. The copy stays on the original's device. Raises SettingsError
-    for another object, ShapeError for tensors that do not fit together.
+    Taken are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it otherwise, Scaffold-GS's
+    `GaussianModel`, gsplat's `splats` (a dict or a ParameterDict), and splatfacto's model or its `gauss_params`. The copy stays on
+    the original's device. Raises SettingsError for another object, ShapeError for tensors that do not fit together, CheckpointError
+    for networks that do not fit their anchors.
     """
     if callable(getattr(model, "gaussians", None)):
         return model
-    if found := [what for name, what in MORE.items() if hasattr(model, name)]:
+    found = [what for name, what in MORE.items() if hasattr(model, name)]
+    if found == [MORE["_anchor"]] and _is_scaffold(model):
+        return scaffold_in_memory(_anchors(model), _networks(model), _name(model))
+    if found:
         raise SettingsError(f"this {_name(model)} has {found[0]}, which are read from files only; save it, and give the path")
     if all(hasattr(model, name) for name in INRIA.values()):
         raw = _copied(model, {name: getattr(model, attribute) for name, attribute in INRIA.items()})
@@ -55,6 +78,27 @@ def adopt(model: Any) -> SplatModel:
         return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE), Origin(host=gsplat.GsplatHost()))
     told = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
     raise SettingsError(f"a {_name(model)}{told} is no model that is known; give a path, a GaussianModel, or gsplat's dictionary of splats")
+
+
+def _is_scaffold(model: Any) -> bool:
+    networks = [getattr(model, NETWORKS[name], None) for name in NEEDED]
+    return all(hasattr(model, name) for name, _ in ANCHORS.values()) and all(isinstance(each, torch.nn.Module) for each in networks)
+
+
+def _anchors(model: Any) -> dict[str, Tensor]:
+    raw = _copied(model, {name: getattr(model, attribute) for name, (attribute, _) in ANCHORS.items()})
+    for name, (attribute, rest) in ANCHORS.items():
+        shape = raw[name].shape
+        if len(shape) != 1 + len(rest) or any(size not in (0, held) for size, held in zip((len(raw["means"]), *rest), shape, strict=True)):
+            wanted = ", ".join(str(size or "any") for size in (len(raw["means"]), *rest))
+            raise ShapeError(f"{attribute}: expected shape [{wanted}], got {list(shape)}")
+    carried = torch.cat([raw.pop("opacities"), raw.pop("quats")], 1)
+    return {**raw, CARRIED: carried}
+
+
+def _networks(model: Any) -> Weights:
+    used = {name: network for name, attribute in NETWORKS.items() if (network := getattr(model, attribute, None)) is not None}
+    return {name: _copied(model, network.state_dict()) for name, network in used.items()}
 
 
 def _mapping(model: Any) -> dict[str, Any]:

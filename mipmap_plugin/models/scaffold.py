@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.models.anchor_files import AnchorFile, read_anchors
-from mipmap_plugin.models.anchor_networks import NEEDED, surplus
+from mipmap_plugin.models.anchor_files import AnchorFile, anchors_in_memory, read_anchors
+from mipmap_plugin.models.anchor_networks import NEEDED, Weights, surplus
 from mipmap_plugin.models.anchors import AnchorModel
-from mipmap_plugin.models.columns import NORMAL
+from mipmap_plugin.models.columns import NORMAL, QUATERNION
 
 
 class ScaffoldModel(AnchorModel):
@@ -33,13 +34,19 @@ def load_scaffold(path: str | Path, *, iteration: int | None = None) -> Scaffold
     Which networks take the distance of the camera follows from their shapes. Raises CheckpointError.
     """
     read = read_anchors(path, "scaffold", iteration)
-    model = ScaffoldModel(read, _inputs(read))
+    model = ScaffoldModel(read, _inputs(read, read.origin.source))
     if read.options.get("lod"):
         model.notes.append(f"cfg_args says lod={read.options['lod']}: the original's test views are not every eighth, so name the views you want")
     return model
 
 
-def _inputs(read: AnchorFile) -> dict[str, tuple[str, ...]]:
+def scaffold_in_memory(parameters: dict[str, Tensor], weights: Weights, name: str) -> ScaffoldModel:
+    """The model of raw tensors, whose `carried` are the opacity and the quaternion; `name` tells whose they are. Raises CheckpointError."""
+    read = anchors_in_memory(parameters, ("opacity", *QUATERNION), weights, name)
+    return ScaffoldModel(read, _inputs(read, name))
+
+
+def _inputs(read: AnchorFile, where: Path | str | None) -> dict[str, tuple[str, ...]]:
     """What each network takes: features, direction, and as the widths tell, distance and appearance."""
     features = read.parameters["features"].shape[1]
     inputs: dict[str, tuple[str, ...]] = {}
@@ -47,7 +54,7 @@ def _inputs(read: AnchorFile) -> dict[str, tuple[str, ...]]:
         extra = surplus(read.weights, name, features)
         if extra not in (0, 1):
             reason = "embedding_appearance.pt is missing" if name == "color_mlp" and extra > 1 else "the files do not match"
-            raise CheckpointError(f"{read.origin.source}: {name} takes {extra} numbers more than features and direction; {reason}")
+            raise CheckpointError(f"{where}: {name} takes {extra} numbers more than features and direction; {reason}")
         inputs[name] = ("features", "direction", *("distance",) * extra)
     if "feature_bank_mlp" in read.weights:
         inputs["feature_bank_mlp"] = ("direction", "distance")
