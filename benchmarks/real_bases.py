@@ -44,7 +44,8 @@ def main(
         write_json(output / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)
     parts = [f"## {file.stem}\n\n{table([Row(**row) for row in json.loads(file.read_text())])}\n" for file in sorted(output.glob("*_[0-9]*.json"))]
-    intro = "# Real bases against real test images\n\nMade by `python benchmarks/real_bases.py DATA`. Protocol P3, mean of 25 test views; seconds on one thread of a shared machine.\n\n"
+    intro = "# Real bases against real test images\n\nMade by `python benchmarks/real_bases.py DATA`. "
+    intro += "Protocol P3, mean of 25 test views; seconds on one thread of a shared machine.\n\n"
     (output / "real_bases.md").write_text(intro + "\n".join(parts))
 
 
