@@ -232,7 +232,6 @@ class _Adaptation:
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str) -> Report:
-        truth = self.config.resize if self.scale < 1 else self.config.upsampler
         before = self.base.gaussians(self.views[0])
         return Report(
             scale=self.scale,
@@ -240,7 +239,7 @@ class _Adaptation:
             settings=self.config,
             backend=self.why,
             views=self.which,
-            filters=f"pseudo truth {truth}; base {_filter(self.trained)}; file {_filter(self.effects)}",
+            filters=f"pseudo truth {_truth(self.scale, self.config)}; base {_filter(self.trained)}; file {_filter(self.effects)}",
             effects=[f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(self.effects, before)],
             gaussians_before=len(before),
             gaussians_after=len(student.gaussians(self.views[0])),
@@ -253,6 +252,15 @@ class _Adaptation:
 
 def _filter(effects: Effects) -> str:
     return f"{effects.screen_filter} {effects.eps2d:g} px²"
+
+
+def _truth(scale: float, config: AdaptConfig) -> str:
+    """Which filter lies between the base's image and what is compared with it."""
+    if not config.steps:
+        return "none, for no step is taken"
+    if scale <= 1:
+        return config.resize
+    return config.upsampler if config.compare_at == "target" else f"the base itself, images shrunk by {config.resize}"
 
 
 def _digest(model: SplatModel) -> str:

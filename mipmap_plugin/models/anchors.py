@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -31,7 +32,7 @@ OPACITY_VIEWS = 12
 RESHAPE_VIEWS = 4
 
 
-class AnchorModel:
+class AnchorModel(ABC):
     """N anchors with k splats each.
 
     Raw parameters: means [N, 3], which never move; offsets [N, k, 3]; features [N, F]; scales [N, 6] log, of the offsets and of the
@@ -140,9 +141,9 @@ class AnchorModel:
         raw = self._parameters
         return Anchors(raw["means"][rows], raw["offsets"][rows], raw["features"][rows], raw["scales"][rows])
 
+    @abstractmethod
     def _second_columns(self) -> dict[str, np.ndarray]:
         """The columns that the family's PLY has behind the position."""
-        raise NotImplementedError
 
     def _cfg_options(self) -> dict[str, Any]:
         """The options, for a model that came without cfg_args, that make the original build these networks."""
