@@ -17,8 +17,8 @@ from mipmap_plugin import registry
 from mipmap_plugin.backends.conformance import Outcome
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
-from mipmap_plugin.cli_outputs import picture_names
-from mipmap_plugin.cli_types import read_scale
+from mipmap_plugin.commands.outputs import picture_names
+from mipmap_plugin.commands.types import read_scale
 from mipmap_plugin.evaluation import backends as backends_module
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.ply import read_ply
@@ -158,7 +158,7 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
 
 
 def test_ctrl_c_anywhere_else_says_interrupted(run, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.cli.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("mipmap_plugin.commands.inspect.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     code, _, err = run("inspect", "a.ply")
     assert code == 130 and err.strip() == "mipmap-plugin: interrupted"
 

@@ -1,0 +1,71 @@
+"""`mipmap-plugin adapt`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.commands.common import tell, wrap
+from mipmap_plugin.commands.outputs import adapted_path
+from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
+from mipmap_plugin.config import Recipe, ResizeFilter, ViewPolicy
+from mipmap_plugin.files import refuse_existing
+
+
+def adapt(
+    checkpoint: Checkpoint,
+    scale: Scales,
+    output: Path | None = None,
+    recipe: Recipe = "default",
+    views: ViewPolicy | None = None,
+    cameras: Path | None = None,
+    steps: int | None = None,
+    time_budget_s: float | None = None,
+    resize: ResizeFilter | None = None,
+    upsampler: str | None = None,
+    background: Background | None = None,
+    screen_filter: ScreenFilter | None = None,
+    backend: str = "auto",
+    seed: int = 0,
+    overwrite: bool = False,
+    json: bool = False,
+) -> None:
+    """Make a checkpoint that looks right at another scale, in any viewer.
+
+    Args:
+        checkpoint: A PLY or a model folder.
+        scale: Target focal length over base focal length, such as 1/4 or 4. May be given several times.
+        output: Where to write; by default beside the checkpoint, as NAME_x0.25. Several scales: a folder for all of them.
+        recipe: default; paper (the published code, quirk by quirk); instant (closed form only).
+        views: Which views to adapt to; by default what the recipe says.
+        cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
+        steps: Optimizer steps at most.
+        time_budget_s: Seconds at most.
+        resize: Filter that makes the base image smaller.
+        upsampler: What makes the base image larger, by name.
+        background: Of the scene; by default what the checkpoint says, else black.
+        screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
+        backend: A backend's name; auto takes the fastest that can do it.
+        seed: Everything random follows from it.
+        overwrite: Replace outputs that exist.
+        json: Print the reports as JSON.
+    """
+    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
+    chosen: dict[str, Any] = dict(views=views, steps=steps, time_budget_s=time_budget_s, resize=resize, upsampler=upsampler)
+    settings = {name: value for name, value in chosen.items() if value is not None}
+    scales = each_once(scale)
+    targets = [adapted_path(checkpoint, output, each, len(scales) > 1) for each in scales]
+    for target in targets:
+        refuse_existing(target, overwrite)
+    reports = []
+    for each, target in zip(scales, targets, strict=True):
+        adapted = wrapped.adapt(each, recipe=recipe, seed=seed, resume=target.with_name(target.name + ".resume"), **settings)
+        saved = adapted.save(target, overwrite=overwrite)
+        report = adapted.report
+        reports.append({"file": str(saved), **report.model_dump()})
+        if not json:
+            print(f"x{each:g}: {saved}")
+            print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
+            print(f"  {report.views}; {report.filters}; backend {report.backend}")
+    if json:
+        tell(reports, json)

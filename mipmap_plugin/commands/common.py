@@ -1,0 +1,42 @@
+"""What several commands do."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.backends import BACKENDS
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.commands.types import Background, ScreenFilter
+from mipmap_plugin.models.inria_folder import read_options
+from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.wrap import Wrapped, wrap_model
+
+
+def wrap(
+    checkpoint: Path, cameras: Path | None, background: Background | None, backend: str, screen_filter: ScreenFilter | None = None
+) -> Wrapped:
+    if backend != "auto":
+        BACKENDS.get(backend)
+    given = None if cameras is None else load_scene(cameras, read_options(checkpoint)[0])
+    color = {None: None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}[background]
+    return wrap_model(checkpoint, cameras=given, backend=backend, background=color, screen_filter=screen_filter)
+
+
+def summary(cameras: Sequence[Camera]) -> str:
+    if not cameras:
+        return "none beside the checkpoint"
+    return f"{len(cameras)}, {cameras[0].width} x {cameras[0].height} px, {sum(c.split == 'test' for c in cameras)} of them test views"
+
+
+def tell(facts: Any, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(facts, indent=2, default=str))
+        return
+    for name, value in facts.items():
+        lines = value if isinstance(value, list) else [value]
+        for line in lines:
+            print(f"{name + ':' if name else '':14}{line}")
+            name = ""

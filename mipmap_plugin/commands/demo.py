@@ -1,0 +1,22 @@
+"""`mipmap-plugin demo`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+from mipmap_plugin.commands.types import Scale
+
+
+def demo(output: Path = Path("mipmap-demo"), scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (), overwrite: bool = False) -> None:
+    """Adapt the embedded scene at x1/4 and x4, write before/after pictures and print a table.
+
+    Args:
+        scale: Other scales, instead of 1/4 and 4; may be given several times.
+        output: The folder for the pictures.
+        overwrite: Replace files that exist there.
+    """
+    from mipmap_plugin.demo.run import run_demo
+
+    print(run_demo(output, scale or (0.25, 4.0), overwrite=overwrite))

@@ -1,0 +1,38 @@
+"""`mipmap-plugin inspect`."""
+
+from __future__ import annotations
+
+from mipmap_plugin.commands.common import summary, tell
+from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
+from mipmap_plugin.effects import explain
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.anchors import AnchorModel
+from mipmap_plugin.models.health import examine
+from mipmap_plugin.wrap import wrap_model
+
+
+def inspect(checkpoint: Checkpoint, iteration: int | None = None, screen_filter: ScreenFilter | None = None, json: bool = False) -> None:
+    """Say what a checkpoint is, what it calls for, and what is wrong with it.
+
+    Args:
+        checkpoint: A PLY or a model folder.
+        iteration: Which iteration of a model folder; the newest by default.
+        screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
+        json: Print JSON instead of sentences.
+    """
+    model = load_model(checkpoint, iteration=iteration)
+    wrapped = wrap_model(model, screen_filter=screen_filter)
+    view = wrapped.views()[0]
+    gaussians = model.gaussians(view)
+    facts = {
+        "file": str(model.source),
+        "family": model.family,
+        "splats": len(gaussians),
+        "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
+        "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
+        "cameras": summary(wrapped.cameras),
+        "effects": [f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(wrapped.effects(), gaussians)],
+        "health": examine(model.bake(view) if isinstance(model, AnchorModel) else model).sentences() or ["nothing found"],
+        "notes": model.notes,
+    }
+    tell(facts, json)
