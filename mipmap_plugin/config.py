@@ -37,6 +37,7 @@ class AdaptConfig(BaseModel):
     recipe: Recipe = Field("default", description="The name of the set that these settings started from.")
     steps: int = Field(1000, ge=0, description="Optimizer steps at most.")
     time_budget_s: float | None = Field(None, gt=0, description="Seconds after which adapting ends, whatever the step.")
+    target_db: float | None = Field(None, description="Stop at the first check whose PSNR against the pseudo truth (not photographs) is this high.")
     patience: int | None = Field(None, gt=0, description="Stop at the knee: after this many checks in a row that gained less than `min_gain_db`.")
     min_gain_db: float = Field(0.05, ge=0, description="Gain in dB between two checks that still pays.")
     check_every: int = Field(50, gt=0, description="Steps between two points of the curve.")

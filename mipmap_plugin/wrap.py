@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +35,9 @@ from mipmap_plugin.models.base import SplatModel, TrainedScale
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.scenes import Scene, model_cameras
+
+# (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
+Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
 
 
 class Interrupted(KeyboardInterrupt):
@@ -100,18 +103,21 @@ class Wrapped:
         recipe: Recipe = "default",
         cameras: Sequence[Camera] | None = None,
         resume: str | Path | None = None,
+        observe: Observer | None = None,
         **settings: Any,
     ) -> Adapted:
         """A new model for `scale` (target focal length in px over base focal length in px); the base stays as it is.
 
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override the recipe's, by the names
-        of AdaptConfig: steps, time_budget_s, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
-        and raises Interrupted, and a finished run removes it. Raises SettingsError and BackendUnavailable.
+        of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
+        and raises Interrupted, and a finished run removes it. `observe` sees the model before the first step and after each.
+        Raises SettingsError and BackendUnavailable.
         """
         if not 0 < scale < float("inf"):
             raise SettingsError(f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4")
         config = make_config(recipe, scale, **settings)
-        return _Adaptation(self, scale, config, self.cameras if cameras is None else list(cameras)).run(None if resume is None else Path(resume))
+        adaptation = _Adaptation(self, scale, config, self.cameras if cameras is None else list(cameras))
+        return adaptation.run(None if resume is None else Path(resume), observe)
 
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit where it came without any."""
@@ -189,22 +195,32 @@ class _Adaptation:
         self.truth = PseudoTruth(self.base, self.backend, self.trained, scale, config)
         self.seconds = {"optimization": 0.0}
 
-    def run(self, resume: Path | None) -> Adapted:
+    def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         began = time.perf_counter()
         student = self.base.copy()
         student.trained = replace(student.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
-        if self.config.closed_form:
+        nothing_to_do = self.scale == 1 and self.effects == self.trained
+        if self.config.closed_form and not nothing_to_do:
             self._start_closed_form(student)
         self.seconds["total"] = time.perf_counter() - began
-        curve, ended_by = self._optimize(student, resume) if self.config.steps else ([], "0 steps")
+        curve: list[CurvePoint] = []
+        ended_by = "scale 1, at which the base is right as it is" if nothing_to_do else "0 steps"
+        if self.config.steps and not nothing_to_do:
+            curve, ended_by = self._optimize(student, resume, observe)
         return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects)
 
-    def _optimize(self, student: SplatModel, resume: Path | None) -> tuple[list[CurvePoint], str]:
+    def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[list[CurvePoint], str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""
         task = Task(self.views, self.scale, self.truth, self._render, self._white)
         fingerprint = self._fingerprint()
         run = load_run(resume, student, task, self.config, fingerprint) if resume and resume.exists() else Run.start(student, task, self.config)
-        ended_by = adapt(run, task, self.config, lambda run: _stop(run, resume, fingerprint))
+        before = self.seconds["total"]
+
+        def look(run: Run) -> None:
+            if observe is not None:
+                observe(run.step, before + run.watch.seconds, lambda camera: self._render(run.student, camera))
+
+        ended_by = adapt(run, task, self.config, lambda run: _stop(run, resume, fingerprint), look)
         if resume:
             resume.unlink(missing_ok=True)
         self.seconds["optimization"] = run.watch.seconds

@@ -47,9 +47,11 @@ def decibel(mean_square: float) -> float:
 
 
 def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig) -> str | None:
-    """Why adapting ends before its last step: the budget is spent, or the knee is passed."""
+    """Why adapting ends before its last step: the budget is spent, the target reached, or the knee passed."""
     if config.time_budget_s is not None and seconds >= config.time_budget_s:
         return f"time budget of {config.time_budget_s:g} s"
+    if config.target_db is not None and curve and curve[-1].psnr_db >= config.target_db:
+        return f"target of {config.target_db:g} dB against the pseudo truth"
     if config.patience is not None and len(curve) > config.patience:
         best_before = max(point.psnr_db for point in curve[: -config.patience])
         if max(point.psnr_db for point in curve[-config.patience :]) < best_before + config.min_gain_db:

@@ -51,14 +51,18 @@ class Run:
         return cls(student, optimizer, Stopwatch(means.device), density.ScreenGradients(len(means), means.device))
 
 
-def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None]) -> str:
-    """Optimise `run.student` in place until its steps, its budget or its patience end; return which of them did.
+def adapt(
+    run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], None] = lambda run: None
+) -> str:
+    """Optimise `run.student` in place until its steps, its budget, its target or its patience end; return which of them did.
 
-    `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise.
+    `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise. `observe` is called before the first
+    step and after each, while the clock stands.
     """
     rounds = Rounds(task.views, config.seed)
     bar = tqdm(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step")
     with bar, interruptible() as interrupted:
+        observe(run)
         while run.step < config.steps:
             with run.watch:
                 _step(run, task, config, [rounds(run.step * config.views_per_step + nth) for nth in range(config.views_per_step)])
@@ -66,6 +70,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             if run.step % config.check_every == 0:
                 _mark(run, config)
                 bar.set_postfix_str(f"{run.curve[-1].psnr_db:.2f} dB, {run.curve[-1].gaussians} splats")
+            observe(run)
             if interrupted():
                 on_interrupt(run)
             if reason := reason_to_stop(run.curve, run.watch.seconds, config):

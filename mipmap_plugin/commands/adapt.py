@@ -21,6 +21,7 @@ def adapt(
     cameras: Path | None = None,
     steps: int | None = None,
     time_budget_s: float | None = None,
+    target_db: float | None = None,
     resize: ResizeFilter | None = None,
     upsampler: str | None = None,
     background: Background | None = None,
@@ -41,6 +42,7 @@ def adapt(
         cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         steps: Optimizer steps at most.
         time_budget_s: Seconds at most.
+        target_db: Stop at this PSNR against the pseudo truth, which is what adapting aims at, and not real photographs.
         resize: Filter that makes the base image smaller.
         upsampler: What makes the base image larger, by name.
         background: Of the scene; by default what the checkpoint says, else black.
@@ -51,7 +53,8 @@ def adapt(
         json: Print the reports as JSON.
     """
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
-    chosen: dict[str, Any] = dict(views=views, steps=steps, time_budget_s=time_budget_s, resize=resize, upsampler=upsampler)
+    limits = dict(steps=steps, time_budget_s=time_budget_s, target_db=target_db)
+    chosen: dict[str, Any] = dict(views=views, resize=resize, upsampler=upsampler, **limits)
     settings = {name: value for name, value in chosen.items() if value is not None}
     scales = each_once(scale)
     targets = [adapted_path(checkpoint, output, each, len(scales) > 1) for each in scales]

@@ -1,0 +1,73 @@
+"""Adapting ends when the curve says so, and says why; whoever watches sees the model while the clock stands."""
+
+import time
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.wrap import wrap_model
+
+STEPS = dict(steps=12, extra_views=0, check_every=2, patience=None)
+
+
+def wrapped(**trained):
+    return wrap_model(tiny.model(30), cameras=tiny.cameras(2), backend="reference", **trained)
+
+
+def test_the_target_ends_the_run_at_the_first_check_that_reaches_it():
+    whole = wrapped().adapt(1 / 4, **STEPS).report
+    target = whole.curve[2].psnr_db
+    first = next(point for point in whole.curve if point.psnr_db >= target)
+    report = wrapped().adapt(1 / 4, target_db=target, **STEPS).report
+    assert report.ended_by == f"target of {target:g} dB against the pseudo truth"
+    assert report.curve[-1].step == first.step < whole.curve[-1].step
+
+
+def test_a_target_out_of_reach_leaves_the_steps_to_end_it():
+    assert wrapped().adapt(1 / 4, target_db=200, **STEPS).report.ended_by == "12 steps"
+
+
+def test_the_target_is_no_photographs_and_says_so():
+    assert "not photographs" in AdaptConfig.model_fields["target_db"].description
+    with pytest.raises(SettingsError, match="target_db"):
+        wrapped().adapt(1 / 4, target_db="high")
+
+
+def test_the_observer_sees_every_step_and_the_model_of_that_step():
+    seen = []
+    camera = tiny.cameras(1)[0].zoomed(1 / 4)
+    adapted = wrapped().adapt(1 / 4, observe=lambda step, seconds, show: seen.append((step, seconds, show(camera).detach())), **STEPS)
+    assert [step for step, _, _ in seen] == list(range(13))
+    assert all(before[1] < after[1] for before, after in zip(seen, seen[1:], strict=False))
+    assert torch.equal(seen[-1][2], adapted.render(camera).image)
+    assert not torch.equal(seen[0][2], seen[-1][2])
+
+
+def test_the_clock_stands_while_somebody_looks():
+    nap = 0.2  # seconds, and there are 13 of them
+    report = wrapped().adapt(1 / 4, observe=lambda *_: time.sleep(nap), **STEPS).report
+    quick = wrapped().adapt(1 / 4, **STEPS).report
+    assert report.seconds["total"] < 13 * nap / 2 + quick.seconds["total"]
+
+
+def test_watching_changes_nothing():
+    camera = tiny.cameras(1)[0].zoomed(1 / 4)
+    watched = wrapped().adapt(1 / 4, observe=lambda step, seconds, show: show(camera), **STEPS).model.parameters()
+    alone = wrapped().adapt(1 / 4, **STEPS).model.parameters()
+    assert all(torch.equal(watched[name], alone[name]) for name in alone)
+
+
+@pytest.mark.parametrize("recipe", ["default", "paper", "instant"])
+def test_at_scale_one_there_is_nothing_to_do(recipe):
+    model, steps = wrapped(), []
+    adapted = model.adapt(1, recipe=recipe, observe=lambda step, *_: steps.append(step))
+    assert adapted.report.ended_by == "scale 1, at which the base is right as it is" and steps == []
+    assert all(torch.equal(tensor, model.model.parameters()[name]) for name, tensor in adapted.model.parameters().items())
+
+
+def test_at_scale_one_a_base_of_another_filter_still_becomes_classic():
+    adapted = wrapped(screen_filter="antialiased").adapt(1, steps=2, extra_views=0)
+    assert adapted.report.ended_by == "2 steps" and adapted.effects.screen_filter == "classic"
