@@ -10,9 +10,8 @@ from scenes import Name, make
 from torch import Tensor
 
 from mipmap_plugin import Camera, Effects, Gaussians, wrap_model
-from mipmap_plugin.backends.compositing import MIN_ALPHA
 from mipmap_plugin.backends.projection import project
-from mipmap_plugin.effects import DILATION
+from mipmap_plugin.effects import DILATION, MIN_ALPHA
 from mipmap_plugin.errors import SettingsError
 
 # Splats counted at once, so that counting pairs takes little memory whatever the checkpoint.

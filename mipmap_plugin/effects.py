@@ -12,9 +12,27 @@ DILATION = 0.3
 # World units: a splat whose centre is nearer than this is not drawn (diff-gaussian-rasterization, auxiliary.h).
 NEAR_PLANE = 0.2
 
+# What every 3DGS rasterizer leaves out (diff-gaussian-rasterization, forward.cu).
+MIN_ALPHA = 1 / 255  # below one 8-bit step a splat cannot change a displayed pixel
+MIN_TRANSMITTANCE = 1e-4  # a pixel this opaque is finished
+
+TILE = 16  # px
 
 # Screen filters that dim what they widen.
 COMPENSATED = frozenset({"antialiased", "mip"})
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """What an image may lack so that it is drawn sooner. Only `tile` changes nothing but the time."""
+
+    min_alpha: float = MIN_ALPHA  # below it a splat is not drawn on a pixel
+    min_transmittance: float = MIN_TRANSMITTANCE  # a pixel stops before the splat that would leave it less
+    radius: float | None = None  # standard deviations at which a splat ends; None: where `min_alpha` ends it
+    tile: int = TILE  # px: pixels that share a list of splats
+
+
+USUAL = RenderSettings()
 
 
 @dataclass(frozen=True)
@@ -30,6 +48,7 @@ class Effects:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear RGB
     supersampling: int = 1  # N: N x N samples per pixel, averaged
     near_plane: float = NEAR_PLANE  # world units
+    settings: RenderSettings = USUAL
 
 
 @dataclass(frozen=True)

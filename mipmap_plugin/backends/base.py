@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import USUAL, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
 
 # Raised when `Backend.render` or the records below change in a way that an old backend cannot serve.
@@ -34,11 +34,12 @@ class Needs:
     sh_degree: int
     screen_filter: str
     covariances: bool = False
+    settings: RenderSettings = USUAL
 
     @classmethod
     def of(cls, gaussians: Gaussians, effects: Effects, *, gradients: bool) -> Needs:
-        means = gaussians.means
-        return cls(means.device.type, means.dtype, gradients, effects.sh_degree, effects.screen_filter, gaussians.covariances is not None)
+        means, given = gaussians.means, gaussians.covariances is not None
+        return cls(means.device.type, means.dtype, gradients, effects.sh_degree, effects.screen_filter, given, effects.settings)
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class Capabilities:
     gradients: bool = True
     max_sh_degree: int = 4
     covariances: bool = True
+    settings: bool = False  # other cut-offs and tiles than the usual ones
 
     def lacking(self, needs: Needs) -> list[str]:
         """One sentence for each need that is not met; empty when all are."""
@@ -67,6 +69,8 @@ class Capabilities:
             reasons.append(f"it has the screen filters {', '.join(sorted(self.screen_filters))}, not {needs.screen_filter}")
         if needs.covariances and not self.covariances:
             reasons.append("it takes quaternions and scales, not covariances")
+        if needs.settings != USUAL and not self.settings:
+            reasons.append("its cut-offs and tiles are fixed; the reference backend has others")
         return reasons
 
 

@@ -15,13 +15,11 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import RenderSettings
 
-# The published constants (diff-gaussian-rasterization, forward.cu).
-MIN_ALPHA = 1 / 255  # below one 8-bit step a splat cannot change a displayed pixel
-MAX_ALPHA = 0.99  # keeps 1 - alpha away from 0, where the gradient of everything behind the splat vanishes
-MIN_TRANSMITTANCE = 1e-4  # a pixel this opaque is finished
-
-TILE = 16  # px
+# A published constant (diff-gaussian-rasterization, forward.cu): it keeps 1 - alpha away from 0, where the gradient of everything
+# behind the splat vanishes.
+MAX_ALPHA = 0.99
 
 # (splat, pixel) pairs composited at once: about ten tensors of this many float32 live together, 0.3 GiB.
 BATCH_PAIRS = 1 << 23
@@ -34,33 +32,35 @@ class Splats:
     means2d: Tensor  # [M, 2] px
     feet: Tensor  # [M, F], what `alpha` needs of each
     colors: Tensor  # [M, 3]
+    least_alpha: Tensor  # [M], below it a splat is not drawn
     alpha: Callable[[Tensor, Tensor, Tensor], Tensor]  # (feet [..., F], dx, dy px from the center) -> alpha
 
 
-def composite(splats: Splats, extents: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+def composite(splats: Splats, extents: Tensor, camera: Camera, settings: RenderSettings) -> tuple[Tensor, Tensor]:
     """Front-to-back over black: color [H, W, 3] and transmittance [H, W]. `extents` [M, 2]: half-sizes in px."""
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    starts, members = bin_tiles(splats.means2d, extents, columns, rows)
+    tile = settings.tile
+    columns, rows = -(-camera.width // tile), -(-camera.height // tile)
+    starts, members = bin_tiles(splats.means2d, extents, columns, rows, tile)
     # The empty sum ties the image to the splats even where none is drawn: its gradient is then 0, not an error.
-    color = splats.colors[:0].sum() + splats.colors.new_zeros(rows * columns, TILE * TILE, 3)
-    through = splats.colors.new_ones(rows * columns, TILE * TILE)
-    parts = (splats.alpha, splats.means2d, splats.feet, splats.colors)
-    for tiles, ids in _batches(starts, members):
-        pixels = _pixel_centers(tiles, columns).to(splats.colors)
+    color = splats.colors[:0].sum() + splats.colors.new_zeros(rows * columns, tile**2, 3)
+    through = splats.colors.new_ones(rows * columns, tile**2)
+    parts = (splats.alpha, splats.means2d, splats.feet, splats.colors, splats.least_alpha, settings.min_transmittance)
+    for tiles, ids in _batches(starts, members, tile**2):
+        pixels = _pixel_centers(tiles, columns, tile).to(splats.colors)
         if torch.is_grad_enabled():
             batch = checkpoint(_composite_batch, *parts, ids, pixels, use_reentrant=False, preserve_rng_state=False)
         else:
             batch = _composite_batch(*parts, ids, pixels)
         color, through = color.index_copy(0, tiles, batch[0]), through.index_copy(0, tiles, batch[1])
-    return _untile(color, columns, camera), _untile(through[..., None], columns, camera)[..., 0]
+    return _untile(color, columns, tile, camera), _untile(through[..., None], columns, tile, camera)[..., 0]
 
 
-def bin_tiles(means2d: Tensor, extents: Tensor, columns: int, rows: int) -> tuple[Tensor, Tensor]:
+def bin_tiles(means2d: Tensor, extents: Tensor, columns: int, rows: int, tile: int) -> tuple[Tensor, Tensor]:
     """Which splats touch which tile: offsets [tiles + 1] into members [pairs], in the splats' order within each tile."""
     grid = means2d.new_tensor([columns, rows])
     # Clamped while still floating-point: a splat may reach further than an integer can count.
-    low = ((means2d - extents) / TILE).floor().clamp_min(0).minimum(grid).long()
-    high = ((means2d + extents) / TILE).floor().add(1).clamp_min(0).minimum(grid).long()
+    low = ((means2d - extents) / tile).floor().clamp_min(0).minimum(grid).long()
+    high = ((means2d + extents) / tile).floor().add(1).clamp_min(0).minimum(grid).long()
     span = (high - low).clamp_min(0)
     counts = span[:, 0] * span[:, 1]
     ids = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
@@ -72,44 +72,46 @@ def bin_tiles(means2d: Tensor, extents: Tensor, columns: int, rows: int) -> tupl
     return torch.cat([starts.new_zeros(1), starts]), ids[order]
 
 
-def _batches(starts: Tensor, members: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+def _batches(starts: Tensor, members: Tensor, pixels: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Tiles [B] and their padded lists [B, K] (-1: none), longest first, so that lists of one batch are of like length."""
     counts = starts.diff()
     order = counts.argsort(descending=True, stable=True)
     order = order[: int((counts > 0).sum())]
     while len(order):
         longest = int(counts[order[0]])
-        take = max(1, BATCH_PAIRS // (longest * TILE * TILE))
+        take = max(1, BATCH_PAIRS // (longest * pixels))
         tiles, order = order[:take], order[take:]
         slots = torch.arange(longest, device=starts.device)
         inside = slots < counts[tiles][:, None]
         yield tiles, torch.where(inside, members[(starts[tiles][:, None] + slots).clamp_max(len(members) - 1)], -1)
 
 
-def _composite_batch(falloff: Callable, means2d: Tensor, feet: Tensor, colors: Tensor, ids: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def _composite_batch(
+    falloff: Callable, means2d: Tensor, feet: Tensor, colors: Tensor, least: Tensor, stop: float, ids: Tensor, pixels: Tensor
+) -> tuple[Tensor, Tensor]:
     """One batch of tiles: ids [B, K], pixels [B, P, 2] -> color [B, P, 3], transmittance [B, P]."""
     shown = (ids >= 0)[:, :, None]
     ids = ids.clamp_min(0)
     dx, dy = (pixels[:, None] - means2d[ids][:, :, None]).unbind(-1)  # [B, K, P]
     alpha = falloff(feet[ids][:, :, None], dx, dy).clamp_max(MAX_ALPHA)
-    alpha = torch.where(shown & (alpha >= MIN_ALPHA), alpha, 0.0)
+    alpha = torch.where(shown & (alpha >= least[ids][:, :, None]), alpha, 0.0)
     after = torch.cumprod(1 - alpha, dim=1)
-    open_ = after.detach() >= MIN_TRANSMITTANCE  # a pixel stops before the splat that would finish it
+    open_ = after.detach() >= stop  # a pixel stops before the splat that would finish it
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     weights = torch.where(open_, before * alpha, 0.0)
     through = torch.where(open_, 1 - alpha, 1.0).prod(dim=1)
     return torch.einsum("bkp,bkc->bpc", weights, colors[ids]), through
 
 
-def _pixel_centers(tiles: Tensor, columns: int) -> Tensor:
+def _pixel_centers(tiles: Tensor, columns: int, tile: int) -> Tensor:
     """[B, P, 2] px, row by row inside each tile."""
-    step = torch.arange(TILE, device=tiles.device) + 0.5
+    step = torch.arange(tile, device=tiles.device) + 0.5
     inside = torch.stack(torch.meshgrid(step, step, indexing="xy"), -1).flatten(0, 1)
-    corner = torch.stack([tiles % columns, tiles // columns], -1) * TILE
+    corner = torch.stack([tiles % columns, tiles // columns], -1) * tile
     return corner[:, None] + inside
 
 
-def _untile(tiles: Tensor, columns: int, camera: Camera) -> Tensor:
-    """[tiles, TILE², C] -> [H, W, C]."""
-    grid = tiles.unflatten(1, (TILE, TILE)).unflatten(0, (-1, columns))
+def _untile(tiles: Tensor, columns: int, tile: int, camera: Camera) -> Tensor:
+    """[tiles, tile², C] -> [H, W, C]."""
+    grid = tiles.unflatten(1, (tile, tile)).unflatten(0, (-1, columns))
     return grid.transpose(1, 2).flatten(2, 3).flatten(0, 1)[: camera.height, : camera.width]

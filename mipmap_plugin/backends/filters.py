@@ -61,13 +61,13 @@ class Footprint:
         yy, shear, across, opacity = packed.unbind(-1)
         return opacity * torch.exp(-(dy.square() / yy + (dx - shear * dy).square() / across) / 2)
 
-    def visible(self, min_alpha: float) -> Tensor:
-        """[N] bool: finite, and bright enough to reach `min_alpha` somewhere."""
+    def visible(self, min_alpha: Tensor) -> Tensor:
+        """[N] bool: finite, and bright enough to reach `min_alpha` [N] somewhere."""
         finite = torch.isfinite(torch.stack([self.yy, self.shear, self.across, self.xx, self.opacities])).all(0)
         return finite & (self.opacities >= min_alpha) & (self.across > 0)
 
-    def extents(self, min_alpha: float) -> Tensor:
-        """[N, 2] px, without gradient: the half-sizes of the box around each ellipse alpha >= `min_alpha`."""
+    def extents(self, min_alpha: Tensor) -> Tensor:
+        """[N, 2] px, without gradient: the half-sizes of the box around each ellipse alpha >= `min_alpha` [N]."""
         reach = (2 * (self.opacities / min_alpha).log()).clamp_min(0)
         return (reach[:, None] * torch.stack([self.xx, self.yy], -1)).sqrt().detach()
 

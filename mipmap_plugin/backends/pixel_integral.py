@@ -54,15 +54,15 @@ class PixelIntegral:
         long, short, cos, sin, opacity = packed.unbind(-1)
         return opacity * 2 * math.pi * integral(cos * dx + sin * dy, long) * integral(cos * dy - sin * dx, short)
 
-    def visible(self, min_alpha: float) -> Tensor:
-        """[N] bool: finite, and bright enough to reach `min_alpha` somewhere. A splat without any width sends no light."""
+    def visible(self, min_alpha: Tensor) -> Tensor:
+        """[N] bool: finite, and bright enough to reach `min_alpha` [N] somewhere. A splat without any width sends no light."""
         zero = torch.zeros_like(self.long)
         return torch.isfinite(torch.cat([self.packed(), self.xx[:, None], self.yy[:, None]], 1)).all(1) & (
             self.alpha(self.packed(), zero, zero) >= min_alpha
         )
 
-    def extents(self, min_alpha: float) -> Tensor:
-        """[N, 2] px, without gradient: half-sizes of a box around all pixels with alpha >= `min_alpha`, half a turned pixel included."""
+    def extents(self, min_alpha: Tensor) -> Tensor:
+        """[N, 2] px, without gradient: half-sizes of a box around all pixels with alpha >= `min_alpha` [N], half a turned pixel included."""
         reach = (2 * (BOUND**2 * self.opacities / min_alpha).log()).clamp_min(0).sqrt()
         pixel = (self.cos.abs() + self.sin.abs()) / 2
         return (reach[:, None] * torch.stack([self.xx, self.yy], -1).sqrt() + pixel[:, None]).detach()

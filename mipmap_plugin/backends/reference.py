@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.compositing import MIN_ALPHA, Splats, composite
+from mipmap_plugin.backends.compositing import Splats, composite
 from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
 from mipmap_plugin.backends.harmonics import colors
 from mipmap_plugin.backends.pixel_integral import PixelIntegral
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
 
 
@@ -22,7 +24,7 @@ class ReferenceBackend:
     name = "reference"
     api_version = API_VERSION
     speed = 0
-    capabilities = Capabilities(devices=None, dtypes=frozenset({torch.float32, torch.float64}), screen_filters=SCREEN_FILTERS)
+    capabilities = Capabilities(devices=None, dtypes=frozenset({torch.float32, torch.float64}), screen_filters=SCREEN_FILTERS, settings=True)
 
     def lacking(self, needs: Needs) -> list[str]:
         return self.capabilities.lacking(needs)
@@ -34,7 +36,8 @@ class ReferenceBackend:
         projected, feet = _footprints(gaussians, camera, effects)
         degree = min(effects.sh_degree, gaussians.sh_degree)
         rgb = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), degree)
-        color, through = composite(Splats(projected.means2d, feet.packed(), rgb, feet.alpha), extents(feet), camera)
+        least = least_alpha(feet, effects.settings)
+        color, through = composite(Splats(projected.means2d, feet.packed(), rgb, least, feet.alpha), feet.extents(least), camera, effects.settings)
         return Rendered(color + through[..., None] * color.new_tensor(effects.background), 1 - through)
 
 
@@ -44,10 +47,11 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor
     Found first and without gradients, so that a row that is not drawn, however broken, is in no gradient either.
     """
     projected, feet = _footprints(gaussians, camera, effects)
-    half = extents(feet)
+    least = least_alpha(feet, effects.settings)
+    half = feet.extents(least)
     low, high = projected.means2d - half, projected.means2d + half
     inside = (high > 0).all(1) & (low < low.new_tensor([camera.width, camera.height])).all(1)
-    drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & feet.visible(MIN_ALPHA) & inside
+    drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & feet.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
     return rows[projected.depths[rows].argsort(stable=True)]
 
@@ -59,9 +63,14 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
     return torch.isfinite(torch.cat(given + shape, dim=1)).all(1)
 
 
-def extents(feet: Footprint | PixelIntegral) -> Tensor:
-    """[N, 2] px: the half-sizes of a box around all pixels that each splat can touch."""
-    return feet.extents(MIN_ALPHA)
+@torch.no_grad()
+def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Tensor:
+    """[N]: the alpha below which each splat is not drawn. A radius of r standard deviations is exp(-r²/2) of its brightest."""
+    packed = feet.packed()
+    if settings.radius is None:
+        return packed.new_full(packed.shape[:1], settings.min_alpha)
+    zero = torch.zeros_like(packed[:, 0])
+    return (feet.alpha(packed, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
 def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral]:

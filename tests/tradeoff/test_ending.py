@@ -1,6 +1,7 @@
 """Adapting ends when the curve says so, and says why; whoever watches sees the model while the clock stands."""
 
 import time
+from itertools import pairwise
 
 import pytest
 import tiny
@@ -41,7 +42,7 @@ def test_the_observer_sees_every_step_and_the_model_of_that_step():
     camera = tiny.cameras(1)[0].zoomed(1 / 4)
     adapted = wrapped().adapt(1 / 4, observe=lambda step, seconds, show: seen.append((step, seconds, show(camera).detach())), **STEPS)
     assert [step for step, _, _ in seen] == list(range(13))
-    assert all(before[1] < after[1] for before, after in zip(seen, seen[1:], strict=False))
+    assert all(before[1] < after[1] for before, after in pairwise(seen))
     assert torch.equal(seen[-1][2], adapted.render(camera).image)
     assert not torch.equal(seen[0][2], seen[-1][2])
 

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from mipmap_plugin.backends.compositing import MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner, kernel
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
+from mipmap_plugin.effects import MIN_ALPHA
 
 # px. A row for each lane, to trace a splat through all of them at once; and wide: a splat is cut into few pieces, and where it
 # crosses a row is exact anyway. A tile's state fits a first-level cache.

@@ -8,7 +8,6 @@ What happens to the pixels themselves is in `planes`.
 
 import numpy as np
 
-from mipmap_plugin.backends.compositing import MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, SLACK, TILE_COLUMNS, TILE_ROWS, tile_grid
@@ -32,6 +31,7 @@ from mipmap_plugin.backends.cpu_kernels.lanes import (
     total,
 )
 from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, BEHIND, CREST, END, ENDS, LIGHT, PLANE, RIDGE, STATE, STRIDE, cover, uncover
+from mipmap_plugin.effects import MIN_ALPHA
 
 # Splats between two looks at whether the tile is finished.
 PATIENCE = 16

@@ -8,11 +8,11 @@ A splat is binned by an ellipse around all that it can touch: that of its Gaussi
 
 import math
 
-from mipmap_plugin.backends.compositing import MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import exp2, fma, maximum, minimum, select
 from mipmap_plugin.backends.pixel_integral import BOUND, CUBIC, LINEAR, MAX_POWER, ROUND
+from mipmap_plugin.effects import MIN_ALPHA
 
 LOG2E = 1 / math.log(2)
 

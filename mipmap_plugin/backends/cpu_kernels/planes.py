@@ -6,10 +6,11 @@ Pixels lie in planes of TILE_ROWS rows, each WIDTH longer than the tile, so that
 # numba gives calls and operators a meaning of its own.
 # mypy: ignore-errors
 
-from mipmap_plugin.backends.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
+from mipmap_plugin.backends.compositing import MAX_ALPHA
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.binning import TILE_COLUMNS, TILE_ROWS
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, load, minimum, select, store
+from mipmap_plugin.effects import MIN_TRANSMITTANCE
 
 STRIDE = TILE_COLUMNS + WIDTH
 PLANE = TILE_ROWS * STRIDE

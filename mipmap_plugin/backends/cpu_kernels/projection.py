@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from mipmap_plugin.backends.compositing import MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, integrals, kernel
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, blend, dot, minus, plus, row, set_row, times
+from mipmap_plugin.effects import MIN_ALPHA
 
 # -q/2 = -HALF_LOG2E · q in powers of two.
 HALF_LOG2E = 0.5 / math.log(2)
