@@ -13,7 +13,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # From the ground up; a module imports only what lies below its own storey, or in its own package.
 STOREYS = [
     {"errors"},
-    {"registry", "config", "files"},
+    {"registry", "config", "files", "torchvision_absent"},
     {"gaussians", "camera"},
     {"effects"},
     {"backends", "models", "scenes"},
@@ -37,8 +37,9 @@ CONFINED = {
     "pycolmap": ["scenes/"],
     "pydantic": ["config.py", "adaptation/curve.py", "adaptation/report.py"],
     "pytest": ["backends/conformance/suite.py"],
+    "safetensors": ["adaptation/super_resolution.py"],
     "skimage": ["evaluation/metrics.py"],
-    "spandrel": ["adaptation/upsamplers.py"],
+    "spandrel": ["adaptation/super_resolution.py"],
     "tqdm": ["adaptation/loop.py", "evaluation/evaluate.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],

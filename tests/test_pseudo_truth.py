@@ -99,7 +99,7 @@ def test_a_render_is_never_finer_than_the_base(scale):
 
 
 def test_an_unknown_upsampler_is_refused_before_anything_is_rendered():
-    with pytest.raises(SettingsError, match="there is no 'swin'"):
+    with pytest.raises(SettingsError, match="there is no upsampler 'swin'"):
         teacher(1 / 4, upsampler="swin")
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
+from mipmap_plugin.adaptation.upsamplers import find_upsampler
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -25,7 +25,7 @@ class PseudoTruth:
     def __init__(self, base: SplatModel, backend: Backend, effects: Effects, scale: float, config: AdaptConfig) -> None:
         """`effects`: how the base is rendered at the scale that it was trained at. Raises SettingsError for an unknown upsampler."""
         self._base, self._backend, self._effects, self._scale, self._config = base, backend, effects, scale, config
-        self._enlarge = UPSAMPLERS.get(config.upsampler)
+        self._enlarge = find_upsampler(config.upsampler)
         self._made: dict[Camera, Tensor] = {}
 
     def __call__(self, view: Camera) -> Tensor:

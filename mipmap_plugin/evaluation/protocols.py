@@ -8,7 +8,7 @@ from typing import Protocol as TypingProtocol
 from torch import Tensor
 
 from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
+from mipmap_plugin.adaptation.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes import Scene
@@ -79,4 +79,4 @@ def resized_base(render: Tensor, size: tuple[int, int], upsampler: str = "bicubi
     if size[0] < render.shape[0]:
         whole = render.shape[0] % size[0] == 0 and render.shape[1] % size[1] == 0
         return resize(render, size, "box" if whole else "area")
-    return UPSAMPLERS.get(upsampler)(render, size)
+    return find_upsampler(upsampler)(render, size)
