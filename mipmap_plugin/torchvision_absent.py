@@ -57,8 +57,6 @@ def _forget() -> None:
 class _Empty(ModuleType):
     """Any name can be imported from it, and none can be used."""
 
-    __path__: tuple[str, ...] = ()
-
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("__"):
             raise AttributeError(name)
