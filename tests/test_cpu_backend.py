@@ -190,15 +190,30 @@ def test_power_of_two_in_lanes():
 
 
 @needs_numba
-def test_depths_sort_as_floats_with_ties_in_order():
+@pytest.mark.parametrize("length", [0, 1, 20, 3000])
+def test_depths_sort_as_floats_with_ties_in_order(length):
     import numpy as np
 
-    from mipmap_plugin.backends.cpu_kernels.binning import depth_order
+    from mipmap_plugin.backends.cpu_kernels.sorting import SLOT_BITS, sort
 
-    depths = np.random.default_rng(0).choice(np.float32([0.25, 1e-30, 3.0, 3.0000002, 1e30]), 3000)
-    counts = np.random.default_rng(1).integers(0, 3, 3000)
-    drawn = np.flatnonzero(counts)
-    assert np.array_equal(depth_order(depths, counts), drawn[np.argsort(depths[drawn], kind="stable")])
+    rng = np.random.default_rng(length)
+    depths = rng.choice(np.float32([0.25, 1e-30, 3.0, 3.0000002, 1e30]), length)
+    splats = rng.permutation(length).astype(np.int32)
+    entries = depths.view(np.int32).astype(np.int64) << SLOT_BITS | np.arange(length)
+    members = np.empty_like(splats)
+    sort(0, 1, np.array([0, length]), entries, splats, members)
+    right = np.argsort(depths, kind="stable")
+    assert np.array_equal(entries, right) and np.array_equal(members, splats[right])
+
+
+@needs_numba
+def test_torch_works_on_after_its_idle_threads_were_dismissed():
+    torch.set_num_threads(2)
+    values = torch.rand(100_000)
+    expected = values.exp().sum()
+    for _ in range(3):
+        BACKEND.render(gaussians(20, dtype=torch.float32), camera(), Effects(1))
+        assert torch.equal(values.exp().sum(), expected)
 
 
 def test_without_numba_it_says_what_to_install(monkeypatch):

@@ -1,8 +1,6 @@
-"""Which splats touch which tile: exact at the rows and columns of the ellipse alpha >= 1/255, in depth order within each tile."""
+"""Which tiles a splat touches: exact at the rows and columns of the ellipse alpha >= 1/255."""
 
 import math
-
-import numpy as np
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner, kernel
@@ -18,9 +16,6 @@ TILE_COLUMNS = 64
 SLACK = 0.01  # px
 
 LOG_MIN_ALPHA = math.log2(MIN_ALPHA)
-
-# Bits of a depth sorted at a time.
-_DIGIT = 11
 
 
 @kernel
@@ -72,54 +67,16 @@ def count_tiles(table, i, width, height):
     return count
 
 
-@kernel
-def cover(start, stop, table, slots, width, height, tiles):
-    """Write the tiles of the splats start..stop into their slots."""
+@inner
+def cover(table, i, slot, width, height, tiles, counts, run):
+    """Write the tiles of splat i into its slots, from `slot` on, and count them as those of a run."""
     columns = tile_grid(width, height)[0]
-    for i in range(start, stop):
-        slot = slots[i]
-        if slot == slots[i + 1]:
-            continue
-        first, last = rows_of(table, i, 0, height - 1)
-        for tile_row in range(first // TILE_ROWS, last // TILE_ROWS + 1):
-            top, bottom = max(first, tile_row * TILE_ROWS), min(last, tile_row * TILE_ROWS + TILE_ROWS - 1)
-            left, right = tile_columns(table, i, top, bottom, width)
-            for tile_column in range(left, right + 1):
-                tiles[slot] = tile_row * columns + tile_column
-                slot += 1
-
-
-@kernel
-def depth_order(depths, counts):
-    """Indices of the drawn splats, front to back; equal depths stay in order. A radix sort: positive floats sort as their bits do."""
-    drawn = np.flatnonzero(counts)
-    keys = depths[drawn].view(np.uint32)
-    other_keys, other = np.empty_like(keys), np.empty_like(drawn)
-    for shift in range(0, 32, _DIGIT):
-        starts = np.zeros((1 << _DIGIT) + 1, np.int64)
-        for key in keys:
-            starts[((key >> shift) & ((1 << _DIGIT) - 1)) + 1] += 1
-        starts = np.cumsum(starts)
-        for n in range(len(keys)):
-            digit = (keys[n] >> shift) & ((1 << _DIGIT) - 1)
-            other_keys[starts[digit]], other[starts[digit]] = keys[n], drawn[n]
-            starts[digit] += 1
-        keys, other_keys, drawn, other = other_keys, keys, other, drawn
-    return drawn
-
-
-@kernel
-def fill_lists(order, slots, tiles, tile_count):
-    """Each tile's splats and their slots, front to back: starts [tiles + 1] into members [pairs] and their slots [pairs]."""
-    starts = np.zeros(tile_count + 1, np.int64)
-    for tile in tiles:
-        starts[tile + 1] += 1
-    starts = np.cumsum(starts)
-    cursors = starts[:-1].copy()
-    members, member_slots = np.empty(len(tiles), np.int64), np.empty(len(tiles), np.int64)
-    for i in order:
-        for slot in range(slots[i], slots[i + 1]):
-            at = cursors[tiles[slot]]
-            members[at], member_slots[at] = i, slot
-            cursors[tiles[slot]] += 1
-    return starts, members, member_slots
+    first, last = rows_of(table, i, 0, height - 1)
+    for tile_row in range(first // TILE_ROWS, last // TILE_ROWS + 1):
+        top, bottom = max(first, tile_row * TILE_ROWS), min(last, tile_row * TILE_ROWS + TILE_ROWS - 1)
+        left, right = tile_columns(table, i, top, bottom, width)
+        for tile_column in range(left, right + 1):
+            tile = tile_row * columns + tile_column
+            tiles[slot] = tile
+            counts[run, tile] += 1
+            slot += 1

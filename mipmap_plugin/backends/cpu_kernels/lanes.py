@@ -210,7 +210,8 @@ def prefetch(_context, array, row):
         kind = signature.args[0]
         record = context.make_array(kind)(context, builder, values[0])
         columns = builder.extract_value(record.shape, 1)
-        place = builder.bitcast(builder.gep(record.data, [builder.mul(values[1], columns)]), cgutils.voidptr_t)
+        row = context.cast(builder, values[1], signature.args[1], types.intp)
+        place = builder.bitcast(builder.gep(record.data, [builder.mul(row, columns)]), cgutils.voidptr_t)
         number = ir.IntType(32)
         signature = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
         function = cgutils.get_or_insert_function(builder.module, signature, "llvm.prefetch.p0")
