@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -31,9 +32,12 @@ class Camera:
     def __post_init__(self) -> None:
         if tuple(self.viewmat.shape) != (4, 4):
             raise ShapeError(f"viewmat: expected shape [4, 4], got {list(self.viewmat.shape)}")
-        if min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:
+        is_lens = min(self.fx, self.fy) > 0 and all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy)))
+        if min(self.width, self.height) < 1 or not is_lens:
             raise SettingsError(f"camera {self.name!r}: {self.width}x{self.height} px with focal lengths {self.fx}, {self.fy} is not a view")
         object.__setattr__(self, "viewmat", self.viewmat.detach().to("cpu", torch.float64))
+        if not self.viewmat.isfinite().all():
+            raise SettingsError(f"camera {self.name!r}: its pose holds NaN or infinity, so that it is nowhere")
 
     @property
     def center(self) -> Tensor:

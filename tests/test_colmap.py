@@ -129,7 +129,7 @@ def test_broken_models_are_refused_in_one_sentence(tmp_path):
     (tmp_path / "torn/sparse/0").mkdir(parents=True)
     for name in ("cameras", "images", "points3D"):
         (tmp_path / f"torn/sparse/0/{name}.bin").write_bytes(b"\1\2\3")
-    with pytest.raises(SceneError, match="is not a COLMAP model that pycolmap reads"):
+    with pytest.raises(SceneError, match="is truncated or damaged, for it is shorter than its own counts say"):
         load_scene(tmp_path / "torn")
 
 

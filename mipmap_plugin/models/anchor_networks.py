@@ -127,7 +127,7 @@ def _read_united(path: Path) -> Weights:
 def _check(name: str, state: dict[str, Tensor], folder: Path | str) -> None:
     wanted = {EMBEDDING} if name == "appearance" else LAYERS
     if state.keys() != wanted or not all(isinstance(held, Tensor) and held.dtype == torch.float32 for held in state.values()):
-        raise CheckpointError(f"{folder}: {name} holds {', '.join(sorted(state)) or 'nothing'}, not {', '.join(sorted(wanted))} in 32 bits")
+        raise CheckpointError(f"{folder}: {name} holds {', '.join(sorted(map(str, state))) or 'nothing'}, not {', '.join(sorted(wanted))} in 32 bits")
     if name == "appearance":
         fits = state[EMBEDDING].dim() == 2
     else:

@@ -142,10 +142,10 @@ def _family_of_network(ply: Path, family: str) -> str:
     return "sc-gs" if family == "deformable" and "nodes" in names_in_torch_file(network, ("nodes",)) else family
 
 
-def _family_of_filter_3d(folder: Path | None, told: str | None) -> str:
+def _family_of_filter_3d(folder: Path | None, told: Any) -> str:
     """By the options that each saves; a bare file that was written here tells its family."""
     options: dict[str, Any] = read_cfg_args(folder / "cfg_args") if folder and (folder / "cfg_args").is_file() else {}
-    if not options and told in {"mip", "gof", "analytic"}:
+    if not options and told in ("mip", "gof", "analytic"):
         return told
     if "use_decoupled_appearance" in options:
         return "gof"

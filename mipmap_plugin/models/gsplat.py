@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import GSPLAT_FILE, detect
 from mipmap_plugin.models.gsplat_frame import normalized_frame
 from mipmap_plugin.models.tags import render_mode
-from mipmap_plugin.models.torch_file import load_torch, save_torch
+from mipmap_plugin.models.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
 from mipmap_plugin.models.yaml_scalars import read_scalars, with_scalar
 
@@ -27,6 +28,9 @@ NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 # World units, the trainer's default.
 NEAR_PLANE = 0.01
+
+# What float32 holds; a text may have any number of digits.
+MAX_OPTION = 1e38
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +87,14 @@ def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaMod
     shards = [_read(file) for file in files]
     options, notes = _options(found.folder)
     means = "means3d" if "means3d" in shards[0]["splats"] else "means"
-    siblings = {name: value for name, value in shards[0].items() if name not in ("splats", "comments")}
-    tagged = render_mode(shards[0].get("comments", ()))
-    host = GsplatHost(found.folder, options, siblings, means)
-    origin = Origin(files[0], sha256(*files), found.folder, found.iteration, tuple(shards[0].get("comments", ())), host=host)
+    siblings = {name: value for name, value in shards[0].items() if name not in ("splats", "comments", "step")}
+    step, comments = step_and_comments(shards[0], files[0])
+    host = GsplatHost(found.folder, options, {"step": step, **siblings}, means)
+    origin = Origin(files[0], sha256(*files), found.folder, found.iteration, comments, host=host)
     parts = [_parameters(shard["splats"], file) for shard, file in zip(shards, files, strict=True)]
     try:
         parameters = {name: torch.cat([part[name] for part in parts]) for name in NAMES}
-        model = VanillaModel(parameters, _trained(options, tagged), origin, notes)
+        model = VanillaModel(parameters, _trained(options, render_mode(comments)), origin, notes)
     except (ShapeError, RuntimeError) as error:  # what torch.cat raises for ranks that do not fit together
         raise CheckpointError(f"{found.path} holds tensors that do not fit together: {error}; copy it again") from error
     if len(files) > 1:
@@ -106,10 +110,9 @@ def rank_files(path: Path) -> list[Path]:
         return [path]
     siblings = (re.fullmatch(GSPLAT_FILE, file.name) for file in path.absolute().parent.iterdir())
     ranks = {int(each["rank"]): path.with_name(each.string) for each in siblings if each and each["rank"] and each["step"] == name["step"]}
-    missing = set(range(max(ranks) + 1)) - set(ranks)
-    if missing:
-        told = ", ".join(map(str, sorted(missing)))
-        raise CheckpointError(f"{path} is one of the files of several GPUs, and rank {told} of step {name['step']} is missing; copy it there")
+    if len(ranks) <= max(ranks):
+        missing = next(rank for rank in count() if rank not in ranks)
+        raise CheckpointError(f"{path} is one of the files of several GPUs, and rank {missing} of step {name['step']} is missing; copy it there")
     return [ranks[rank] for rank in sorted(ranks)]
 
 
@@ -117,7 +120,7 @@ def _read(path: Path) -> dict[str, Any]:
     content = load_torch(path)
     if not isinstance(content, dict) or not isinstance(content.get("splats"), Mapping):
         raise CheckpointError(f"{path} is no gsplat checkpoint: it has no dictionary of splats; give a ckpt_*.pt of simple_trainer")
-    return {"step": 0, **content}
+    return content
 
 
 def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
@@ -127,7 +130,7 @@ def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
         advice = "train without app_opt, or export a PLY from gsplat (save_ply), which bakes one appearance"
         raise CheckpointError(f"{path} was trained with app_opt: a network of gsplat colors its splats, which is not read here; {advice}")
     if set(named) != set(NAMES) or not all(torch.is_tensor(tensor) for tensor in named.values()):
-        raise CheckpointError(f"{path} holds the splat tensors {', '.join(named)}; expected are {', '.join(NAMES)}")
+        raise CheckpointError(f"{path} holds the splat tensors {', '.join(map(str, named))}; expected are {', '.join(NAMES)}")
     return {name: named[name].detach().float() for name in NAMES}
 
 
@@ -142,8 +145,10 @@ def _options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
         return {}, ["cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter"]
     try:
         options = json.loads(file.read_text(encoding="utf-8")) if file.suffix == ".json" else read_scalars(file)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{file} is not JSON ({error}); copy it again, or remove it") from error
+    if not isinstance(options, dict):
+        raise CheckpointError(f"{file} holds no options by name; copy it again, or remove it")
     if str(options.get("model_type", "")).startswith("2dgs"):
         raise CheckpointError(f"{file} says that the splats are flat (2DGS), a family that is recognized but not loaded")
     return options, []
@@ -157,7 +162,7 @@ def _trained(options: dict[str, Any], tagged: str | None) -> TrainedScale:
 
 def _positive(options: dict[str, Any], key: str, default: float) -> float:
     value = options.get(key)
-    return value if isinstance(value, (int, float)) and value > 0 else default
+    return value if isinstance(value, (int, float)) and 0 < value < MAX_OPTION else default
 
 
 def _oddities(options: dict[str, Any], siblings: dict[str, Any], sh_degree: int) -> list[str]:

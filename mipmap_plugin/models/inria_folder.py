@@ -6,7 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.files import new_folder, refuse_to_lose
@@ -33,7 +33,7 @@ def read_options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
 def trained_scale(options: dict[str, Any], screen_filter: str | None) -> TrainedScale:
     """How the checkpoint was trained, as far as its options and its header tag say so."""
     resolution, white = options.get("resolution"), options.get("white_background")
-    if not isinstance(resolution, (int, float)) or isinstance(resolution, bool):
+    if not _is_number(resolution):
         resolution = TrainedScale.resolution
     screen_filter, eps2d = _screen_filter(options, screen_filter)
     return TrainedScale(
@@ -44,10 +44,15 @@ def trained_scale(options: dict[str, Any], screen_filter: str | None) -> Trained
     )
 
 
+def _is_number(value: Any) -> TypeGuard[float]:
+    """Whether an option is a finite number that float32 holds; a literal may have any number of digits."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e38
+
+
 def _screen_filter(options: dict[str, Any], tag: str | None) -> tuple[str, float]:
     """Mip-Splatting and what follows it save their kernel_size; Analytic-Splatting has its multi-scale option without one."""
     kernel_size = options.get("kernel_size")
-    if tag != "classic" and isinstance(kernel_size, (int, float)) and not isinstance(kernel_size, bool):
+    if tag != "classic" and _is_number(kernel_size) and kernel_size >= 0:
         return "mip", float(kernel_size)
     if tag is None and "load_allres" in options and kernel_size is None:
         return "analytic", 0.0
@@ -95,7 +100,7 @@ def _exposure_note(path: Path) -> str:
         exposures = json.loads(path.read_text(encoding="utf-8"))
         identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
         changed = sum(matrix != identity for matrix in exposures.values())
-    except (OSError, ValueError, AttributeError) as error:
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
         return f"exposure.json cannot be read ({error}); exposures are not applied here"
     if not changed:
         return "exposure.json holds only identities: no exposure was trained"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +36,7 @@ def _refuse_placeholder(path: Path, head: bytes) -> None:
     if not head:
         raise CheckpointError(f"{path} is empty; download or export it again")
     if start.startswith(b"version https://git-lfs"):
-        size = re.search(rb"size (\d+)", head)
+        size = re.search(rb"size (\d{1,20})\b", head)
         told = f" of a file of {int(size[1]):,} bytes" if size else ""
         raise CheckpointError(f"{path} is only the Git-LFS pointer{told}; run `git lfs pull` in its repository")
     if start.startswith((b"<!doctype", b"<html", b"<?xml")):
@@ -66,7 +68,7 @@ def kind_of(path: Path) -> str:
 def names_in_torch_file(path: Path, wanted: tuple[str, ...]) -> set[str]:
     """Which of these words stand in a torch file's pickle, which is searched as bytes and never unpickled."""
     if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
+        with _archive(path) as archive:
             pickles = [name for name in archive.namelist() if name.endswith("data.pkl")]
             if not pickles:
                 return set()
@@ -91,12 +93,20 @@ def _kind_of_json(head: bytes) -> str:
     return "sog" if b".webp" in head or b"meta.json" in head else "unknown"
 
 
-def _kind_of_zip(path: Path) -> str:
+@contextmanager
+def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """An open zip archive. Raises CheckpointError for whatever zipfile raises on a damaged one, also inside the block."""
     try:
         with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except zipfile.BadZipFile as error:
-        raise CheckpointError(f"{path} is a damaged zip archive ({error}); download or copy it again") from error
+            yield archive
+    except Exception as error:  # bad offsets, names, versions, sums and streams each fail in their own way
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise CheckpointError(f"{path} is a damaged zip archive ({reason}); download or copy it again") from error
+
+
+def _kind_of_zip(path: Path) -> str:
+    with _archive(path) as archive:
+        names = archive.namelist()
     leaves = {name.rpartition("/")[2] for name in names}
     if "data.pkl" in leaves:
         compiled = any("/code/" in name for name in names) or "constants.pkl" in leaves

@@ -21,6 +21,7 @@ from mipmap_plugin.models.anchors import AnchorModel
 # How a distance becomes a level: `dist2level` of cfg_args. Progressive levels fade in.
 TO_LEVEL = {"floor": torch.floor, "round": torch.round, "ceil": torch.ceil}
 PROGRESSIVE = "progressive"
+MAX_LEVELS, MAX_FORK = 100, 1000  # published models have 5 to 20 levels, each 2 times finer
 ALMOST_ONE = 0.9999  # the original's: progressive levels are clamped just short of the next one
 
 
@@ -37,6 +38,8 @@ class OctreeModel(AnchorModel):
         super().__init__(read, inputs)
         levels = self._column("level")
         self._levels = int(levels.max() - levels.min()) + 1
+        if self._levels > MAX_LEVELS:
+            raise CheckpointError(f"{self.source}: its anchors lie in {self._levels:,} levels of detail; the file is damaged, so export it again")
         self.notes.append(f"{self._levels} levels of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
 
     def wanted_levels(self, camera: Camera) -> Tensor:
@@ -84,7 +87,7 @@ def load_octree(path: str | Path, *, iteration: int | None = None) -> OctreeMode
     if len(read.first["info"]) < 2 or not all(math.isfinite(each) and each > 0 for each in read.first["info"]):
         raise CheckpointError(f"{read.origin.source}: the first two values of `info` are no voxel size and standard distance; export it again")
     fork, to_level = read.options.get("fork", 2), read.options.get("dist2level", "round")
-    if not isinstance(fork, (int, float)) or fork <= 1 or to_level not in (*TO_LEVEL, PROGRESSIVE):
+    if not isinstance(fork, (int, float)) or not 1 < fork <= MAX_FORK or to_level not in (*TO_LEVEL, PROGRESSIVE):
         raise CheckpointError(f"{read.origin.source}: cfg_args has fork={fork!r} and dist2level={to_level!r}, which make no levels")
     model = OctreeModel(read, _inputs(read), fork, to_level)
     if "dist2level" not in read.options:

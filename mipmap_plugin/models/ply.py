@@ -94,11 +94,11 @@ def read_header(path: str | Path) -> Header:
     if first is None:
         raise CheckpointError(f"{path} is not a PLY file: it does not start with the line `ply`")
     # The first line's ending holds for the whole header (plyfile): a body may well begin with a byte that looks like one.
-    newline = rb"[ \t\r]*\n" if first[1] == b"\n" else rb"[ \t]*" + first[1]
-    end = re.search(newline + rb"end_header" + newline, head)
+    newline, blank = first[1], rb"[ \t\r]*" if first[1] == b"\n" else rb"[ \t]*"
+    end = re.search(newline + rb"end_header" + blank + newline, head)
     if end is None:
         raise CheckpointError(f"{path} has no end_header in its first {MAX_HEADER // 1024} kB: it is cut off or not a PLY; download it again")
-    header = _parsed(path, re.split(newline, head[first.end() : end.start()]), end.end())
+    header = _parsed(path, head[first.end() : end.start()].split(newline), end.end())
     return _sized(path, header, path.stat().st_size - end.end())
 
 
@@ -154,7 +154,8 @@ def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
             raise CheckpointError(f"{path}: line {number} of the PLY header cannot be read: {line[:80].decode('ascii', 'replace')!r}") from error
     if not form:
         raise CheckpointError(f"{path}: the PLY header has no `format` line; export the file again")
-    return Header(form, tuple(elements), tuple(comments), body)
+    # Rows of nothing may be of any number, and plyfile would count to it.
+    return Header(form, tuple(element for element in elements if element.properties), tuple(comments), body)
 
 
 def _with_property(element: Element, words: list[str]) -> Element:
@@ -183,7 +184,7 @@ def _count(word: str) -> int:
 def _sized(path: Path, header: Header, size: int) -> Header:
     """Compare the `size` bytes after the header with what it declares."""
     vertices = [element for element in header.elements if element.name == "vertex"]
-    if not vertices or not vertices[0].properties:
+    if not vertices:
         raise CheckpointError(f"{path} has no vertex element, so it holds no splats; its elements are {[e.name for e in header.elements]}")
     vertex = vertices[0]
     if vertex.has_lists:

@@ -19,7 +19,7 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import C0
 from mipmap_plugin.models.detect import RESULTS, detect
 from mipmap_plugin.models.tags import render_mode
-from mipmap_plugin.models.torch_file import load_torch, save_torch
+from mipmap_plugin.models.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.models.vanilla import OPACITY_MARGIN, Origin, VanillaModel, without_poison
 from mipmap_plugin.models.yaml_scalars import read_scalars, with_scalar
 
@@ -73,7 +73,7 @@ class SplatfactoHost:
     def _content(self, parameters: dict[str, Tensor], comments: Sequence[str]) -> dict[str, Any]:
         content = load_torch(self.source)
         stored = to_stored(parameters)
-        pipeline = {key: stored[name[1]] if (name := re.fullmatch(KEY, key)) else value for key, value in content["pipeline"].items()}
+        pipeline = {key: stored[name[1]] if (name := re.fullmatch(KEY, str(key))) else value for key, value in content["pipeline"].items()}
         return {**content, "pipeline": pipeline, "comments": list(comments)}
 
     def _frame(self) -> Tensor:
@@ -82,7 +82,7 @@ class SplatfactoHost:
         try:
             facts = json.loads(file.read_text(encoding="utf-8"))
             scale, transform = float(facts["scale"]), torch.tensor(facts["transform"], dtype=torch.float64)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             advice = "without it the cameras of the scene cannot be placed; copy it from the folder of the training"
             raise SceneError(f"{file} cannot be read ({error}): {advice}") from error
         if tuple(transform.shape) != (3, 4) or not scale > 0:
@@ -110,8 +110,8 @@ def load_splatfacto(path: str | Path, *, iteration: int | None = None) -> Vanill
     stored = _stored(content, found.path)
     config = found.folder / "config.yml" if found.folder else None
     options = read_scalars(config) if config and config.is_file() else {}
-    comments = tuple(content.get("comments", ()))
-    host = SplatfactoHost(found.path, found.folder, int(content.get("step", 0)), options)
+    step, comments = step_and_comments(content, found.path)
+    host = SplatfactoHost(found.path, found.folder, step, options)
     origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, comments, host=host)
     antialiased = "antialiased" if options.get("rasterize_mode") == "antialiased" else "classic"
     background = BACKGROUNDS.get(str(options.get("background_color")))
@@ -157,7 +157,7 @@ def _oddities(pipeline: Mapping[str, Any], options: dict[str, Any]) -> list[str]
     notes = []
     if not options:
         notes.append("config.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter")
-    if any(key.endswith("camera_optimizer.pose_adjustment") for key in pipeline):
+    if any(str(key).endswith("camera_optimizer.pose_adjustment") for key in pipeline):
         notes.append("the training moved its cameras (camera_optimizer); the cameras of the scene are rendered as they are given")
     if options.get("use_bilateral_grid"):
         notes.append("trained with a bilateral grid: nerfstudio regrades each training view by its own, which is not applied here")

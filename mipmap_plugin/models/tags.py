@@ -39,7 +39,7 @@ def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:
         if comment.startswith(PROVENANCE + " {"):
             try:
                 return json.loads(comment.removeprefix(PROVENANCE))
-            except json.JSONDecodeError:
+            except (json.JSONDecodeError, RecursionError):
                 return None
     return None
 

@@ -12,7 +12,7 @@ from mipmap_plugin.models.magic import read_head
 # Bytes; real files have 1 to 20 kB.
 MAX_SIZE = 1024 * 1024
 
-_LINE = re.compile(r"^( *)(?:- )?([A-Za-z_]\w*): +([^\s!&*\[{|>].*?)\s*$", re.MULTILINE)
+_LINE = re.compile(r"^( *)(?:- )?([A-Za-z_]\w*): +([^\s!&*\[{|>].*)$", re.MULTILINE)
 _WORDS = {"true": True, "false": False, "null": None, "~": None}
 
 
@@ -26,7 +26,7 @@ def read_scalars(path: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for indent, key, value in _LINE.findall(text):
         if len(indent) < depths.get(key, len(indent) + 1):
-            depths[key], found[key] = len(indent), _scalar(value)
+            depths[key], found[key] = len(indent), _scalar(value.strip())
     return found
 
 
@@ -40,5 +40,5 @@ def _scalar(text: str) -> Any:
         return _WORDS[text.lower()]
     try:
         return ast.literal_eval(text)
-    except (ValueError, SyntaxError):
+    except (ValueError, SyntaxError, RecursionError, MemoryError):  # the last two: brackets without end
         return text

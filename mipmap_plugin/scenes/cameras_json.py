@@ -14,7 +14,7 @@ import torch
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.files import write_json
-from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
+from mipmap_plugin.scenes.json_file import MAX_SIDE, numbers, pixels, positive, present, read_json, rotation
 
 # INRIA's reader holds out every eighth photograph of a COLMAP scene.
 TEST_EVERY = 8
@@ -86,11 +86,11 @@ def trained_size(width: int, height: int, cfg: dict[str, Any]) -> tuple[int, int
     images_2, images_4 and images_8 hold photographs shrunk by that factor. Rounding is `loadCam`'s: the divisors
     round, the cap and the target width cut off.
     """
-    shrunk = re.fullmatch(r"images_(\d+)", str(cfg.get("images", "")))
+    shrunk = re.fullmatch(r"images_(\d{1,9})", str(cfg.get("images", "")))
     if shrunk and int(shrunk[1]) > 0:
         width, height = max(1, round(width / int(shrunk[1]))), max(1, round(height / int(shrunk[1])))
     resolution = cfg.get("resolution", 1)
-    if not isinstance(resolution, (int, float)) or (resolution <= 0 and resolution != -1):
+    if not isinstance(resolution, (int, float)) or not (resolution == -1 or 0 < resolution <= MAX_SIDE):
         raise SceneError(f"cfg_args: resolution={resolution!r} is no training size; use 1, 2, 4, 8, -1 or a width in pixels")
     if resolution in DIVISORS:
         return max(1, round(width / resolution)), max(1, round(height / resolution))

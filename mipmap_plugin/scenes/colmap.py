@@ -12,7 +12,9 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, trained_size
-from mipmap_plugin.scenes.images import image_size
+from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
+from mipmap_plugin.scenes.images import image_size, is_file
+from mipmap_plugin.scenes.json_file import pixels
 
 if TYPE_CHECKING:
     import pycolmap
@@ -36,7 +38,10 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     path, cfg = Path(path), cfg or {}
     model = _read(path)
     folder = _root(path) / str(cfg.get("images", "images"))
-    images = sorted(model.images.values(), key=lambda image: image.name)
+    try:
+        images = sorted(model.images.values(), key=lambda image: image.name)
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: the COLMAP model has names of images that are no UTF-8; copy or export it again") from error
     if not images:
         raise SceneError(f"{path}: the COLMAP model has no image with a pose; run the mapper again")
     _refuse_distortion(model, path)
@@ -45,7 +50,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     for index, image in enumerate(images):
         camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
         photograph = folder / image.name
-        if photograph.is_file():
+        if is_file(photograph):
             camera = camera.resized(*trained_size(*image_size(photograph), {**cfg, "images": "images"}))
             photographs[camera] = photograph
         else:
@@ -78,6 +83,7 @@ def _read(path: Path) -> pycolmap.Reconstruction:
     folder = _model_folder(path)
     if folder is None:
         raise SceneError(f"{path}: holds no COLMAP model (sparse/0 with cameras, images and points3D); give the folder that does")
+    refuse_truncated(folder)
     try:
         return pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap raises what its C++ does for a damaged file
@@ -100,7 +106,8 @@ def _camera(model: pycolmap.Reconstruction, image: pycolmap.Image, split: Litera
     viewmat[:3] = torch.as_tensor(image.cam_from_world().matrix())
     cx, cy = (lens.width / 2, lens.height / 2) if centered else (lens.principal_point_x, lens.principal_point_y)
     name = Path(image.name).with_suffix("").as_posix()
-    return Camera(lens.width, lens.height, lens.focal_length_x, lens.focal_length_y, cx, cy, viewmat, name, split)
+    width, height = (pixels(side, f"{image.name}, {what}") for what, side in (("width", lens.width), ("height", lens.height)))
+    return Camera(width, height, lens.focal_length_x, lens.focal_length_y, cx, cy, viewmat, name, split)
 
 
 def _points(model: pycolmap.Reconstruction) -> Tensor | None:

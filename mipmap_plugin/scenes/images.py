@@ -50,6 +50,14 @@ def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
     return (blended * 255.0).astype(np.uint8)
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file; False also for a name that the system does not take, which files that list images may hold."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def image_size(path: str | Path) -> tuple[int, int]:
     """(width, height) in px of an image file, from its header alone. Raises SceneError."""
     with _opened(path) as image:

@@ -14,6 +14,9 @@ from mipmap_plugin.errors import SceneError
 
 GIT_LFS_POINTER = b"version https://git-lfs"
 
+# px; an image of this width and height would take 120 GB.
+MAX_SIDE = 100_000
+
 # A rotation written with three decimals is off by this much; a mirrored or scaled one by far more.
 ROTATION_TOLERANCE = 1e-2
 
@@ -28,7 +31,7 @@ def read_json(path: Path) -> Any:
         raise SceneError(f"{path}: is a Git LFS pointer, not the file itself; run `git lfs pull` where it came from")
     try:
         return json.loads(content.decode("utf-8-sig"))
-    except ValueError as error:  # also what a wrong encoding raises
+    except (ValueError, RecursionError) as error:  # also what a wrong encoding and brackets without end raise
         raise SceneError(f"{path}: is not JSON ({error}); export or download it again") from error
 
 
@@ -63,6 +66,8 @@ def positive(value: Any, where: str) -> float:
 def pixels(value: Any, where: str) -> int:
     """`value` as a whole number of pixels, at least 1. Raises SceneError, led by `where`."""
     number = positive(value, where)
+    if number > MAX_SIDE:
+        raise SceneError(f"{where}: is {number:g} px, more than any photograph has; correct the file")
     if number != int(number):
         raise SceneError(f"{where}: is {number:g} but must be a whole number of pixels; correct the file")
     return int(number)

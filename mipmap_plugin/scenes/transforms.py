@@ -13,13 +13,16 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.images import image_size
+from mipmap_plugin.scenes.images import image_size, is_file
 from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+# Radians; half of it has a tangent that can be divided by, and no lens is as long.
+MIN_ANGLE = 1e-9
 
 # OpenGL's camera looks along -z with y up, OpenCV's along +z with y down.
 OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
@@ -104,15 +107,13 @@ def _applied(file: Path) -> Tensor | None:
     data = read_json(file)
     if "applied_transform" not in data:
         return None
-    matrix = torch.eye(4, dtype=torch.float64)
-    matrix[:3] = numbers(data["applied_transform"][:3], (3, 4), f"{file}, applied_transform")
-    return matrix
+    return _pose(data["applied_transform"], f"{file}, applied_transform")
 
 
 def _image(folder: Path, listed: str) -> Path | None:
     """The image file behind a `file_path`, which may lack its extension; None when it is absent."""
     stem = listed.replace("\\", "/")
-    return next((folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES if (folder / f"{stem}{suffix}").is_file()), None)
+    return next((folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES if is_file(folder / f"{stem}{suffix}")), None)
 
 
 def _stated_size(values: Mapping[str, Any], where: str) -> tuple[int, int] | None:
@@ -136,13 +137,17 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: 
 
 
 def _viewmat(values: Mapping[str, Any], where: str) -> Tensor:
-    pose = present(values, "transform_matrix", where)
-    rows = pose[:3] if isinstance(pose, list) else pose  # the last row is 0 0 0 1, and some files leave it out
-    upper = numbers(rows, (3, 4), f"{where}, transform_matrix")
-    rotation(upper[:, :3].tolist(), f"{where}, transform_matrix")
-    camera_to_world = torch.eye(4, dtype=torch.float64)
-    camera_to_world[:3] = upper
-    return viewmat_from_opengl(camera_to_world)
+    return viewmat_from_opengl(_pose(present(values, "transform_matrix", where), f"{where}, transform_matrix"))
+
+
+def _pose(value: Any, where: str) -> Tensor:
+    """A rotation and a shift as [4, 4] float64. Raises SceneError, led by `where`."""
+    rows = value[:3] if isinstance(value, list) else value  # the last row is 0 0 0 1, and some files leave it out
+    upper = numbers(rows, (3, 4), where)
+    rotation(upper[:, :3].tolist(), where)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3] = upper
+    return pose
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float | None:
@@ -152,8 +157,8 @@ def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float
     if f"camera_angle_{axis}" not in values:
         return None
     angle = positive(values[f"camera_angle_{axis}"], f"{where}, camera_angle_{axis}")
-    if angle >= math.pi:
-        raise SceneError(f"{where}, camera_angle_{axis}: is {angle:g} but must be below pi; give it in radians")
+    if not MIN_ANGLE < angle < math.pi:
+        raise SceneError(f"{where}, camera_angle_{axis}: is {angle:g} but must be above 0 and below pi; give it in radians")
     return size / (2 * math.tan(angle / 2))
 
 

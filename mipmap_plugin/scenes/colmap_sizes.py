@@ -1,0 +1,62 @@
+"""Whether COLMAP's binary files are as long as their own counts say. pycolmap reads on behind the end of one that is not, for hours."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+from mipmap_plugin.errors import SceneError
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What a file consists of after the number of its rows, in bytes (COLMAP, src/colmap/scene/reconstruction_io_binary.cc)."""
+
+    fixed: int  # of a row, before its name and its list
+    has_name: bool = False  # a text that ends with a zero
+    count: str = ""  # how the length of the row's list is packed; empty: there is no list
+    each: int = 0  # of the list
+
+
+FILES = {
+    "cameras.bin": Rows(24),  # and parameters, whose number the model of the lens tells
+    "images.bin": Rows(64, has_name=True, count="<Q", each=24),
+    "points3D.bin": Rows(43, count="<Q", each=8),
+    "rigs.bin": Rows(4, count="<I", each=8),
+    "frames.bin": Rows(64, count="<I", each=16),
+}
+
+
+def refuse_truncated(folder: Path) -> None:
+    """Raise SceneError when a file of the binary model in `folder` is shorter than it says."""
+    for name, rows in FILES.items():
+        path = folder / name
+        if path.is_file() and not _is_whole(path, rows):
+            raise SceneError(f"{path}: is truncated or damaged, for it is shorter than its own counts say; copy or export it again")
+
+
+def _is_whole(path: Path, rows: Rows) -> bool:
+    size = path.stat().st_size
+    if size < 8:
+        return False
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        (declared,) = struct.unpack_from("<Q", content)
+        if declared * max(1, rows.fixed) > size:
+            return False
+        return rows.each == 0 or _end(content, rows, declared) <= size
+
+
+def _end(content: mmap.mmap, rows: Rows, declared: int) -> int:
+    """Where the last row ends, or a place behind the content where it is cut off."""
+    at, beyond = 8, len(content) + 1
+    length = struct.Struct(rows.count)
+    for _ in range(declared):
+        at += rows.fixed
+        if rows.has_name and at < len(content):
+            at = content.find(b"\0", at) + 1 or beyond
+        if at + length.size > len(content):
+            return beyond
+        at += length.size + rows.each * length.unpack_from(content, at)[0]
+    return at

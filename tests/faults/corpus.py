@@ -1,0 +1,147 @@
+"""One small sound checkpoint or scene for each kind of file that is read, and which of its files is damaged."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import anchor_checkpoints
+import moving
+import numpy as np
+import ply_files
+import tiny
+import torch_checkpoints
+
+from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.wrap import wrap_model
+
+
+@dataclass(frozen=True)
+class Sample:
+    make: Callable[[Path], Path]  # fills an empty folder; what to open
+    damaged: str  # the file that is damaged, in that folder
+    kinds: tuple[str, ...]  # what is done to it: functions of `mutations`
+    is_scene: bool = False
+
+
+def open_checkpoint(path: Path) -> None:
+    """Load, and draw one small view, which has to be finite."""
+    model = wrap_model(path, backend="reference")
+    camera = model.any_camera()
+    image = model.render(replace(camera.resized(8, 6), time=0.4)).image
+    assert image.isfinite().all(), "the image is not finite"
+
+
+def open_scene(path: Path) -> None:
+    """Load, and let a checkpoint be seen by its cameras."""
+    scene = load_scene(path)
+    model = wrap_model(tiny.model(5), cameras=scene, backend="reference")
+    for camera in scene.cameras[:2]:
+        assert model.render(camera.resized(8, 6)).image.isfinite().all(), "the image is not finite"
+
+
+def _folder(path: Path) -> Path:
+    tiny.folder(path, tiny.cameras(3), count=20)
+    (path / "cfg_args").write_text("Namespace(sh_degree=1, resolution=2, white_background=True, images='images_2', kernel_size=0.1, eval=True)")
+    identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.0]]
+    (path / "exposure.json").write_text(json.dumps({"view_0": identity, "view_1": identity}))
+    return path
+
+
+def _ply(form: str, lists: bool = False) -> Callable[[Path], Path]:
+    def make(path: Path) -> Path:
+        path.mkdir()
+        file = ply_files.write_splats(path / "a.ply", 12, 3, form=form, comments=("SplatRenderMode: default", 'mipmap_plugin {"scale": 0.5}'))
+        if lists:
+            header, body = file.read_bytes().split(b"element vertex")
+            face = b"element face 2\nproperty list uchar int vertex_indices\nproperty list uint float more\n"
+            rows = (b"\x03" + bytes(12) + b"\x01\x00\x00\x00" + bytes(4)) * 2
+            body = body.replace(b"end_header\n", b"end_header\n" + (rows if form != "ascii" else b"3 0 1 2 1 0.5\n" * 2), 1)
+            file.write_bytes(header + face + b"element vertex" + body)
+        return file
+
+    return make
+
+
+def _mip(path: Path) -> Path:
+    path.mkdir()
+    columns = {**ply_files.splat_columns(12, 0), "filter_3D": np.full(12, 0.01, np.float32)}
+    return ply_files.write(path / "a.ply", columns)
+
+
+def _anchors(layout: anchor_checkpoints.Layout) -> Callable[[Path], Path]:
+    def make(path: Path) -> Path:
+        anchor_checkpoints.write(path, layout, count=12)
+        return path
+
+    return make
+
+
+def _gsplat(path: Path) -> Path:
+    return torch_checkpoints.gsplat_folder(path, torch_checkpoints.splats(12))
+
+
+def _splatfacto(path: Path) -> Path:
+    return torch_checkpoints.splatfacto_folder(path, torch_checkpoints.splats(12))
+
+
+def _transforms(path: Path) -> Path:
+    path.mkdir()
+    pose = np.eye(4).tolist()
+    pose[2][3] = 3.0
+    lens = {"camera_angle_x": 0.8, "fl_y": 20.0, "cx": 9.0, "w": 20, "h": 15, "k1": 0.0, "camera_model": "OPENCV"}
+    frames = [{"file_path": f"./images/{i}", "transform_matrix": pose, "time": 0.5} for i in range(2)]
+    (path / "transforms.json").write_text(json.dumps({**lens, "applied_transform": pose[:3], "frames": frames}, indent=1))
+    return path
+
+
+def _colmap(path: Path) -> Path:
+    import pycolmap
+    import test_colmap
+
+    test_colmap.write_text_model(path / "text", test_colmap.names(3))
+    (path / "sparse/0").mkdir(parents=True)
+    pycolmap.Reconstruction(path / "text").write_binary(path / "sparse/0")
+    return path
+
+
+def _deformable(path: Path) -> Path:
+    return moving.write_deformable(path, moving.deform_state(width=8))
+
+
+SPLATS = "point_cloud/iteration_30000/point_cloud.ply"
+BINARY, TEXT, OPTIONS = ("of_bytes",), ("of_text", "of_text", "of_bytes"), ("of_options", "of_options", "of_text")
+PLY, TORCH = ("of_bytes", "of_text"), ("of_bytes", "of_torch", "of_torch")
+SCAFFOLD, UNITED = anchor_checkpoints.Layout(appearance=(3, 2)), anchor_checkpoints.Layout(united=True)
+
+SAMPLES: dict[str, Sample] = {
+    "ply": Sample(_ply("binary_little_endian"), "a.ply", PLY),
+    "ply, ascii": Sample(_ply("ascii"), "a.ply", PLY),
+    "ply, big endian": Sample(_ply("binary_big_endian"), "a.ply", PLY),
+    "ply, lists": Sample(_ply("binary_little_endian", lists=True), "a.ply", PLY),
+    "ply, ascii lists": Sample(_ply("ascii", lists=True), "a.ply", PLY),
+    "ply of Mip-Splatting": Sample(_mip, "a.ply", PLY),
+    "ply of Scaffold-GS": Sample(_anchors(UNITED), SPLATS, PLY),
+    "ply of Octree-GS": Sample(_anchors(anchor_checkpoints.Layout("octree", united=True)), SPLATS, PLY),
+    "cfg_args": Sample(_folder, "cfg_args", OPTIONS),
+    "cfg_args of 4D Gaussians": Sample(moving.write_hexplane, "cfg_args", OPTIONS),
+    "cfg_args of Octree-GS": Sample(_anchors(anchor_checkpoints.Layout("octree", united=True)), "cfg_args", OPTIONS),
+    "cameras.json": Sample(_folder, "cameras.json", ("of_json", *TEXT)),
+    "exposure.json": Sample(_folder, "exposure.json", ("of_json", *TEXT)),
+    "transforms.json": Sample(_transforms, "transforms.json", ("of_json", "of_json", *TEXT), is_scene=True),
+    "deform.pth": Sample(_deformable, "deform/iteration_40000/deform.pth", TORCH),
+    "deformation.pth": Sample(moving.write_hexplane, "point_cloud/iteration_14000/deformation.pth", TORCH),
+    "checkpoints.pth": Sample(_anchors(UNITED), "point_cloud/iteration_30000/checkpoints.pth", TORCH),
+    "opacity_mlp.pt": Sample(_anchors(SCAFFOLD), "point_cloud/iteration_30000/opacity_mlp.pt", BINARY),
+    "ckpt of gsplat": Sample(_gsplat, "ckpts/ckpt_6999_rank0.pt", TORCH),
+    "cfg.yml": Sample(_gsplat, "cfg.yml", OPTIONS),
+    "ckpt of splatfacto": Sample(_splatfacto, "nerfstudio_models/step-000029999.ckpt", TORCH),
+    "config.yml": Sample(_splatfacto, "config.yml", OPTIONS),
+    "COLMAP cameras": Sample(_colmap, "sparse/0/cameras.bin", BINARY, is_scene=True),
+    "COLMAP images": Sample(_colmap, "sparse/0/images.bin", BINARY, is_scene=True),
+    "COLMAP rigs": Sample(_colmap, "sparse/0/rigs.bin", BINARY, is_scene=True),
+    "COLMAP frames": Sample(_colmap, "sparse/0/frames.bin", BINARY, is_scene=True),
+    "COLMAP points": Sample(_colmap, "sparse/0/points3D.bin", BINARY, is_scene=True),
+}
