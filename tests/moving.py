@@ -15,6 +15,8 @@ from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.wrap import Adapted, Wrapped
 
+SPLATS = 60
+
 DEFORMABLE_OPTIONS = "sh_degree={degree}, white_background=True, load2gpu_on_the_fly=False, is_blender=False, is_6dof=False"
 
 
@@ -43,9 +45,9 @@ def deform_state(timenet: bool = False, six_dof: bool = False, width: int = 256,
     return state
 
 
-def write_deformable(folder: Path, state: dict[str, Tensor] | None = None, iteration: int = 40_000, degree: int = 1) -> Path:
+def write_deformable(folder: Path, state: dict[str, Tensor] | None = None, iteration: int = 40_000, degree: int = 1, count: int = SPLATS) -> Path:
     """A model folder of Deformable 3D Gaussians."""
-    _write_splats(folder, iteration, DEFORMABLE_OPTIONS.format(degree=degree), degree)
+    _write_splats(folder, iteration, DEFORMABLE_OPTIONS.format(degree=degree), degree, count)
     network = folder / f"deform/iteration_{iteration}/deform.pth"
     network.parent.mkdir(parents=True)
     torch.save(deform_state() if state is None else state, network)
@@ -69,14 +71,14 @@ def hexplane_state(width: int = 32, channels: int = 8, scales: tuple[int, ...] =
     return {**state, "time_poc": 2.0 ** torch.arange(4), "pos_poc": 2.0 ** torch.arange(10)}
 
 
-def write_hexplane(folder: Path, options: str = "", state: dict[str, Tensor] | None = None, degree: int = 3) -> Path:
+def write_hexplane(folder: Path, options: str = "", state: dict[str, Tensor] | None = None, degree: int = 3, count: int = SPLATS) -> Path:
     """A model folder of 4D Gaussians, with its bookkeeping by row."""
     kplanes = "kplanes_config={'grid_dimensions': 2, 'resolution': [8, 6, 7, 5]}, multires=[1, 2], net_width=32"
-    _write_splats(folder, 14_000, f"sh_degree={degree}, white_background=True, {kplanes}{options and ', ' + options}", degree)
+    _write_splats(folder, 14_000, f"sh_degree={degree}, white_background=True, {kplanes}{options and ', ' + options}", degree, count)
     place = folder / "point_cloud/iteration_14000"
     torch.save(hexplane_state() if state is None else state, place / "deformation.pth")
-    torch.save(torch.ones(60, dtype=torch.bool), place / "deformation_table.pth")
-    torch.save(torch.zeros(60, 3), place / "deformation_accum.pth")
+    torch.save(torch.ones(count, dtype=torch.bool), place / "deformation_table.pth")
+    torch.save(torch.zeros(count, 3), place / "deformation_accum.pth")
     return folder
 
 
@@ -94,9 +96,9 @@ def decibels(wrapped: Wrapped, adapted: Adapted, views: list[Camera]) -> tuple[f
     return before, after
 
 
-def _write_splats(folder: Path, iteration: int, options: str, degree: int) -> None:
+def _write_splats(folder: Path, iteration: int, options: str, degree: int, count: int) -> None:
     ply = folder / f"point_cloud/iteration_{iteration}/point_cloud.ply"
     ply.parent.mkdir(parents=True)
-    tiny.ply(ply, degree=degree)
+    tiny.ply(ply, degree=degree, count=count)
     (folder / "cfg_args").write_text(f"Namespace({options})")
     write_cameras(folder / "cameras.json", tiny.cameras())

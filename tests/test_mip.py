@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import ply_files
 import pytest
 import tiny
 import torch
+from mip_checkpoints import folder, splats
 from oracle import brute_force
 
 from mipmap_plugin.adaptation.resize import resize
@@ -25,29 +25,7 @@ from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
-MIP = "kernel_size=0.1, ray_jitter=False, resample_gt_image=False, load_allres=False, sample_more_highres=False"
-OPTIONS = {"mip": MIP, "gof": "kernel_size=0.0, use_decoupled_appearance=False", "analytic": "load_allres=False, sample_more_highres=False"}
 FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
-
-
-def splats(count: int = 40, bands: int = 3) -> dict[str, np.ndarray]:
-    """Raw columns of a ball of small splats around the origin, the 3D filter of each last."""
-    random = np.random.default_rng(3)
-    columns = ply_files.splat_columns(count, bands)
-    for name in ("scale_0", "scale_1", "scale_2"):
-        columns[name] = random.uniform(-5, -2, count).astype(np.float32)
-    for name in ("x", "y", "z"):
-        columns[name] = (0.5 * columns[name]).astype(np.float32)
-    return {**columns, "filter_3D": random.uniform(0.01, 0.1, count).astype(np.float32)}
-
-
-def folder(path: Path, family: str = "mip", columns: dict[str, np.ndarray] | None = None) -> Path:
-    """A model folder as the family's project leaves it."""
-    ply = path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
-    ply.parent.mkdir(parents=True)
-    ply_files.write(ply, splats() if columns is None else columns)
-    (path / "cfg_args").write_text(f"Namespace(sh_degree=1, resolution=1, white_background=False, {OPTIONS[family]})")
-    return path
 
 
 def by_formats_md(columns: dict[str, np.ndarray], smooth: bool = True) -> Gaussians:
