@@ -13,10 +13,11 @@ from mipmap_plugin.commands.demo import demo
 from mipmap_plugin.commands.evaluate import evaluate
 from mipmap_plugin.commands.inspect import inspect
 from mipmap_plugin.commands.render import render
+from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.errors import MipmapPluginError
 
 app = tyro.extras.SubcommandApp()
-for command in (inspect, adapt, render, evaluate, backends, demo):
+for command in (inspect, adapt, render, evaluate, tradeoff, backends, demo):
     app.command(command)
 
 

@@ -30,7 +30,8 @@ CONFINED = {
     "PIL": ["scenes/images.py"],
     "gsplat": ["backends/gsplat"],
     "llvmlite": ["backends/cpu_kernels/"],
-    "matplotlib": ["evaluation/"],
+    "lpips": ["evaluation/perceptual.py"],
+    "matplotlib": ["evaluation/tradeoff_plot.py"],
     "numba": ["backends/cpu_kernels/"],
     "numpy": ["backends/", "evaluation/metrics.py", "models/", "scenes/images.py"],
     "plyfile": ["models/ply.py"],
@@ -40,7 +41,7 @@ CONFINED = {
     "safetensors": ["adaptation/super_resolution.py"],
     "skimage": ["evaluation/metrics.py"],
     "spandrel": ["adaptation/super_resolution.py"],
-    "tqdm": ["adaptation/loop.py", "evaluation/evaluate.py"],
+    "tqdm": ["adaptation/loop.py", "evaluation/tradeoff.py", "evaluation/evaluate.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
 }

@@ -1,0 +1,237 @@
+"""What accuracy costs: one scene at one scale through recipes, steps, backends and renderer settings, beside every answer that
+needs no adapting. Measuring quality is not billed as adapting, and no view that is judged on is adapted to."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from mipmap_plugin.adaptation.curve import Stopwatch
+from mipmap_plugin.backends import get_backend
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.backends.filters import SCREEN_FILTERS
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import Recipe
+from mipmap_plugin.effects import USUAL, Effects, RenderSettings
+from mipmap_plugin.errors import BackendUnavailable, SettingsError
+from mipmap_plugin.evaluation.protocols import resized_base
+from mipmap_plugin.evaluation.tradeoff_truth import Yardstick
+from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.wrap import Adapted, Wrapped
+
+Kind = Literal["base", "filter", "supersampling", "adapted", "renderer"]
+Show = Callable[[Camera], Tensor]
+
+RESIZED = "base, resized"
+
+# Steps after which a run is looked at: even on the logarithmic axis of time.
+LOOKS = (0, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+
+# What a renderer may save, each alone: (name, settings, float type).
+RENDERERS: tuple[tuple[str, RenderSettings, torch.dtype], ...] = (
+    ("as usual", USUAL, torch.float32),
+    ("float64", USUAL, torch.float64),
+    *((f"alpha from {name}", replace(USUAL, min_alpha=1 / least), torch.float32) for name, least in (("1/64", 64), ("1/16", 16))),
+    *((f"stop at {least:g}", replace(USUAL, min_transmittance=least), torch.float32) for least in (0.01, 0.1)),
+    *((f"radius {radius:g}", replace(USUAL, radius=radius), torch.float32) for radius in (3.0, 2.0)),
+    *((f"tile {tile}", replace(USUAL, tile=tile), torch.float32) for tile in (8, 32)),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Several measurements of one thing."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Spread:
+        return cls(statistics.median(values), min(values), max(values))
+
+
+NOTHING = Spread(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Point:
+    """One way to show a scene at one scale: what it costs, and how good it is."""
+
+    scale: float
+    kind: Kind
+    name: str
+    backend: str
+    gaussians: int
+    psnr_db: Spread = NOTHING
+    adapt_seconds: Spread = NOTHING
+    ms_per_frame: Spread | None = None  # None on the way, before a run has ended
+    step: int | None = None  # on the way
+    ended_by: str = ""  # at the end of a run; where repeats differ, all reasons
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is tried."""
+
+    recipes: Sequence[Recipe] = ("default",)
+    steps: Sequence[int | None] = ()  # none: as many as each recipe says
+    backends: Sequence[str] = ("auto",)
+    supersampling: Sequence[int] = (2, 4, 8)
+    renderers: bool = True  # the settings of RENDERERS, on the first run's model
+    repeats: int = 3
+    seed: int = 0  # of the first repeat; each has the next
+
+    def __post_init__(self) -> None:
+        if self.repeats < 1 or any(n < 2 for n in self.supersampling):
+            raise SettingsError("a tradeoff needs repeats of at least 1, and supersampling of at least 2 x 2 samples")
+
+
+def measure(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> Iterator[Point]:
+    """Each point as soon as it is measured. Raises SettingsError and BackendUnavailable."""
+    if scale == 1:
+        raise SettingsError("at scale 1 the base is right as it is, and nothing is to be traded; give another scale")
+    runs = [(name, steps, backend) for backend in plan.backends for name in plan.recipes for steps in plan.steps or (None,)]
+    free = [way for backend in plan.backends for way in _free_ways(on_backend(model, backend), scale, plan.supersampling)]
+    free = [way for way in free if not (yardstick.is_resized_base and way[1] == RESIZED)]  # it is the truth
+    bar = tqdm(total=len(free) + len(runs) * plan.repeats + len(RENDERERS) * plan.renderers, disable=None, desc=f"tradeoff x{scale:g}")
+    first: Adapted | None = None
+    with bar:
+        for kind, name, backend, show, count in free:
+            yield _judged(Point(scale, kind, name, backend, count), show, yardstick, plan.repeats)
+            bar.update()
+        for backend in plan.backends if runs else ():
+            _warm_up(on_backend(model, backend), yardstick, scale)
+        for name, steps, backend in runs:
+            points, adapted = _run(on_backend(model, backend), yardstick, scale, plan, name, steps, bar)
+            yield from points
+            first = first or adapted
+        for point, show in _renderers(model, first, scale) if plan.renderers else ():
+            yield _judged(point, show, yardstick, plan.repeats)
+            bar.update()
+
+
+def on_backend(model: Wrapped, name: str) -> Wrapped:
+    """The same base, rendered and adapted by another backend."""
+    return Wrapped(model.model, model.cameras, name, model.trained)
+
+
+def _free_ways(model: Wrapped, scale: float, supersampling: Sequence[int]) -> list[tuple[Kind, str, str, Show, int]]:
+    """Everything that needs no adapting: kind, name, backend, what shows a view of the base scale, splats."""
+    count = len(model.model.gaussians(model.any_camera()))
+
+    def rendered(screen_filter: str | None, n: int = 1) -> Show:
+        return lambda view: model.render(view.zoomed(scale), scale, screen_filter, n).image
+
+    def resized(view: Camera) -> Tensor:
+        return resized_base(model.render(view).image.clamp(0, 1), view.zoomed(scale).size)
+
+    own = model.backend()[0].name
+    served = {name: _backend_for(model, name) for name in sorted(SCREEN_FILTERS - {model.trained.screen_filter})}
+    ways: list[tuple[Kind, str, str, Show]] = [("base", "base as it is", own, rendered(None)), ("filter", "scaled filter", own, rendered("scaled"))]
+    ways += [("filter", f"{name} filter", backend, rendered(name)) for name, backend in served.items() if backend]
+    ways += [("supersampling", f"{n} x {n} samples", own, rendered("scaled", n)) for n in supersampling]
+    ways += [("supersampling" if scale < 1 else "filter", RESIZED, own, resized)]
+    return [(*way, count) for way in ways]
+
+
+def _backend_for(model: Wrapped, screen_filter: str) -> str | None:
+    """The name of the backend that draws with another filter than the base's; None where the one asked for lacks it."""
+    try:
+        return model.backend(screen_filter=screen_filter)[0].name
+    except BackendUnavailable:
+        return None
+
+
+def _judged(point: Point, show: Show, yardstick: Yardstick, repeats: int) -> Point:
+    """`point` with its dB and its milliseconds a frame, the mean over the views in each repeat."""
+    times, decibels = [], []
+    with torch.no_grad():
+        watch = Stopwatch(show(yardstick.views[0]).device)  # the first image may compile what it needs
+        for repeat in range(repeats):
+            watch.seconds = 0.0
+            for view in yardstick.views:
+                with watch:
+                    image = show(view)
+                if repeat == 0:
+                    decibels.append(yardstick.psnr(view, image))
+            times.append(1000 * watch.seconds / len(yardstick.views))
+    return replace(point, psnr_db=Spread.of([statistics.fmean(decibels)]), ms_per_frame=Spread.of(times))
+
+
+def _warm_up(model: Wrapped, yardstick: Yardstick, scale: float) -> None:
+    """One step on one view, so that what compiles at first use is not billed."""
+    model.adapt(scale, cameras=yardstick.adapt_on[:1], views="given" if yardstick.adapt_on else "orbit", extra_views=1, steps=1)
+
+
+def _run(
+    model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan, recipe: Recipe, steps: int | None, bar: tqdm
+) -> tuple[list[Point], Adapted]:
+    """The points of a recipe on its way and at its end, over all repeats, and the first repeat's model."""
+    way: dict[int, list[tuple[float, float]]] = {}  # after so many steps: seconds and dB of each repeat that went so far
+
+    @torch.no_grad()
+    def look(step: int, seconds: float, show: Show) -> None:
+        if step in LOOKS:
+            quality = statistics.fmean(yardstick.psnr(view, show(view.zoomed(scale))) for view in yardstick.views)
+            way.setdefault(step, []).append((seconds, quality))
+
+    runs, ends = [], []
+    for repeat in range(plan.repeats):
+        settings: dict[str, Any] = {"seed": plan.seed + repeat} | ({} if steps is None else {"steps": steps})
+        runs.append(adapted := model.adapt(scale, recipe=recipe, cameras=yardstick.adapt_on, observe=look, **settings))
+        report = adapted.report
+        end = Point(scale, "adapted", _name(recipe, steps), adapted.backend.name, report.gaussians_after, ended_by=report.ended_by)
+        ends.append(_judged(replace(end, adapt_seconds=Spread.of([report.seconds["total"]])), _shows(adapted, scale), yardstick, 1))
+        bar.update()
+    on_the_way = replace(ends[0], ms_per_frame=None, ended_by="")
+    points = [
+        replace(on_the_way, step=step, **_spreads(adapt_seconds=[seconds for seconds, _ in seen], psnr_db=[quality for _, quality in seen]))
+        for step, seen in way.items()
+    ]
+    return [*points, _over_repeats(ends)], runs[0]
+
+
+def _name(recipe: Recipe, steps: int | None) -> str:
+    return recipe if steps is None else f"{recipe}, {steps} steps at most"
+
+
+def _spreads(**values: Sequence[float]) -> dict[str, Any]:
+    return {name: Spread.of(each) for name, each in values.items()}
+
+
+def _over_repeats(ends: Sequence[Point]) -> Point:
+    """One point from those of all repeats."""
+    measured = {name: [getattr(end, name).median for end in ends] for name in ("psnr_db", "adapt_seconds", "ms_per_frame")}
+    return replace(ends[0], ended_by="; ".join(dict.fromkeys(end.ended_by for end in ends)), **_spreads(**measured))
+
+
+def _shows(adapted: Adapted, scale: float) -> Show:
+    return lambda view: adapted.render(view.zoomed(scale)).image
+
+
+def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterator[tuple[Point, Show]]:
+    """The adapted model, or the base without one, drawn by the reference backend with each of RENDERERS."""
+    backend = get_backend("reference")
+    shown: SplatModel = adapted.model if adapted else model.model
+    effects = adapted.effects if adapted else model.effects(scale)
+    who = adapted.report.settings.recipe if adapted else "base as it is"
+    seconds = Spread.of([adapted.report.seconds["total"]]) if adapted else NOTHING
+    count = len(shown.gaussians(model.any_camera()))
+    for name, settings, dtype in RENDERERS:
+        point = Point(scale, "renderer", f"{who}, {name}", backend.name, count, adapt_seconds=seconds)
+        yield point, _drawn(backend, shown, replace(effects, settings=settings), dtype, scale)
+
+
+def _drawn(backend: Backend, model: SplatModel, effects: Effects, dtype: torch.dtype, scale: float) -> Show:
+    def show(view: Camera) -> Tensor:
+        camera = view.zoomed(scale)
+        return backend.render(model.gaussians(camera).to(dtype=dtype), camera, effects).image
+
+    return show

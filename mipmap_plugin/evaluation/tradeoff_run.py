@@ -1,0 +1,38 @@
+"""A tradeoff from beginning to end: every scale measured, and what was measured written, also when it is interrupted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mipmap_plugin.evaluation.tradeoff import Plan, measure
+from mipmap_plugin.evaluation.tradeoff_files import write
+from mipmap_plugin.evaluation.tradeoff_front import Tradeoff
+from mipmap_plugin.evaluation.tradeoff_truth import base_itself, photographs
+from mipmap_plugin.scenes import Scene
+from mipmap_plugin.wrap import Interrupted, Wrapped
+
+
+def run(
+    model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan, views: int | None, output: Path, *, picture: bool, overwrite: bool
+) -> list[Tradeoff]:
+    """Measure and write into the folder `output`. `scene`: with photographs to judge by; `views`: how many of them at most.
+
+    Ctrl-C raises Interrupted after what was measured until then is written. Raises SettingsError, BackendUnavailable, OutputExists
+    and OutputError.
+    """
+    yardsticks = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
+    found = [Tradeoff(scale, yardstick.label, []) for scale, yardstick in zip(scales, yardsticks, strict=True)]
+    try:
+        for each, yardstick in zip(found, yardsticks, strict=True):
+            for point in measure(model, yardstick, each.scale, plan):
+                each.points.append(point)
+    except KeyboardInterrupt:
+        measured = [each for each in found if each.points]
+        if not measured:
+            raise Interrupted("interrupted; nothing was measured yet") from None
+        write(output, measured, complete=False, picture=picture, overwrite=overwrite)
+        count = sum(len(each.points) for each in measured)
+        raise Interrupted(f"interrupted; the {count} points that were measured until then are in {output}; --overwrite replaces them") from None
+    write(output, found, complete=True, picture=picture, overwrite=overwrite)
+    return found

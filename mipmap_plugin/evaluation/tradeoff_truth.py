@@ -1,0 +1,87 @@
+"""What the decibels of a tradeoff are of, and on which views: photographs where there are any, else what the base itself knows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.views import choose_views, with_times
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, resized_base, test_views
+from mipmap_plugin.scenes import Scene, jittered
+from mipmap_plugin.wrap import Wrapped
+
+# Of a checkpoint without test views, one camera in so many is kept from adapting, as mip-NeRF 360 does.
+HOLD_OUT = 8
+
+# The seed of views that are generated to judge on; those to adapt on follow from seeds that a person chooses.
+JUDGES_SEED = 8_128
+
+
+@dataclass(frozen=True, eq=False)
+class Yardstick:
+    """Views that nothing is adapted to, and the truth in them."""
+
+    label: str  # what the dB are of, as the axis says it
+    views: list[Camera]  # of the base scale
+    adapt_on: list[Camera]  # the cameras that are left to adapt on; none: an orbit is generated
+    psnr: Callable[[Camera, Tensor], float]  # (one of the views, the image of it at the new scale) -> dB
+    is_resized_base: bool  # the truth is the base's own image, made smaller
+
+
+def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) -> Yardstick:
+    """Real images, resized as protocol P3 does; `most` of them at most. Raises SettingsError without any, or where they are too small."""
+    scene = model.place(scene)
+    if not model.cameras:
+        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
+    judged: dict[Camera, Judged] = {view.camera: view for view in test_views(scene, model.cameras[0], model.background)}
+    views = _spread_out(list(judged), most)
+    truths = {view: judged[view].truth(scale, PROTOCOLS["P3"]) for view in views}
+    label = f"real dB, protocol P3 on {len(views)} photographs"
+    train = [camera for camera in model.cameras if camera.split == "train"]
+    return Yardstick(label, views, train or model.cameras, lambda view, image: psnr(image, truths[view]), False)
+
+
+@torch.no_grad()
+def base_itself(model: Wrapped, scale: float, most: int | None) -> Yardstick:
+    """Without photographs. Zoom-out: the supersampled base. Zoom-in: the image, shrunk, against the base, for more is not known."""
+    views, adapt_on = _held_out(model)
+    views = _spread_out(views, most)
+    shown = {view: model.render(view).image.clamp(0, 1) for view in views}
+    if scale > 1:
+        label = f"dB of the image, shrunk, against the base itself (no photographs), {len(views)} views"
+        return Yardstick(label, views, adapt_on, lambda view, image: psnr(resize(image, view.size, "area"), shown[view]), False)
+    n = math.ceil(1 / scale)
+    label = f"dB against the base supersampled {n} x {n} (no photographs), {len(views)} views"
+    truths = {view: resized_base(image, view.zoomed(scale).size) for view, image in shown.items()}
+    return Yardstick(label, views, adapt_on, lambda view, image: psnr(image, truths[view]), True)
+
+
+def _held_out(model: Wrapped) -> tuple[list[Camera], list[Camera]]:
+    """Views to judge on and views to adapt on: the checkpoint's own split, every eighth camera, or generated ones."""
+    generator = torch.Generator().manual_seed(JUDGES_SEED)
+    test, train = ([camera for camera in model.cameras if camera.split == split] for split in ("test", "train"))
+    if not model.cameras:
+        judged = choose_views([], model.model.parameters()["means"], AdaptConfig(seed=JUDGES_SEED, extra_views=HOLD_OUT))[0]
+    elif test and train:
+        judged = test
+    elif len(model.cameras) > 1:
+        judged, train = model.cameras[::HOLD_OUT], [camera for n, camera in enumerate(model.cameras) if n % HOLD_OUT]
+    else:
+        judged, train = jittered(model.cameras, HOLD_OUT, generator), model.cameras
+    return (with_times(judged, JUDGES_SEED)[0] if getattr(model.model, "moves", False) else judged), train
+
+
+def _spread_out(views: list[Camera], most: int | None) -> list[Camera]:
+    """Every so many-th view, so that `most` are left."""
+    if most is None or len(views) <= most:
+        return views
+    return [views[place * len(views) // most] for place in range(most)]

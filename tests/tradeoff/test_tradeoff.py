@@ -1,0 +1,241 @@
+"""A tradeoff: honest views, honest clocks, everything on the same axes, and nothing lost."""
+
+import csv
+import json
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import cli
+from mipmap_plugin.backends.filters import SCREEN_FILTERS
+from mipmap_plugin.errors import OutputExists, SettingsError
+from mipmap_plugin.evaluation import tradeoff as measuring
+from mipmap_plugin.evaluation.tradeoff import LOOKS, RENDERERS, Plan, measure
+from mipmap_plugin.evaluation.tradeoff_files import facts, table
+from mipmap_plugin.evaluation.tradeoff_run import run
+from mipmap_plugin.evaluation.tradeoff_truth import base_itself, photographs
+from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.wrap import Interrupted, wrap_model
+
+PLAN = Plan(recipes=("default",), steps=(6,), backends=("reference",), supersampling=(2,), renderers=False, repeats=2)
+
+
+def wrapped(views=None):
+    return wrap_model(tiny.model(30), cameras=tiny.cameras(3) if views is None else views, backend="reference")
+
+
+def poses(cameras):
+    return {tuple(camera.viewmat.flatten().tolist()) for camera in cameras}
+
+
+# What is judged
+
+
+def test_photographs_are_the_truth_where_there_are_any(tmp_path):
+    model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", train=tiny.cameras(2), count=30))
+    yardstick = photographs(model, scene, 1 / 4, most=1)
+    assert yardstick.label == "real dB, protocol P3 on 1 photographs"
+    assert poses(yardstick.views) <= poses(camera for camera in scene.cameras if camera.split == "test")
+    good, bad = model.render(yardstick.views[0].zoomed(1 / 4), 1 / 4, "scaled", 4).image, torch.zeros(6, 8, 3)
+    assert yardstick.psnr(yardstick.views[0], good) > 30 > yardstick.psnr(yardstick.views[0], bad)
+
+
+def test_photographs_need_the_cameras_of_the_checkpoint(tmp_path):
+    with pytest.raises(SettingsError, match="give its model folder"):
+        photographs(wrapped([]), load_scene(tiny.scene(tmp_path / "scene")), 1 / 4, None)
+
+
+@pytest.mark.parametrize(
+    ("views", "judged"),
+    [
+        ([*tiny.cameras(3), *tiny.cameras(2, seed=9, split="test")], 2),
+        (tiny.cameras(17), 3),
+        (tiny.cameras(2), 1),
+        (tiny.cameras(1), 8),
+        ([], 8),
+    ],
+    ids=["its own test views", "every eighth", "one of two", "around the only one", "an orbit"],
+)
+def test_without_photographs_no_view_that_is_judged_on_is_adapted_to(views, judged):
+    yardstick = base_itself(wrapped(views), 1 / 4, None)
+    assert len(yardstick.views) == judged
+    assert poses(yardstick.views).isdisjoint(poses(yardstick.adapt_on))
+    assert bool(yardstick.adapt_on) == bool(views)
+
+
+def test_without_photographs_the_label_says_what_the_truth_is():
+    out, in_ = (base_itself(wrapped(), scale, 1).label for scale in (1 / 4, 4))
+    assert out == "dB against the base supersampled 4 x 4 (no photographs), 1 views"
+    assert in_ == "dB of the image, shrunk, against the base itself (no photographs), 1 views"
+
+
+# What is measured
+
+
+@pytest.fixture(scope="module")
+def points():
+    """Zoomed out, without photographs."""
+    model = wrapped()
+    return list(measure(model, base_itself(model, 1 / 4, 1), 1 / 4, replace(PLAN, renderers=True)))
+
+
+def test_everything_that_needs_no_adapting_stands_beside_the_adapted(points):
+    assert [point.name for point in points if point.kind == "base"] == ["base as it is"]
+    filters = {point.name for point in points if point.kind == "filter"}
+    assert filters == {"scaled filter", *(f"{name} filter" for name in SCREEN_FILTERS - {"classic"})}
+    assert [point.name for point in points if point.kind == "supersampling"] == ["2 x 2 samples"]  # the base, resized, is the truth
+    assert all(point.adapt_seconds.high == 0 for point in points if point.kind in ("base", "filter", "supersampling"))
+
+
+def test_a_run_is_looked_at_on_its_way_and_at_its_end(points):
+    way = [point for point in points if point.kind == "adapted"]
+    assert [point.step for point in way] == [step for step in LOOKS if step <= 6] + [None]
+    assert [point.ms_per_frame is None for point in way] == [True] * (len(way) - 1) + [False]
+    assert way[-1].ended_by == "6 steps" and way[-1].name == "default, 6 steps at most"
+    assert way[0].psnr_db.median < way[-1].psnr_db.median
+    assert 0 < way[0].adapt_seconds.median < way[-2].adapt_seconds.median <= way[-1].adapt_seconds.median
+
+
+def test_repeats_have_seeds_of_their_own_and_a_spread(points):
+    end = [point for point in points if point.kind == "adapted"][-1]
+    assert end.psnr_db.low < end.psnr_db.median < end.psnr_db.high
+    assert end.adapt_seconds.low < end.adapt_seconds.high
+
+
+def test_the_adapted_model_is_drawn_with_every_setting_of_a_renderer(points):
+    drawn = {point.name.removeprefix("default, "): point for point in points if point.kind == "renderer"}
+    assert list(drawn) == [name for name, _, _ in RENDERERS]
+    usual = drawn["as usual"].psnr_db.median
+    assert drawn["tile 32"].psnr_db.median == pytest.approx(usual, abs=1e-3)
+    assert drawn["float64"].psnr_db.median == pytest.approx(usual, abs=1e-2)
+    assert drawn["alpha from 1/16"].psnr_db.median != pytest.approx(usual, abs=1e-3)
+
+
+def test_the_base_resized_stands_beside_photographs(tmp_path):
+    model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene"))
+    yardstick = photographs(model, scene, 1 / 4, 1)
+    assert "base, resized" in [point.name for point in measure(model, yardstick, 1 / 4, replace(PLAN, recipes=()))]
+
+
+def test_measuring_is_not_billed():
+    model = wrapped()
+    yardstick = base_itself(model, 1 / 4, 1)
+    nap = 0.3  # seconds, and a run is looked at three times and once more at its end
+    slow = replace(yardstick, psnr=lambda *pair: (time.sleep(nap), yardstick.psnr(*pair))[1])
+    end = list(measure(model, slow, 1 / 4, replace(PLAN, repeats=1)))[-1]
+    assert end.adapt_seconds.median < 2 * nap and end.ms_per_frame.median < 1000 * nap
+
+
+def test_the_first_use_of_a_backend_is_not_billed(monkeypatch):
+    compiles = iter([1.0])
+    step = measuring.Wrapped.adapt
+
+    def adapt(*args, observe=None, **settings):
+        time.sleep(next(compiles, 0.0))
+        assert observe is not None or settings["steps"] == 1
+        return step(*args, observe=observe, **settings)
+
+    monkeypatch.setattr(measuring.Wrapped, "adapt", adapt)
+    model = wrapped()
+    list(measure(model, base_itself(model, 1 / 4, 1), 1 / 4, PLAN))
+    assert next(compiles, None) is None
+
+
+def test_scale_one_has_nothing_to_trade():
+    model = wrapped()
+    with pytest.raises(SettingsError, match="give another scale"):
+        list(measure(model, base_itself(model, 1, 1), 1, PLAN))
+
+
+@pytest.mark.parametrize("wrong", [dict(repeats=0), dict(supersampling=(1,))])
+def test_a_plan_that_cannot_be_is_refused(wrong):
+    with pytest.raises(SettingsError, match="repeats of at least 1"):
+        Plan(**wrong)
+
+
+# What is written
+
+
+def test_json_csv_and_table_hold_every_point(tmp_path):
+    found = run(wrapped(), None, [1 / 4, 2], replace(PLAN, repeats=1), 1, tmp_path / "new", picture=False, overwrite=False)
+    told = json.loads((tmp_path / "new/tradeoff.json").read_text())
+    assert told == json.loads(json.dumps(facts(found, complete=True)))
+    assert [each["scale"] for each in told["scales"]] == [0.25, 2] and told["complete"]
+    rows = list(csv.DictReader((tmp_path / "new/tradeoff.csv").open()))
+    assert len(rows) == sum(len(each.points) for each in found)
+    assert {row["truth"] for row in rows} == {each.truth for each in found}
+    assert float(rows[0]["psnr_db_median"]) == found[0].points[0].psnr_db.median
+    text = table(found[0])
+    assert found[0].truth in text and all(sentence in text for sentence in found[0].sentences())
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["tradeoff.csv", "tradeoff.json"]
+
+
+def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch):
+    left = iter(range(4))
+
+    def tired(point, show, yardstick, repeats, judged=measuring._judged):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        return judged(point, show, yardstick, repeats)
+
+    monkeypatch.setattr(measuring, "_judged", tired)
+    with pytest.raises(Interrupted, match=f"the 4 points that were measured until then are in {tmp_path}"):
+        run(wrapped(), None, [1 / 4, 4], PLAN, 1, tmp_path, picture=False, overwrite=False)
+    told = json.loads((tmp_path / "tradeoff.json").read_text())
+    assert not told["complete"] and [len(each["points"]) for each in told["scales"]] == [4]
+
+
+def test_ctrl_c_before_the_first_point_writes_nothing(tmp_path, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(measuring, "_judged", stop)
+    with pytest.raises(Interrupted, match="nothing was measured yet"):
+        run(wrapped(), None, [1 / 4], PLAN, 1, tmp_path / "new", picture=False, overwrite=False)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_picture_is_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    run(wrapped(), None, [1 / 4], replace(PLAN, repeats=1), 1, tmp_path, picture=True, overwrite=False)
+    assert (tmp_path / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tradeoff.csv", "tradeoff.json", "tradeoff.png"]
+
+
+# The command
+
+
+def command(tmp_path, *more):
+    folder = tmp_path / "base"
+    if not folder.exists():
+        tiny.folder(folder, tiny.cameras(3))
+    some = ["--recipe", "default", "--steps", "2", "--backend", "reference", "--supersampling", "2"]
+    some += ["--no-renderers", "--repeats", "1", "--views", "1"]
+    return cli.main(["tradeoff", str(folder), "--scale", "1/4", "--output", str(tmp_path / "new"), "--no-picture", *some, *more])
+
+
+def test_the_command_prints_a_table_and_refuses_to_replace_it(tmp_path, capsys):
+    assert command(tmp_path) == 0
+    out = capsys.readouterr().out
+    assert "x0.25, dB against the base supersampled 4 x 4 (no photographs)" in out and "base as it is" in out
+    assert command(tmp_path) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert command(tmp_path, "--overwrite", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["complete"]
+
+
+def test_pictures_without_matplotlib_are_refused_before_anything_is_measured(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert command(tmp_path, "--picture") == 2
+    assert "pip install 'mipmap-plugin[plot]'" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_existing_result_is_refused_by_the_library_too(tmp_path):
+    (tmp_path / "tradeoff.json").write_text("{}")
+    with pytest.raises(OutputExists):
+        run(wrapped(), None, [1 / 4], replace(PLAN, recipes=()), 1, tmp_path, picture=False, overwrite=False)
