@@ -217,6 +217,16 @@ def test_evaluate_as_json(run, model_folder, tmp_path):
     assert code == 0 and json.loads(out)[0]["name"] == "base"
 
 
+def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, model_folder, tmp_path):
+    scenes = [tiny.scene(tmp_path / "one"), tiny.scene(tmp_path / "two")]
+    words = ["--scale", "1/4", "--published", "nerf-synthetic", "--backend", "reference"]
+    code, out, _ = run("evaluate", model_folder, model_folder, "--images", *scenes, *words)
+    assert code == 0
+    assert "| one       | x0.25 | P3 " in out and "| mean of 2 | x0.25 | P3 " in out
+    assert "published, mean over the 8 scenes of NeRF-Synthetic" in out and "Mipmap-GS (arXiv 2408.06286)" in out
+    refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "1 checkpoints and 2 folders of images")
+
+
 def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
     refused(run("evaluate", tiny.ply(tmp_path / "a.ply"), "--images", scene, "--scale", "1"), "has no cameras, so its base scale is not known")
@@ -303,7 +313,7 @@ def test_a_damaged_state_ends_in_one_sentence(run, model_folder, tmp_path):
 
 def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
     refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no 'gpu'; known are", "reference")
-    refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no 'swin'; known are bicubic, lanczos")
+    refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no upsampler 'swin'; known are bicubic, lanczos")
     refused(run("adapt", model_folder, "--scale", "4", "--steps", "-1"), "setting steps: Input should be greater than or equal to 0")
     refused(run("adapt", model_folder), "no scale is given; pass --scale 1/4")
     refused(run("evaluate", model_folder, "--images", model_folder), "no scale is given; pass --scale 1/4")

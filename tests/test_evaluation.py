@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import tiny
@@ -10,11 +11,13 @@ import torch
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import protocols
-from mipmap_plugin.evaluation.evaluate import evaluate, judge, training_free_rows
+from mipmap_plugin.evaluation.evaluate import Judge, evaluate, means, training_free_rows
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, resized_base
-from mipmap_plugin.evaluation.report import markdown, records, table
+from mipmap_plugin.evaluation.published import PUBLISHED, published
+from mipmap_plugin.evaluation.report import markdown, published_table, records, table
 from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes.images import write_image
 from mipmap_plugin.wrap import wrap_model
 
 BRIEF = dict(steps=2, extra_views=1, check_every=1)
@@ -75,17 +78,41 @@ def test_ssim_is_not_known_for_an_image_smaller_than_its_window():
 
 def test_p1_truncates_the_mean_of_blocks_and_the_others_round_pillows_bicubic():
     photograph = noise(24, 32, 3)
-    view = protocols.TestView(tiny.cameras(1)[0], photograph)
-    levels = {name: view.truth(1 / 4, protocol) * 255 for name, protocol in PROTOCOLS.items()}
+    view = protocols.TestView(tiny.cameras(1)[0], photograph, Path("photograph.png"))
+    levels = {name: view.truth(1 / 4, PROTOCOLS[name]) * 255 for name in ("P1", "P2", "P3")}
     torch.testing.assert_close(levels["P1"], (photograph.view(6, 4, 8, 4, 3).mean(dim=(1, 3)) * 255).floor(), atol=1e-3, rtol=0)
     for name in ("P2", "P3"):
         torch.testing.assert_close(levels[name], (resize(photograph, (6, 8), "pil-bicubic").clamp(0, 1) * 255).round(), atol=1e-3, rtol=0)
 
 
 def test_a_truth_finer_than_the_photograph_is_refused():
-    view = protocols.TestView(tiny.cameras(1)[0], noise(24, 32, 3))
+    view = protocols.TestView(tiny.cameras(1)[0], noise(24, 32, 3), Path("photograph.png"))
     with pytest.raises(SettingsError, match="x2 asks for 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"):
         view.truth(2, PROTOCOLS["P3"])
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """A COLMAP scene's photographs, and its copies at a half and, but for rounding, a quarter."""
+    for folder, value, size in (("images", 0.2, (97, 130)), ("images_2", 0.4, (49, 65)), ("images_4", 0.6, (24, 33)), ("masks_4", 0.8, (24, 32))):
+        write_image(tmp_path / folder / "left" / "a.png", torch.full((*size, 3), value))
+    return tmp_path
+
+
+@pytest.mark.parametrize(("scale", "value"), [(1, 0.6), (2, 0.4), (4, 0.2)])
+def test_p4_reads_the_copy_that_has_the_size(folders, scale, value):
+    view = protocols.TestView(replace(tiny.cameras(1)[0], width=33), noise(97, 130, 3), folders / "images_2" / "left" / "a.png")
+    truth = view.truth(scale, PROTOCOLS["P4"])
+    assert truth.shape == (24 * scale, 33 * scale, 3)
+    torch.testing.assert_close(truth, torch.full_like(truth, value), atol=1e-3, rtol=0)
+
+
+def test_p4_refuses_a_size_that_no_folder_has(folders, tmp_path):
+    view = protocols.TestView(tiny.cameras(1)[0], noise(97, 130, 3), folders / "images" / "left" / "a.png")
+    with pytest.raises(SettingsError, match=r"P4 wants a\.png at 16 x 12 px .* but there is 130 x 97, 65 x 49, 33 x 24; evaluate a"):
+        view.truth(1 / 2, PROTOCOLS["P4"])
+    with pytest.raises(SettingsError, match="but there is none"):
+        protocols.ready_made(tmp_path / "a.png", (12, 16))
 
 
 def test_test_views_are_brought_to_the_density_of_the_base(scene):
@@ -119,15 +146,15 @@ def test_the_base_resized():
 
 def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
     views = protocols.test_views(scene, tiny.cameras()[0], (0.0, 0.0, 0.0))
-    row = judge("black", lambda camera: torch.zeros(*camera.size, 3), views, 1, PROTOCOLS["P3"], gaussians=7)
+    row = Judge(views, PROTOCOLS["P3"]).row("black", 1, lambda camera: torch.zeros(*camera.size, 3), gaussians=7)
     assert row.psnr_db == pytest.approx(sum(psnr(torch.zeros(24, 32, 3), view.photograph) for view in views) / 2)
     assert (row.name, row.scale, row.gaussians, row.adapt_seconds, row.adapted_on) == ("black", 1, 7, 0.0, "-")
-    assert row.ms_per_view > 0
+    assert row.ms_per_view > 0 and row.protocol == "P3" and row.lpips is None
 
 
 def test_the_base_against_photographs_of_itself_is_perfect(model, scene):
     views = protocols.test_views(scene, tiny.cameras()[0], (0.0, 0.0, 0.0))
-    [row] = training_free_rows(model, views, 1, PROTOCOLS["P3"])
+    [row] = training_free_rows(model, Judge(views, PROTOCOLS["P3"]), 1)
     assert row.name == "base" and row.psnr_db > 50 and row.ssim == pytest.approx(1.0, abs=1e-3)
 
 
@@ -145,6 +172,26 @@ def test_rows_for_every_scale_and_recipe(model, scene):
     assert zoomed["naive"].psnr_db < min(zoomed[name].psnr_db for name in ("resized base", "default, held out"))
 
 
+def test_an_upsampler_has_a_row_of_its_own(model, scene, monkeypatch):
+    gray = {"bicubic": 0.0, "mine": 0.999}
+    monkeypatch.setattr(protocols, "find_upsampler", lambda name: lambda image, size: image.new_full((*size, 3), gray[name]))
+    views = [protocols.TestView(tiny.cameras(1)[0], torch.ones(96, 128, 3), Path("photograph.png"))]
+    rows = {row.name: row.psnr_db for row in training_free_rows(model, Judge(views, PROTOCOLS["P3"]), 2, "mine")}
+    assert rows["resized base"] < 1 and rows["base upsampled by mine"] > 50
+
+
+def test_the_mean_over_scenes(model, scene):
+    rows = evaluate(model, scene, [1, 1 / 4], ["instant"], "P3")
+    better = [replace(row, scene="other", psnr_db=row.psnr_db + 2, ssim=None, gaussians=row.gaussians + 1) for row in rows]
+    averaged = means([*rows, *better])
+    assert [(row.scale, row.name) for row in averaged] == [(row.scale, row.name) for row in rows]
+    assert {row.scene for row in averaged} == {"mean of 2"}
+    for row, mean in zip(rows, averaged, strict=True):
+        assert mean.psnr_db == pytest.approx(row.psnr_db + 1) and mean.ssim is None
+        assert mean.adapted_on == row.adapted_on
+    assert table([*rows, *averaged]).splitlines()[0].startswith("| scene ")
+
+
 def test_a_checkpoint_without_cameras_cannot_be_judged(scene):
     with pytest.raises(SettingsError, match="has no cameras, so its base scale is not known; give its model folder"):
         evaluate(wrap_model(tiny.model(), backend="reference"), scene, [1], [], "P3")
@@ -156,7 +203,30 @@ def test_rows_as_text_and_as_records(model, scene):
     assert len(lines) == 2 + len(rows) and len({len(line) for line in lines}) == 1
     assert lines[2].startswith("| x1 ") and f"{rows[0].psnr_db:.2f}" in lines[2]
     assert "| - " in lines[-1]  # no SSIM at 8 x 6 px
+    assert all("| P3 " in line for line in lines[2:])
     assert records(rows)[0] == {**vars(rows[0])}
+
+
+def test_lpips_has_a_column_that_says_which(model, scene):
+    class Half:
+        label = "LPIPS (half)"
+
+        def __call__(self, image, truth):
+            return None if image.shape[0] < 10 else 0.5
+
+    rows = evaluate(model, scene, [1, 1 / 4], [], "P3", Half())
+    head, _, first, *_, last = table(rows).splitlines()
+    assert "| LPIPS (half) |" in head and "| 0.5000 " in first and "| - " in last
+    assert (rows[0].lpips, rows[0].lpips_label, rows[-1].lpips) == (0.5, "LPIPS (half)", None)
+
+
+def test_published_rows_name_their_protocol_and_source():
+    rows = published("nerf-synthetic", [1 / 4, 2])
+    assert {row.scale for row in rows} == {1 / 4, 2} and {row.dataset for row in rows} == {"nerf-synthetic"}
+    head, _, *lines = published_table(rows).splitlines()
+    assert "LPIPS (vgg, 0..1)" in head and len(lines) == len(rows)
+    assert any("| x0.25 | P3 " in line and "Mipmap-GS, adapted on the scored views" in line and "| 32.51 " in line for line in lines)
+    assert all(row.source and row.protocol in PROTOCOLS and 15 < row.psnr_db < 40 for row in PUBLISHED)
 
 
 def test_a_markdown_table_pads_its_columns():

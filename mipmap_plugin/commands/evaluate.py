@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
 from mipmap_plugin.commands.common import tell, wrap
-from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
+from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import Recipe
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import refuse_existing, write_json
 from mipmap_plugin.scenes import load_scene
 
 
 def evaluate(
-    checkpoint: Checkpoint,
-    images: Path,
+    checkpoint: tyro.conf.Positional[tuple[Path, ...]],
+    images: tuple[Path, ...],
     scale: Scales,
     recipe: tyro.conf.UseAppendAction[tuple[Recipe, ...]] = (),
-    protocol: Literal["P1", "P2", "P3"] = "P3",
+    protocol: Literal["P1", "P2", "P3", "P4"] = "P3",
+    lpips: Literal["alex", "vgg", "vgg-01"] | None = None,
+    lpips_weights: Path | None = None,
+    published: Literal["nerf-synthetic", "mip-nerf-360"] | None = None,
     steps: int | None = None,
+    upsampler: str | None = None,
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
     backend: str = "auto",
@@ -29,15 +35,19 @@ def evaluate(
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
-    """Judge a checkpoint against real images: as it is, with training-free filters, resized, and adapted.
+    """Judge checkpoints against real images: as they are, with training-free filters, resized, and adapted.
 
     Args:
-        checkpoint: A PLY or a model folder; its cameras tell the base scale.
-        images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images).
+        checkpoint: A PLY or a model folder, whose cameras tell the base scale; or several, which are also averaged.
+        images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images), one for each checkpoint.
         scale: Target over base, such as 1/4 or 4; 1 is the base itself. May be given several times.
         recipe: Adapt with this recipe, once on views that are not judged on and once on those that are; may be given several times.
-        protocol: How a photograph becomes the truth at another scale: P1 box, truncated; P2, P3 Pillow's bicubic.
+        protocol: The truth at another scale: P1 box, truncated; P2, P3 Pillow's bicubic; P4 the folders images_2, images_4, ... of a COLMAP scene.
+        lpips: Also measure LPIPS, with AlexNet or VGG; vgg-01 feeds images in 0..1, which is not LPIPS' definition but what the papers do.
+        lpips_weights: The backbone's weights, as torchvision saves them; by default they are downloaded, once.
+        published: Also print what papers published for this data set.
         steps: Optimizer steps at most, instead of the recipe's.
+        upsampler: What makes the base image larger, by name or the file of a network.
         background: Of the scene; by default what the checkpoint says, else black.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
@@ -47,17 +57,40 @@ def evaluate(
         json: Print JSON instead of a table.
     """
     from mipmap_plugin.evaluation.evaluate import evaluate as rows_of
-    from mipmap_plugin.evaluation.report import records, table
+    from mipmap_plugin.evaluation.evaluate import means
+    from mipmap_plugin.evaluation.perceptual import Perceptual
+    from mipmap_plugin.evaluation.report import records
 
     if output:
         refuse_existing(output, overwrite)
-    wrapped = wrap(checkpoint, None, background, backend, screen_filter)
-    overrides: dict[str, Any] = {"seed": seed} | ({} if steps is None else {"steps": steps})
-    rows = rows_of(wrapped, load_scene(images), each_once(scale), recipe, protocol, **overrides)
+    if len(checkpoint) != len(images):
+        raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")
+    perceptual = Perceptual(lpips, lpips_weights) if lpips else None
+    chosen: dict[str, Any] = dict(seed=seed, steps=steps, upsampler=upsampler)
+    settings = {name: value for name, value in chosen.items() if value is not None}
+    rows = []
+    for each, folder in zip(checkpoint, images, strict=True):
+        wrapped = wrap(each, None, background, backend, screen_filter)
+        rows += rows_of(wrapped, load_scene(folder), each_once(scale), recipe, protocol, perceptual, **settings)
+    rows += means(rows) if len(checkpoint) > 1 else []
     if output:
         write_json(output, records(rows), overwrite)
     if json:
         tell(records(rows), json)
     else:
-        print(f"{checkpoint}, truth: {protocol} from {images}, real dB over the test views")
-        print(table(rows))
+        print(f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views")
+        _print_tables(rows, published, each_once(scale))
+
+
+def _listed(paths: Sequence[Path]) -> str:
+    return ", ".join(map(str, paths))
+
+
+def _print_tables(rows: Sequence[Any], dataset: Any, scales: list[float]) -> None:
+    from mipmap_plugin.evaluation.published import TITLE, published
+    from mipmap_plugin.evaluation.report import published_table, table
+
+    print(table(rows))
+    if dataset:
+        print(f"\npublished, {TITLE[dataset]}; rows of different protocols are not comparable")
+        print(published_table(published(dataset, scales)))

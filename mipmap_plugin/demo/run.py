@@ -13,7 +13,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.demo.world import render_world
-from mipmap_plugin.evaluation.evaluate import Row, adapted_row, training_free_rows
+from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row, training_free_rows
 from mipmap_plugin.evaluation.protocols import Protocol
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.files import refuse_existing
@@ -62,10 +62,11 @@ def run_demo(output: Path, scales: Sequence[float], *, overwrite: bool = False) 
     views = [WorldView(camera) for camera in base.cameras if camera.split == "test"]
     views = views[:: len(views) // JUDGED][:JUDGED]
     rows: list[Row] = []
+    judge = Judge(views, PROTOCOL)
     for scale in scales:
-        rows += training_free_rows(base, views, scale, PROTOCOL)
+        rows += training_free_rows(base, judge, scale)
         adapted = base.adapt(scale, resize="box", time_budget_s=BUDGET_S)
-        rows.append(adapted_row("adapted", adapted, views, PROTOCOL))
+        rows.append(adapted_row("adapted", adapted, judge))
         adapted.save(output / f"x{scale:g}.ply", overwrite=overwrite)
         camera = views[0].camera.zoomed(scale)
         pictures = [base.render(camera).image, adapted.render(camera).image, views[0].truth(scale, PROTOCOL)]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -17,6 +18,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr, ssim
+from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, resized_base, test_views
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.wrap import Adapted, Wrapped
@@ -28,54 +30,85 @@ class Row:
 
     name: str
     scale: float
+    protocol: str
     psnr_db: float
     ssim: float | None  # None: the image is smaller than SSIM's window
     adapt_seconds: float
     ms_per_view: float
     gaussians: int
     adapted_on: str = "-"  # what it was adapted on
+    lpips: float | None = None  # None: not asked for, or the image is too small
+    lpips_label: str = ""  # which LPIPS
+    scene: str = ""
 
 
-def judge(name: str, show: Callable[[Camera], Tensor], views: Sequence[Judged], scale: float, protocol: Protocol, **facts) -> Row:
-    """The mean quality of `show(camera at the base scale)` over the views. PSNR per view, then the mean, as the literature does."""
-    decibels, similarities, seconds = [], [], []
-    for view in tqdm(views, disable=None, desc=f"{name} x{scale:g}", leave=False):
-        began = time.perf_counter()
-        with torch.no_grad():
-            image = show(view.camera)
-        seconds.append(time.perf_counter() - began)
-        truth = view.truth(scale, protocol).to(image)
-        decibels.append(psnr(image, truth))
-        similarities.append(ssim(image, truth))
-    known = [value for value in similarities if value is not None]
-    similarity = fmean(known) if len(known) == len(views) else None
-    return Row(name, scale, fmean(decibels), similarity, facts.pop("adapt_seconds", 0.0), 1000 * fmean(seconds), **facts)
+@dataclass(frozen=True)
+class Judge:
+    """The views of a scene, and how an image of them is compared with the truth."""
+
+    views: Sequence[Judged]
+    protocol: Protocol
+    perceptual: Perceptual | None = None
+    scene: str = ""
+
+    def row(self, name: str, scale: float, show: Callable[[Camera], Tensor], **facts: Any) -> Row:
+        """The mean quality of `show(camera at the base scale)` over the views. PSNR per view, then the mean, as the literature does."""
+        decibels, similarities, distances, seconds = [], [], [], []
+        for view in tqdm(self.views, disable=None, desc=f"{name} x{scale:g}", leave=False):
+            began = time.perf_counter()
+            with torch.no_grad():
+                image = show(view.camera)
+            seconds.append(time.perf_counter() - began)
+            truth = view.truth(scale, self.protocol).to(image)
+            decibels.append(psnr(image, truth))
+            similarities.append(ssim(image, truth))
+            distances.append(self.perceptual(image, truth) if self.perceptual else None)
+        label = self.perceptual.label if self.perceptual else ""
+        quality = dict(psnr_db=fmean(decibels), ssim=_mean(similarities), lpips=_mean(distances), lpips_label=label)
+        facts = {"adapt_seconds": 0.0, "ms_per_view": 1000 * fmean(seconds), **facts}
+        return Row(name=name, scale=scale, protocol=self.protocol.name, scene=self.scene, **quality, **facts)  # type: ignore[arg-type]
 
 
-def training_free_rows(model: Wrapped, views: Sequence[Judged], scale: float, protocol: Protocol) -> list[Row]:
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None where one of them is not known."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
+
+
+def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic") -> list[Row]:
     """The base as it is, each screen filter that needs no training, and the base's own render resized (for zoom-out, supersampling)."""
     count = len(model.model.gaussians(model.any_camera()))
 
     def filtered(screen_filter: str | None) -> Callable[[Camera], Tensor]:
         return lambda camera: model.render(camera.zoomed(scale), scale, screen_filter).image
 
-    def resized(camera: Camera) -> Tensor:
-        return resized_base(model.render(camera).image.clamp(0, 1), camera.zoomed(scale).size)
+    def resized(by: str) -> Callable[[Camera], Tensor]:
+        return lambda camera: resized_base(model.render(camera).image.clamp(0, 1), camera.zoomed(scale).size, by)
 
-    shows = {"naive": filtered(None), "scaled": filtered("scaled"), "antialiased": filtered("antialiased"), "resized base": resized}
+    shows = {"naive": filtered(None), "scaled": filtered("scaled"), "antialiased": filtered("antialiased"), "resized base": resized("bicubic")}
+    if scale > 1 and upsampler != "bicubic":
+        shows[f"base upsampled by {Path(upsampler).name}"] = resized(upsampler)
     if scale == 1:
         shows = {"base": filtered(None)}
-    return [judge(name, show, views, scale, protocol, gaussians=count) for name, show in shows.items()]
+    return [judge.row(name, scale, show, gaussians=count) for name, show in shows.items()]
 
 
-def adapted_row(name: str, adapted: Adapted, views: Sequence[Judged], protocol: Protocol) -> Row:
+def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:
     """An adapted model, rendered as any classic viewer renders its file."""
     report = adapted.report
     facts = dict(adapt_seconds=report.seconds["total"], gaussians=report.gaussians_after, adapted_on=report.views)
-    return judge(name, lambda camera: adapted.render(camera.zoomed(report.scale)).image, views, report.scale, protocol, **facts)
+    return judge.row(name, report.scale, lambda camera: adapted.render(camera.zoomed(report.scale)).image, **facts)
 
 
-def evaluate(model: Wrapped, scene: Scene, scales: Sequence[float], recipes: Sequence[Recipe], protocol: str, **settings: Any) -> list[Row]:
+def evaluate(
+    model: Wrapped,
+    scene: Scene,
+    scales: Sequence[float],
+    recipes: Sequence[Recipe],
+    protocol: str,
+    perceptual: Perceptual | None = None,
+    **settings: Any,
+) -> list[Row]:
     """All rows: for each scale the training-free ones, then each recipe twice. Raises SettingsError.
 
     "held out": adapted on the checkpoint's training poses, and around them if the recipe says so; the honest row, for a user
@@ -85,12 +118,13 @@ def evaluate(model: Wrapped, scene: Scene, scales: Sequence[float], recipes: Seq
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
     judged = test_views(scene, model.cameras[0], model.background)
+    judge = Judge(judged, PROTOCOLS[protocol], perceptual, scene.source.name)
     rows = []
     for scale in scales:
-        rows += training_free_rows(model, judged, scale, PROTOCOLS[protocol])
+        rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"))
         for name, on in product(recipes if scale != 1 else [], ("held out", "scored")):
             adapted = model.adapt(scale, recipe=name, **(settings | _views(name, on, judged)))
-            rows.append(adapted_row(f"{name}, {on}", adapted, judged, PROTOCOLS[protocol]))
+            rows.append(adapted_row(f"{name}, {on}", adapted, judge))
     return rows
 
 
@@ -98,3 +132,25 @@ def _views(name: Recipe, on: str, judged: Sequence[TestView]) -> dict[str, Any]:
     if on == "scored":
         return {"views": "given", "cameras": [view.camera for view in judged]}
     return {} if name == "default" else {"views": "train"}
+
+
+def means(rows: Sequence[Row]) -> list[Row]:
+    """The rows of several scenes, averaged over them as the papers' tables are: one for each scale and way, in their order."""
+    groups: dict[tuple[float, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row.scale, row.name), []).append(row)
+    return [_averaged(group) for group in groups.values()]
+
+
+def _averaged(group: Sequence[Row]) -> Row:
+    return replace(
+        group[0],
+        scene=f"mean of {len(group)}",
+        adapted_on=group[0].adapted_on if len({row.adapted_on for row in group}) == 1 else "each scene's own",
+        psnr_db=fmean(row.psnr_db for row in group),
+        ssim=_mean([row.ssim for row in group]),
+        lpips=_mean([row.lpips for row in group]),
+        adapt_seconds=fmean(row.adapt_seconds for row in group),
+        ms_per_view=fmean(row.ms_per_view for row in group),
+        gaussians=round(fmean(row.gaussians for row in group)),
+    )

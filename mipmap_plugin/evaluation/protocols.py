@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 from typing import Protocol as TypingProtocol
 
 from torch import Tensor
@@ -12,6 +15,15 @@ from mipmap_plugin.adaptation.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes import Scene
+from mipmap_plugin.scenes.images import image_size, read_image
+
+ProtocolName = Literal["P1", "P2", "P3", "P4"]
+
+# COLMAP scenes come with their photographs made smaller beforehand: images_2, images_4, images_8 beside images.
+READY_MADE = re.compile(r"images(_\d+)?$")
+
+# px: the half that is rounded off an eighth is four of the whole. A copy that differs by as much is resized.
+ROUNDING = 4
 
 
 @dataclass(frozen=True)
@@ -19,7 +31,7 @@ class Protocol:
     """One way to make the truth, as the papers do it."""
 
     name: str
-    resize: str  # of the photograph, already composited on the background
+    resize: str | None  # of the photograph, already composited on the background; None: files of the wanted size are read
     truncate: bool  # P1 writes its levels with truncation to 8 bits, the others with rounding
 
     def quantized(self, image: Tensor) -> Tensor:
@@ -27,10 +39,11 @@ class Protocol:
         return (steps.floor() if self.truncate else steps.round()) / 255
 
 
-PROTOCOLS = {
+PROTOCOLS: dict[str, Protocol] = {
     "P1": Protocol("P1", "box", truncate=True),
     "P2": Protocol("P2", "pil-bicubic", truncate=False),
     "P3": Protocol("P3", "pil-bicubic", truncate=False),
+    "P4": Protocol("P4", None, truncate=False),
 }
 
 
@@ -49,14 +62,35 @@ class TestView:
 
     camera: Camera
     photograph: Tensor  # [H, W, 3], full resolution
+    file: Path
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def truth(self, scale: float, protocol: Protocol) -> Tensor:
-        """[h, w, 3] at `scale` times the base scale."""
+        """[h, w, 3] at `scale` times the base scale. Raises SettingsError where there is no photograph as large."""
         size = self.camera.zoomed(scale).size
+        if protocol.resize is None:
+            return resize(read_image(ready_made(self.file, size), self.background), size, "pil-bicubic")
         if size[0] > self.photograph.shape[0]:
             has = f"{self.photograph.shape[1]} x {self.photograph.shape[0]}"
             raise SettingsError(f"x{scale:g} asks for {size[1]} x {size[0]} px, but the photographs have only {has}; evaluate a smaller scale")
         return protocol.quantized(resize(self.photograph, size, protocol.resize))
+
+
+def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
+    """The copy of a COLMAP scene's photograph that has `size` (height, width), but for rounding: of images, images_2, images_4, ...
+
+    Raises SettingsError when there is none.
+    """
+    folder = next((parent for parent in photograph.parents if READY_MADE.match(parent.name)), None)
+    others = [] if folder is None else sorted(each for each in folder.parent.iterdir() if READY_MADE.match(each.name))
+    copies = [other / photograph.relative_to(folder) for other in others if folder]
+    sizes = {copy: image_size(copy) for copy in copies if copy.is_file()}
+    for copy, (width, height) in sizes.items():
+        if max(abs(height - size[0]), abs(width - size[1])) <= ROUNDING:
+            return copy
+    there = ", ".join(f"{width} x {height}" for width, height in sizes.values()) or "none"
+    wanted = f"{photograph.name} at {size[1]} x {size[0]} px in a folder images_2, images_4, ... of its scene"
+    raise SettingsError(f"P4 wants {wanted}, but there is {there}; evaluate a scale that has one, or by P3")
 
 
 def test_views(scene: Scene, base: Camera, background: tuple[float, float, float]) -> list[TestView]:
@@ -65,7 +99,7 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
     cameras = [c for c in cameras if c.split == "test"] or cameras
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to judge by")
-    return [TestView(_as_sampled(camera, base), scene.image(camera, background)) for camera in cameras]
+    return [TestView(_as_sampled(camera, base), scene.image(camera, background), scene.images[camera], background) for camera in cameras]
 
 
 def _as_sampled(camera: Camera, base: Camera) -> Camera:

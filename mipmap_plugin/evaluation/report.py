@@ -6,17 +6,34 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from mipmap_plugin.evaluation.evaluate import Row
+from mipmap_plugin.evaluation.published import LPIPS_LABEL, Published
 
 
 def table(rows: Sequence[Row]) -> str:
-    """A Markdown table, which is legible in a terminal too."""
-    head = ["scale", "what", "adapted on", "PSNR dB", "SSIM", "adapt s", "ms/view", "splats"]
+    """A Markdown table, which is legible in a terminal too. Scenes and LPIPS have columns where there are any."""
+    several, label = len({row.scene for row in rows}) > 1, next((row.lpips_label for row in rows if row.lpips_label), "")
+    head = ["scene"] * several + ["scale", "protocol", "what", "adapted on", "PSNR dB", "SSIM"] + [label] * bool(label)
+    head += ["adapt s", "ms/view", "splats"]
     body = [
-        [f"x{row.scale:g}", row.name, row.adapted_on, f"{row.psnr_db:.2f}", "-" if row.ssim is None else f"{row.ssim:.4f}",
-         f"{row.adapt_seconds:.1f}", f"{row.ms_per_view:.0f}", f"{row.gaussians:,}"]
+        [row.scene] * several
+        + [f"x{row.scale:g}", row.protocol, row.name, row.adapted_on, f"{row.psnr_db:.2f}", _digits(row.ssim, 4)]
+        + [_digits(row.lpips, 4)] * bool(label)
+        + [f"{row.adapt_seconds:.1f}", f"{row.ms_per_view:.0f}", f"{row.gaussians:,}"]
         for row in rows
-    ]  # fmt: skip
+    ]
     return markdown(head, body)
+
+
+def published_table(rows: Sequence[Published]) -> str:
+    head = ["scale", "protocol", "published", "PSNR dB", "SSIM", LPIPS_LABEL, "source"]
+    body = [
+        [f"x{row.scale:g}", row.protocol, row.method, f"{row.psnr_db:.2f}", _digits(row.ssim, 3), _digits(row.lpips, 3), row.source] for row in rows
+    ]
+    return markdown(head, body)
+
+
+def _digits(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:

@@ -1,0 +1,100 @@
+"""LPIPS (Zhang et al. 2018) by the lpips package, which brings the linear heads; the backbone's weights are a file or downloaded."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
+from mipmap_plugin.models.torch_file import load_torch
+from mipmap_plugin.torchvision_absent import torchvision_optional
+
+# A backbone, and what it is fed with: images in -1..1 as LPIPS is defined, or (01) in 0..1, as the papers of this field do with VGG.
+Kind = Literal["alex", "vgg", "vgg-01"]
+
+INSTALL = "install it with `pip install 'mipmap-plugin[metrics]'`"
+
+# torchvision's weights for ImageNet, at the address that torchvision has for them.
+DOWNLOADS = {
+    "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
+    "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
+}
+
+# px: a smaller image is less than one pixel after the last pooling.
+SMALLEST = {"alex": 31, "vgg": 16}
+
+
+class Perceptual:
+    """LPIPS as a metric: `perceptual(image, truth)`, both [H, W, 3]. `label` says which LPIPS it is."""
+
+    def __init__(self, kind: Kind = "alex", weights: str | Path | None = None) -> None:
+        """`weights`: a file of the backbone's weights, as torchvision names them; by default they are downloaded, once.
+
+        Raises PluginError without lpips, CheckpointError for another file, SettingsError when they cannot be downloaded.
+        """
+        self._backbone = kind.removesuffix("-01")
+        self._normalize = not kind.endswith("-01")
+        self.label = f"LPIPS ({self._backbone}, {'normalized' if self._normalize else '0..1'})"
+        self._network = _load(self._backbone, None if weights is None else Path(weights))
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor, truth: Tensor) -> float | None:
+        """The distance of two images [H, W, 3] clamped to 0..1; None for images that are too small for the backbone."""
+        if min(image.shape[:2]) < SMALLEST[self._backbone]:
+            return None
+        planes = [each.detach().cpu().float().clamp(0, 1).movedim(-1, 0)[None] for each in (image, truth)]
+        return float(self._network(*planes, normalize=self._normalize))
+
+
+def _load(backbone: str, file: Path | None) -> nn.Module:
+    with torchvision_optional(models={"alexnet": _alexnet, "vgg16": _vgg16}):
+        try:
+            import lpips
+        except ImportError as error:
+            raise PluginError(f"LPIPS is measured by the package lpips; {INSTALL} ({error})") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torchvision's, on the arguments that lpips calls it with
+        network = lpips.LPIPS(net=backbone, pnet_rand=True, verbose=False)
+    weights = _download(backbone) if file is None else load_torch(file)
+    wanted = {name: "features." + name.split(".", 1)[1] for name in network.net.state_dict()}  # lpips: slice1.0.weight
+    try:
+        network.net.load_state_dict({name: weights[theirs] for name, theirs in wanted.items()})
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise CheckpointError(f"{file} holds no {backbone} backbone as torchvision saves it; leave it out to download one") from error
+    return network
+
+
+def _download(backbone: str) -> dict[str, Tensor]:
+    try:
+        return torch.hub.load_state_dict_from_url(DOWNLOADS[backbone], map_location="cpu", weights_only=True, check_hash=True)
+    except OSError as error:
+        advice = f"download {DOWNLOADS[backbone]} elsewhere and give the file (--lpips-weights)"
+        raise SettingsError(f"LPIPS needs the weights of its backbone, which cannot be downloaded ({error}); {advice}") from error
+
+
+def _alexnet(pretrained: bool) -> SimpleNamespace:
+    """AlexNet's convolutions in torchvision's order, with random weights; for where torchvision does not work."""
+    shapes = [(3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1), (256, 256, 3, 1, 1)]
+    layers: list[nn.Module] = []
+    for number, shape in enumerate(shapes):
+        layers += [nn.Conv2d(*shape), nn.ReLU()]
+        if number in (0, 1, 4):
+            layers.append(nn.MaxPool2d(3, 2))
+    return SimpleNamespace(features=nn.Sequential(*layers))
+
+
+def _vgg16(pretrained: bool) -> SimpleNamespace:
+    """VGG-16's convolutions, likewise."""
+    layers: list[nn.Module] = []
+    channels = 3
+    for width, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
+        for _ in range(depth):
+            layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU()]
+            channels = width
+        layers.append(nn.MaxPool2d(2, 2))
+    return SimpleNamespace(features=nn.Sequential(*layers))
