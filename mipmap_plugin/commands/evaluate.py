@@ -56,8 +56,7 @@ def evaluate(
         overwrite: Replace that file if it exists.
         json: Print JSON instead of a table.
     """
-    from mipmap_plugin.evaluation.evaluate import evaluate as rows_of
-    from mipmap_plugin.evaluation.evaluate import means
+    from mipmap_plugin.evaluation import evaluate as evaluation
     from mipmap_plugin.evaluation.perceptual import Perceptual
     from mipmap_plugin.evaluation.report import records
 
@@ -66,13 +65,12 @@ def evaluate(
     if len(checkpoint) != len(images):
         raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")
     perceptual = Perceptual(lpips, lpips_weights) if lpips else None
-    chosen: dict[str, Any] = dict(seed=seed, steps=steps, upsampler=upsampler)
-    settings = {name: value for name, value in chosen.items() if value is not None}
-    rows = []
+    settings = {name: value for name, value in dict(seed=seed, steps=steps, upsampler=upsampler).items() if value is not None}
+    rows: list[Any] = []
     for each, folder in zip(checkpoint, images, strict=True):
         wrapped = wrap(each, None, background, backend, screen_filter)
-        rows += rows_of(wrapped, load_scene(folder), each_once(scale), recipe, protocol, perceptual, **settings)
-    rows += means(rows) if len(checkpoint) > 1 else []
+        rows += evaluation.evaluate(wrapped, load_scene(folder), each_once(scale), recipe, protocol, perceptual, **settings)
+    rows += evaluation.means(rows) if len(checkpoint) > 1 else []
     if output:
         write_json(output, records(rows), overwrite)
     if json:
