@@ -60,10 +60,7 @@ def evaluate(
     from mipmap_plugin.evaluation.perceptual import Perceptual
     from mipmap_plugin.evaluation.report import records
 
-    if output:
-        refuse_existing(output, overwrite)
-    if len(checkpoint) != len(images):
-        raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")
+    _refuse(checkpoint, images, output, overwrite)
     perceptual = Perceptual(lpips, lpips_weights) if lpips else None
     settings = {name: value for name, value in dict(seed=seed, steps=steps, upsampler=upsampler).items() if value is not None}
     rows: list[Any] = []
@@ -78,6 +75,13 @@ def evaluate(
     else:
         print(f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views")
         _print_tables(rows, published, each_once(scale))
+
+
+def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], output: Path | None, overwrite: bool) -> None:
+    if output:
+        refuse_existing(output, overwrite)
+    if len(checkpoint) != len(images):
+        raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")
 
 
 def _listed(paths: Sequence[Path]) -> str:
