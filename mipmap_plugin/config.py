@@ -74,14 +74,14 @@ _INSTANT = dict(steps=0)
 
 _DEFAULT_OUT = dict(
     steps=400, patience=2, decay=0.3, truth_oversampling=4, views_per_step=2,
-    rates=LearningRates(means=3.2e-4, scales=0.01, quats=0.002, opacities=0.05, sh0=0.01, shN=0.001),
+    rates=LearningRates(means=3.2e-4, scales=0.01, quats=0.002, opacities=0.05, sh0=0.01, shN=0.001, networks=5e-4),
 )  # fmt: skip
 
 # Towards a bicubic or Lanczos target every step loses real dB against the closed form: the target knows nothing that the
 # base does not, and adds the kernel's ringing. So the image is shrunk and compared with the base itself, at gentle rates.
 _DEFAULT_IN = dict(
     steps=200, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
-    rates=LearningRates(means=1.6e-4, opacities=0.02),
+    rates=LearningRates(means=1.6e-4, opacities=0.02, networks=5e-4),
 )  # fmt: skip
 
 
