@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 import tiny
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.scenes import write_cameras
@@ -31,7 +33,7 @@ def layers(sizes: dict[str, tuple[int, int]], seed: int, gain: float = 1.0) -> d
 
 
 def deform_state(timenet: bool = False, six_dof: bool = False, width: int = 256, seed: int = 0) -> dict[str, Tensor]:
-    """The weights of a DeformNetwork (FORMATS.md 7.2) that moves a scene of unit size by about a tenth."""
+    """The weights of a DeformNetwork that moves a scene of unit size by about a tenth."""
     inputs = 63 + (30 if timenet else 21)
     sizes = {"timenet.0": (256, 13), "timenet.2": (30, 256)} if timenet else {}
     sizes |= {f"linear.{i}": (width, {0: inputs, 5: inputs + width}.get(i, width)) for i in range(8)}
@@ -55,7 +57,7 @@ def write_deformable(folder: Path, state: dict[str, Tensor] | None = None, itera
 
 
 def hexplane_state(width: int = 32, channels: int = 8, scales: tuple[int, ...] = (1, 2), depth: int = 1, no_grid: bool = False, seed: int = 0):
-    """The weights of a deform_network (FORMATS.md 8.1): every head, used or not, and what nobody uses."""
+    """The weights of a deform_network: every head, used or not, and what nobody uses."""
     n = "deformation_net."
     sizes = {"timenet.0": (64, 9), "timenet.2": (32, 64), n + "feature_out.0": (width, 4 if no_grid else channels * len(scales))}
     sizes |= {f"{n}feature_out.{2 * i}": (width, width) for i in range(1, depth)}
@@ -87,13 +89,15 @@ def at(time: float | None) -> Camera:
 
 
 def decibels(wrapped: Wrapped, adapted: Adapted, views: list[Camera]) -> tuple[float, float]:
-    """Mean dB against the pseudo truth at the adapted model's scale: of the unadapted base, and of the adapted model."""
+    """Mean dB against the pseudo truth, at its size: of the unadapted base at the adapted model's scale, and of the adapted model."""
     report, zoom = adapted.report, [view.zoomed(adapted.report.scale) for view in views]
     truth = PseudoTruth(wrapped.model, adapted.backend, wrapped.effects(), report.scale, report.settings)
     targets = [truth(view) for view in views]
-    shown = {"base": [wrapped.render(camera).image for camera in zoom], "adapted": [adapted.render(camera).image for camera in zoom]}
-    before, after = (sum(psnr(*pair) for pair in zip(images, targets, strict=True)) / len(views) for images in shown.values())
-    return before, after
+
+    def quality(images: list[Tensor]) -> float:
+        return fmean(psnr(resize(image, target.shape[:2], "area"), target) for image, target in zip(images, targets, strict=True))
+
+    return quality([wrapped.render(camera).image for camera in zoom]), quality([adapted.render(camera).image for camera in zoom])
 
 
 def _write_splats(folder: Path, iteration: int, options: str, degree: int, count: int) -> None:

@@ -27,7 +27,7 @@ def equal(model, raw) -> bool:
 
 
 def activated(raw) -> Gaussians:
-    """The float64 reading of FORMATS: exp, sigmoid, sh0 before shN; gsplat normalizes quaternions inside."""
+    """In float64: exp, sigmoid, sh0 before shN; gsplat normalizes quaternions inside."""
     wide = {name: tensor.double() for name, tensor in raw.items()}
     sh = torch.cat([wide["sh0"], wide["shN"]], 1)
     return Gaussians(wide["means"], wide["quats"], wide["scales"].exp(), 1 / (1 + (-wide["opacities"]).exp()), sh)

@@ -26,7 +26,7 @@ def bilinear(plane, x, y):
 
 
 def oracle(state, raw, time, *, no_grid=False, static_mlp=False, apply_rotation=False, off=("opacity_deform", "shs_deform")):
-    """The activated parameters of one splat by FORMATS.md 8.1 in float64."""
+    """The activated parameters of one splat in float64."""
     w = {name.removeprefix("deformation_net."): tensor.double().numpy() for name, tensor in state.items()}
     layer = lambda name, h: w[f"{name}.weight"] @ h + w[f"{name}.bias"]  # noqa: E731
     head = lambda name, h: layer(f"{name}.3", np.maximum(layer(f"{name}.1", np.maximum(h, 0)), 0))  # noqa: E731

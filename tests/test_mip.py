@@ -1,4 +1,4 @@
-"""The families with a `filter_3D` column: against FORMATS.md's formulas, there and back, and adapted."""
+"""The families with a `filter_3D` column: against the published formulas, there and back, and adapted."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ from mipmap_plugin.wrap import wrap_model
 FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
 
 
-def by_formats_md(columns: dict[str, np.ndarray], smooth: bool = True) -> Gaussians:
-    """FORMATS.md 1.2 and 6.2 in float64."""
+def by_the_formulas(columns: dict[str, np.ndarray], smooth: bool = True) -> Gaussians:
+    """The published formulas in float64."""
     wide = {name: torch.from_numpy(column.astype(np.float64)) for name, column in columns.items()}
     pick = lambda *names: torch.stack([wide[name] for name in names], -1)  # noqa: E731
     s, f = pick("scale_0", "scale_1", "scale_2").exp(), wide["filter_3D"] if smooth else torch.zeros_like(wide["x"])
@@ -78,7 +78,7 @@ def test_rendered_as_an_independent_sum_of_the_files_own_numbers(tmp_path, famil
     assert (model.family, (model.trained.screen_filter, model.trained.eps2d)) == (family, FILTERS[family])
     view = tiny.cameras(1)[0]
     image = wrap_model(model, cameras=[view], backend="reference").render(view).image
-    expected = brute_force(by_formats_md(splats(), family != "analytic"), view, FILTERS[family][1], screen_filter=FILTERS[family][0])[0]
+    expected = brute_force(by_the_formulas(splats(), family != "analytic"), view, FILTERS[family][1], screen_filter=FILTERS[family][0])[0]
     assert expected.max() > 0.2
     torch.testing.assert_close(image.double(), expected, atol=1e-5, rtol=0)
 

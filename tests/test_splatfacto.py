@@ -29,7 +29,7 @@ def equal(model, raw) -> bool:
 
 
 def activated(raw) -> Gaussians:
-    """The float64 reading of FORMATS §3.2; without f_rest a color is the sigmoid of its logit, here as SH of that color."""
+    """In float64; without f_rest a color is the sigmoid of its logit, here as SH of that color."""
     wide = {name: tensor.double() for name, tensor in raw.items()}
     dc = wide["sh0"]
     if not raw["shN"].shape[1]:

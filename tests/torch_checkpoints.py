@@ -110,7 +110,7 @@ def aim(base, camera, scale: float) -> Tensor:
 
 
 def normalized_by_numpy(cameras, points):
-    """gsplat's own steps (FORMATS §2.3), in NumPy: similarity from the cameras, then principal axes of the points."""
+    """gsplat's own steps, in NumPy: similarity from the cameras, then principal axes of the points."""
     c2w = np.stack([np.linalg.inv(camera.viewmat.numpy()) for camera in cameras])
     t, R = c2w[:, :3, 3], c2w[:, :3, :3]
     up = -R[:, :, 1].mean(0)

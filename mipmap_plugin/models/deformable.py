@@ -41,6 +41,9 @@ class DeformNetwork:
         self.depth = sum(bool(re.fullmatch(r"linear\.\d+\.weight", name)) for name in weights)
         self.has_timenet = "timenet.0.weight" in weights
         self.is_6dof = "branch_w.weight" in weights
+        if self.depth == 0:
+            held = ", ".join(sorted({name.partition(".")[0] for name in weights})[:4]) or "nothing"
+            raise CheckpointError(f"{where}: it has no layers linear.0, linear.1, ..., but {held}, so a changed copy of the project trained it")
         told_by = ["linear.0.weight", *(["timenet.0.weight", "timenet.2.weight"] if self.has_timenet else [])]
         require(self._weights, dict.fromkeys(told_by, (-1, -1)), where)
         self._refuse_other_inputs(where)

@@ -19,6 +19,9 @@ HEAD = 64 * 1024
 # Bytes of a zip member that are looked at for names; the pickle of a gsplat or splatfacto checkpoint has a few kB.
 MAX_PICKLE = 16 * 1024 * 1024
 
+# A splat in a .splat file (antimatter15/splat); its quaternion is wxyz around 128.
+SPLAT_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
+
 
 def read_head(path: Path, size: int = HEAD) -> bytes:
     """The first `size` bytes. Raises CheckpointError when there are none, or when a placeholder stands for the data."""
@@ -115,10 +118,10 @@ def _kind_of_zip(path: Path) -> str:
 
 
 def _plausible_splat(head: bytes, size: int) -> bool:
-    """Records of 32 bytes: 3 f4 position, 3 f4 scale, 4 u1 color, 4 u1 quaternion around 128 (antimatter15/splat)."""
-    if size % 32:
+    """Whether the file is whole records of numbers that a splat can have."""
+    if size % SPLAT_RECORD.itemsize:
         return False
-    rows = np.frombuffer(head[: len(head) // 32 * 32], np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)]))
+    rows = np.frombuffer(head[: len(head) // SPLAT_RECORD.itemsize * SPLAT_RECORD.itemsize], SPLAT_RECORD)
     length = np.linalg.norm(rows["quat"].astype(np.float32) / 128 - 1, axis=1)
     scale = rows["scale"]
     return bool(np.isfinite(rows["position"]).all() and (scale > 0).all() and (scale < 1e6).all() and ((length > 0.5) & (length < 1.8)).all())

@@ -1,0 +1,66 @@
+"""Numbers that were evaluated by hand in float64, as far as the tests of their own modules do not hold them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_exchange import RECORD
+from test_reference import BACKEND, t2_camera, t3_gaussian
+
+from mipmap_plugin.backends.filters import footprint
+from mipmap_plugin.backends.harmonics import colors
+from mipmap_plugin.backends.projection import project
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.magic import SPLAT_RECORD, kind_of
+from mipmap_plugin.models.vanilla import VanillaModel
+
+LEAST_LOGIT = -5.537334267  # logit(1/255), of the faintest splat that is drawn
+
+
+def test_t3_view_conic_and_alpha():
+    splat, view = t3_gaussian(), t2_camera()
+    seen = splat.means[0] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    assert seen.tolist() == pytest.approx([0.355789474, -0.134210526, 4.325263158], abs=1e-8)
+    drawn = footprint(project(splat, view, 0.2), splat.opacities, "classic", 0.3)
+    conic = 1 / drawn.across, -drawn.shear / drawn.across, 1 / drawn.yy + drawn.shear**2 / drawn.across
+    assert [float(part) for part in conic] == pytest.approx([0.332591097, -0.034755101, 0.925606762], abs=1e-8)
+    dx, dy = (torch.tensor([pixel + 0.5], dtype=torch.float64) - at for pixel, at in ((37, 37.758091993), (21, 21.765879776)))
+    alpha = float(drawn.alpha(drawn.packed(), dx, dy))
+    assert float(splat.opacities) == pytest.approx(0.731058579, abs=1e-9)
+    assert alpha == pytest.approx(0.701404548, abs=1e-8) and math.log(alpha / float(splat.opacities)) == pytest.approx(-0.041408769, abs=1e-8)
+
+
+def test_t3_color():
+    splat, view = t3_gaussian(), t2_camera()
+    assert colors(splat.sh, splat.means, view.center, 0)[0].tolist() == pytest.approx([0.641047396, 0.415371562, 0.528209479], abs=1e-9)
+
+
+def test_t5_record_of_a_splat_file(tmp_path):
+    [row] = np.frombuffer(RECORD, SPLAT_RECORD)
+    assert row["position"].tolist() == pytest.approx([-21.4308968, -18.3631401, -22.6337585], abs=1e-6)
+    assert row["scale"].tolist() == pytest.approx([1.77184176, 0.90761751, 4.88086510], abs=1e-7)
+    assert row["color"].tolist() == [117, 201, 255, 255]
+    assert ((row["quat"] - 128.0) / 128).tolist() == [0.9296875, -0.0546875, -0.3046875, 0.203125]
+    (tmp_path / "one").write_bytes(RECORD)
+    assert kind_of(tmp_path / "one") == "splat"
+
+
+def test_t6_logit_of_the_faintest_splat():
+    faintest = VanillaModel.from_gaussians(_with_opacity(1 / 255))
+    assert float(faintest.parameters()["opacities"]) == pytest.approx(LEAST_LOGIT, abs=1e-6)
+
+
+@pytest.mark.parametrize(("more", "drawn"), [(1e-6, True), (-1e-6, False)])
+def test_t6_fainter_splats_are_not_drawn(more, drawn):
+    splat, view = _with_opacity(torch.sigmoid(torch.tensor(LEAST_LOGIT + more, dtype=torch.float64))), t2_camera()
+    x, y = project(splat, view, 0.2).means2d[0].tolist()
+    on_a_pixel = replace(view, cx=view.cx + 37.5 - x, cy=view.cy + 21.5 - y)
+    assert bool(BACKEND.render(splat, on_a_pixel, Effects(0)).alpha.any()) == drawn
+
+
+def _with_opacity(opacity) -> Gaussians:
+    splat = t3_gaussian()
+    return Gaussians(splat.means, splat.quats, splat.scales, torch.full_like(splat.opacities, float(opacity)), splat.sh)
