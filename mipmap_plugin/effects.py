@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 
 # px²: the variance that every 3DGS rasterizer adds to a projected splat (diff-gaussian-rasterization, forward.cu).
@@ -53,22 +55,78 @@ class Effects:
 
 @dataclass(frozen=True)
 class Effect:
-    """One thing that a renderer can do, whether this image calls for it, and why."""
+    """One thing that can be simulated, whether it is called for here, and why."""
 
     name: str
     on: bool
     reason: str
+    cost: str  # counted: what it takes where it is on, and what is saved where it is off
+
+    def __str__(self) -> str:
+        return f"{self.name}: {'on' if self.on else 'off'}, {self.reason} ({'costs' if self.on else 'saves'} {self.cost})"
 
 
-def explain(effects: Effects, gaussians: Gaussians) -> list[Effect]:
-    """Every effect that rendering knows, on or off, with its reason."""
-    integrates = effects.screen_filter == "analytic"
+# What only some families do; a model that does it says so itself (`models.base.effects_of`).
+OF_OTHER_MODELS = (
+    Effect("view-dependent geometry", False, "the splats are the same for every camera", "decoding them for each"),
+    Effect("levels of detail", False, "every splat is there at every distance", "a distance and a comparison a splat"),
+    Effect("time", False, "nothing moves", "a pass through a field for each image"),
+    Effect("appearance embedding", False, "all views share one appearance", "more inputs of a color network"),
+    Effect("3D filter", False, "no splat has one", "three roots a splat"),
+)
+
+
+def explain(
+    effects: Effects, gaussians: Gaussians, of_model: Sequence[Effect] = (), config: AdaptConfig | None = None, scale: float = 1.0
+) -> tuple[Effect, ...]:
+    """Every effect that is known here, on or off, with its reason and its cost.
+
+    `of_model`: what the model says of itself; `config` and `scale`: of an adaptation, if it is one that is asked about.
+    """
+    said = {effect.name: effect for effect in of_model}
+    own = [said.get(effect.name, effect) for effect in OF_OTHER_MODELS]
+    return (*own, *_of_rendering(effects, gaussians), *_of_adapting(config, scale))
+
+
+def enlarges(config: AdaptConfig, scale: float) -> bool:
+    """Whether the truth of an adaptation is an image made larger."""
+    return scale > 1 and config.compare_at == "target"
+
+
+def _of_rendering(effects: Effects, gaussians: Gaussians) -> list[Effect]:
+    integrates, n, given = effects.screen_filter == "analytic", effects.supersampling, gaussians.covariances is not None
     size = "over the area of a pixel" if integrates else f"{effects.eps2d:g} px²"
-    degree, room, n, given = effects.sh_degree, gaussians.sh_degree, effects.supersampling, gaussians.covariances is not None
+    exponentials = "five exponentials more for each splat on each pixel" if integrates else "two sums and a determinant a splat"
+    extra = "two products of matrices a splat"
     return [
-        Effect("view-dependent color", degree > 0, f"SH up to degree {degree} of {room}: above it every coefficient is 0"),
-        Effect("screen filter", effects.eps2d > 0 or integrates, f"{effects.screen_filter}, {size}"),
-        Effect("compensation", effects.screen_filter in COMPENSATED, f"the screen filter is {effects.screen_filter}"),
-        Effect("supersampling", n > 1, f"{n * n} sample{'s' if n > 1 else ''} a pixel"),
-        Effect("covariances", given, "the model gives them" if given else "quaternions and scales suffice"),
+        _view_dependent_color(effects.sh_degree, gaussians),
+        Effect("screen filter", effects.eps2d > 0 or integrates, f"{effects.screen_filter}, {size}", exponentials),
+        Effect("compensation", effects.screen_filter in COMPENSATED, f"the screen filter is {effects.screen_filter}", "one root a splat"),
+        Effect("supersampling", n > 1, f"{n * n} sample{'s' if n > 1 else ''} a pixel", f"{n * n if n > 1 else 'N x N'} times the pixels"),
+        Effect("covariances", given, "the model gives them" if given else "quaternions and scales suffice", extra),
     ]
+
+
+def _view_dependent_color(degree: int, gaussians: Gaussians) -> Effect:
+    bands, room = (degree + 1) ** 2, gaussians.sh.shape[1]
+    reason = f"SH up to degree {degree} of {gaussians.sh_degree}: above it every coefficient is 0"
+    on = f"a direction and {bands} of {room} coefficients a splat"
+    return Effect("view-dependent color", degree > 0, reason, on if degree > 0 else f"a direction and {room - 1} of {room} coefficients a splat")
+
+
+def _of_adapting(config: AdaptConfig | None, scale: float) -> list[Effect]:
+    enlarges, counts = "an enlarged image for each view", "two sums and a norm a splat, for each view of each step"
+    if config is None or not config.steps:
+        why = "nothing is optimised"
+        return [Effect("upsampler", False, why, enlarges), Effect("densification statistics", False, why, counts)]
+    grows = "none is cloned or split" if config.densify_gradient is None else f"splats above {config.densify_gradient:g} are cloned or split"
+    return [
+        Effect("upsampler", *_upsampler(config, scale), enlarges),
+        Effect("densification statistics", config.densify_gradient is not None, grows, counts),
+    ]
+
+
+def _upsampler(config: AdaptConfig, scale: float) -> tuple[bool, str]:
+    if enlarges(config, scale):
+        return True, f"{config.upsampler} makes the truth from the base's image"
+    return False, "no image has to become larger" if scale <= 1 else "images are shrunk and compared with the base's own"

@@ -18,7 +18,7 @@ from mipmap_plugin.adaptation.closed_form import closed_form
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.report import Report, versions
+from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.resume import load_run, save_run
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.backends import choose_backend, supersample
@@ -31,7 +31,7 @@ from mipmap_plugin.effects import DILATION, Effects, explain
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import write_json
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import SplatModel, TrainedScale
+from mipmap_plugin.models.base import SplatModel, TrainedScale, effects_of
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.scenes import Scene, model_cameras
@@ -55,8 +55,7 @@ class Adapted:
 
     def render(self, camera: Camera) -> Rendered:
         """The view of a camera of the new scale."""
-        with torch.no_grad():
-            return supersample.render(self.backend, self.model.gaussians(camera), camera, self.effects)
+        return _shown(self.model, self.backend, camera, self.effects)
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
@@ -92,9 +91,8 @@ class Wrapped:
 
     def render(self, camera: Camera, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1) -> Rendered:
         """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did."""
-        effects = self.effects(scale, screen_filter, supersampling)
-        with torch.no_grad():
-            return supersample.render(self.backend(screen_filter=screen_filter)[0], self.model.gaussians(camera), camera, effects)
+        backend, _ = self.backend(screen_filter=screen_filter)
+        return _shown(self.model, backend, camera, self.effects(scale, screen_filter, supersampling))
 
     def adapt(
         self,
@@ -214,6 +212,8 @@ class _Adaptation:
         task = Task(self.views, self.scale, self.truth, self._render, self._white)
         fingerprint = self._fingerprint()
         run = load_run(resume, student, task, self.config, fingerprint) if resume and resume.exists() else Run.start(student, task, self.config)
+        if self.effects.sh_degree == 0 and (unused := student.parameters().get("shN")) is not None:
+            unused.requires_grad_(False)  # no color follows the direction: its coefficients stay out of the gradient
         before = self.seconds["total"]
 
         def look(run: Run) -> None:
@@ -255,8 +255,8 @@ class _Adaptation:
             settings=self.config,
             backend=self.why,
             views=self.which,
-            filters=f"pseudo truth {_truth(self.scale, self.config)}; base {_filter(self.trained)}; file {_filter(self.effects)}",
-            effects=[f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(self.effects, before)],
+            filters=filters(self.scale, self.config, self.trained, self.effects),
+            effects=list(explain(self.effects, before, effects_of(self.base), self.config, self.scale)),
             gaussians_before=len(before),
             gaussians_after=len(student.gaussians(self.views[0])),
             seconds=self.seconds,
@@ -266,17 +266,11 @@ class _Adaptation:
         )
 
 
-def _filter(effects: Effects) -> str:
-    return f"{effects.screen_filter} {effects.eps2d:g} px²"
-
-
-def _truth(scale: float, config: AdaptConfig) -> str:
-    """Which filter lies between the base's image and what is compared with it."""
-    if not config.steps:
-        return "none, for no step is taken"
-    if scale <= 1:
-        return config.resize
-    return config.upsampler if config.compare_at == "target" else f"the base itself, images shrunk by {config.resize}"
+@torch.no_grad()
+def _shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects) -> Rendered:
+    gaussians = model.gaussians(camera)
+    rendered = supersample.render(backend, gaussians, camera, effects)
+    return replace(rendered, effects=explain(effects, gaussians, effects_of(model)))
 
 
 def _digest(model: SplatModel) -> str:

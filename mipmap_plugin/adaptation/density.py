@@ -8,6 +8,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.optimizer import change_rows
 from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 
@@ -30,6 +31,11 @@ class ScreenGradients:
     def __init__(self, count: int, device: torch.device) -> None:
         self.total = torch.zeros(count, device=device)
         self.seen = torch.zeros(count, device=device)
+
+    @classmethod
+    def of(cls, means: Tensor, config: AdaptConfig) -> ScreenGradients | None:
+        """An empty record of the `means` [N, 3], where anything is densified at all."""
+        return None if config.densify_gradient is None else cls(len(means), means.device)
 
     def add(self, means: Tensor, gradient: Tensor, camera: Camera) -> None:
         """Take one view's `gradient` [N, 3] of the `means` [N, 3]."""

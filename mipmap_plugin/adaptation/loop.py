@@ -38,7 +38,7 @@ class Run:
     student: SplatModel
     optimizer: torch.optim.Adam
     watch: Stopwatch
-    gradients: density.ScreenGradients
+    gradients: density.ScreenGradients | None  # None: nothing is cloned or split, so nobody asks for them
     step: int = 0
     curve: list[CurvePoint] = field(default_factory=list)
     square_error: float = 0.0  # summed over the views since the last point of the curve
@@ -48,7 +48,7 @@ class Run:
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
         means = student.parameters()["means"]
         optimizer = make_optimizer(student, config, extent(task.views))
-        return cls(student, optimizer, Stopwatch(means.device), density.ScreenGradients(len(means), means.device))
+        return cls(student, optimizer, Stopwatch(means.device), density.ScreenGradients.of(means, config))
 
 
 def adapt(
@@ -83,7 +83,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         density.reset_opacities(run.optimizer)
     set_rates(run.optimizer, config, run.step)
     means = run.student.parameters()["means"]
-    before = torch.zeros_like(means)  # their gradient from the views before this one
+    before: Tensor | float = 0.0  # the gradient of the means from the views before this one
     for view in views:
         camera = view.zoomed(task.scale)
         target = task.truth(view)  # r(x̂): the frozen base, resized
@@ -93,7 +93,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         loss = (image - target).square().mean()
         loss.backward()
         run.square_error += float(loss.detach()) / len(views)
-        if config.densify_gradient is not None and means.grad is not None:
+        if run.gradients is not None and means.grad is not None:
             run.gradients.add(means, means.grad - before, camera)
             before = means.grad.clone()
     run.optimizer.step()
@@ -106,13 +106,13 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
 @torch.no_grad()
 def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     before = run.student.parameters()["means"]
-    if config.densify_gradient is not None:
+    if run.gradients is not None and config.densify_gradient is not None:
         shown = run.student.gaussians(task.views[0]).detach()
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
         density.densify(run.student, run.optimizer, run.gradients.mean() >= config.densify_gradient, extent(task.views), shown, generator)
     density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
     means = run.student.parameters()["means"]
-    run.gradients = density.ScreenGradients(len(means), means.device)
+    run.gradients = density.ScreenGradients.of(means, config)
     run.rows_changed |= means is not before
 
 

@@ -36,13 +36,16 @@ def change_rows(
     model: SplatModel, optimizer: torch.optim.Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
 ) -> None:
     """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in model and optimizer alike."""
-    fresh = {}
+    fresh, moves = {}, {}
     names = model.parameters().keys()
     for group in (group for group in optimizer.param_groups if group["name"] in names):
         old = group["params"][0]
         new = parameter(group["name"], old.detach()).clone().requires_grad_()
+        moves[group["name"]] = old.requires_grad
         state = optimizer.state.pop(old, {})
         optimizer.state[new] = {k: moment(v) if torch.is_tensor(v) and v.shape == old.shape else v for k, v in state.items()}
         group["params"] = [new]
         fresh[group["name"]] = new
     model.replace_parameters(fresh)
+    for name, tensor in fresh.items():
+        tensor.requires_grad_(moves[name])

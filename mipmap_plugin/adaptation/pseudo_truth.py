@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import find_upsampler
+from mipmap_plugin.adaptation.upsamplers import Upsampler, check_upsampler, find_upsampler
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, enlarges
 from mipmap_plugin.models.base import SplatModel
 
 
@@ -25,7 +26,7 @@ class PseudoTruth:
     def __init__(self, base: SplatModel, backend: Backend, effects: Effects, scale: float, config: AdaptConfig) -> None:
         """`effects`: how the base is rendered at the scale that it was trained at. Raises SettingsError for an unknown upsampler."""
         self._base, self._backend, self._effects, self._scale, self._config = base, backend, effects, scale, config
-        self._enlarge = find_upsampler(config.upsampler)
+        check_upsampler(config.upsampler)
         self._made: dict[Camera, Tensor] = {}
 
     def __call__(self, view: Camera) -> Tensor:
@@ -34,13 +35,18 @@ class PseudoTruth:
             self._made[view] = self._make(view)
         return self._made[view]
 
+    @cached_property
+    def _enlarge(self) -> Upsampler:
+        """Loaded when the first image has to become larger."""
+        return find_upsampler(self._config.upsampler)
+
     @torch.no_grad()
     def _make(self, view: Camera) -> Tensor:
         size = view.zoomed(self._scale).size
-        if self._scale > 1 and self._config.compare_at == "base":
-            target = self._render(view, 1.0)
-        elif self._scale > 1:
+        if enlarges(self._config, self._scale):
             target = self._enlarge(self._render(view, 1.0), size)
+        elif self._scale > 1:
+            target = self._render(view, 1.0)
         else:
             target = resize(self._render(view, self._finest()), size, self._config.resize)
         return target.clamp(0, 1).mul(255).round().div(255) if self._config.quantize_truth else target

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effect, Effects, enlarges
 
 
 class Report(BaseModel):
@@ -23,7 +24,7 @@ class Report(BaseModel):
     backend: str  # which, and why
     views: str  # which, in a sentence
     filters: str  # of the pseudo truth, the base and the adapted file
-    effects: list[str]
+    effects: list[Effect]  # what adapting and rendering simulate, what they do not, and why
     gaussians_before: int
     gaussians_after: int
     seconds: dict[str, float]  # "closed form", "optimization" (pseudo truth included), "total"
@@ -34,6 +35,18 @@ class Report(BaseModel):
     def provenance(self) -> dict[str, Any]:
         """What fits into a file's header: base, scale, settings, versions. Nothing in it depends on the clock."""
         return {"scale": self.scale, "base": self.base, "settings": self.settings.model_dump(), "versions": self.versions}
+
+
+def filters(scale: float, config: AdaptConfig, base: Effects, file: Effects) -> str:
+    """Which filters lie between the base's image and what is compared with it, and which ones base and file are drawn with."""
+    if not config.steps:
+        truth = "none, for no step is taken"
+    elif scale <= 1:
+        truth = config.resize
+    else:
+        truth = config.upsampler if enlarges(config, scale) else f"the base itself, images shrunk by {config.resize}"
+    of_base, of_file = (f"{effects.screen_filter} {effects.eps2d:g} px²" for effects in (base, file))
+    return f"pseudo truth {truth}; base {of_base}; file {of_file}"
 
 
 def versions() -> dict[str, str]:

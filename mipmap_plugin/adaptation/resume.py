@@ -30,7 +30,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "parameters": {name: tensor.detach() for name, tensor in run.student.parameters().items()},
         "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
         "optimizer": run.optimizer.state_dict(),
-        "gradients": (run.gradients.total, run.gradients.seen),
+        "gradients": None if run.gradients is None else (run.gradients.total, run.gradients.seen),
     }
     with new_file(path, overwrite=True) as temporary:
         torch.save(state, temporary)
@@ -53,8 +53,9 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
             tensor.copy_(state["shared"][name])
     optimizer = make_optimizer(student, config, extent(task.views))
     optimizer.load_state_dict(state["optimizer"])
-    gradients = ScreenGradients(0, device)
-    gradients.total, gradients.seen = (tensor.to(device) for tensor in state["gradients"])
+    gradients = ScreenGradients.of(student.parameters()["means"], config)
+    if gradients is not None:
+        gradients.total, gradients.seen = (tensor.to(device) for tensor in state["gradients"])
     curve = [CurvePoint(**point) for point in state["curve"]]
     return Run(student, optimizer, Stopwatch(device, state["seconds"]), gradients, state["step"], curve, state["square_error"], state["rows_changed"])
 

@@ -28,14 +28,19 @@ def register_upsampler(name: str, target: Any, *, replace: bool = False) -> None
 
 def find_upsampler(name: str) -> Upsampler:
     """The upsampler of a registered name, or the network in a file. Raises SettingsError, CheckpointError and PluginError."""
+    check_upsampler(name)
+    return UPSAMPLERS.get(name) if name in UPSAMPLERS.names() else Network(name)
+
+
+def check_upsampler(name: str) -> None:
+    """Raise SettingsError where there is none of this name, without loading any."""
     known = UPSAMPLERS.names()
     if name in known:
-        return UPSAMPLERS.get(name)
+        return
     if not name.endswith(SUFFIXES):
         raise SettingsError(f"there is no upsampler {name!r}; known are {', '.join(known)}, or give the file of a network ({', '.join(SUFFIXES)})")
     if not Path(name).is_file():
         raise SettingsError(f"there is no upsampler file {name}; check the path")
-    return Network(name)
 
 
 def bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:

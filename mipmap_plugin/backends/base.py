@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import USUAL, Effects, RenderSettings
+from mipmap_plugin.effects import USUAL, Effect, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
 
 # Raised when `Backend.render` or the records below change in a way that an old backend cannot serve.
@@ -22,6 +22,7 @@ class Rendered:
 
     image: Tensor  # [H, W, 3], background included, not clamped
     alpha: Tensor  # [H, W], 1 - transmittance
+    effects: tuple[Effect, ...] = ()  # what was simulated for it and what was not; a wrapped model says so, a backend need not
 
 
 @dataclass(frozen=True)

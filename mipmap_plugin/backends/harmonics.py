@@ -40,6 +40,8 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 def colors(sh: Tensor, means: Tensor, eye: Tensor, degree: int) -> Tensor:
     """Linear RGB [N, 3] of splats at `means` seen from `eye` [3]: SH + 0.5, not below 0, no upper bound."""
+    if degree == 0:  # the same from everywhere: no direction is needed
+        return (C0 * sh[:, 0]).add(0.5).clamp_min(0)
     bands = (degree + 1) ** 2
     rays = means - eye
     # A splat in the very eye has no direction: any unit vector will do, as long as it and its gradient are finite.

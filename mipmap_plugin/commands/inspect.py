@@ -7,6 +7,7 @@ from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
 from mipmap_plugin.effects import explain
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.anchors import AnchorModel
+from mipmap_plugin.models.base import effects_of
 from mipmap_plugin.models.health import examine
 from mipmap_plugin.wrap import wrap_model
 
@@ -31,7 +32,7 @@ def inspect(checkpoint: Checkpoint, iteration: int | None = None, screen_filter:
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
         "cameras": summary(wrapped.cameras),
-        "effects": [f"{e.name}: {'on' if e.on else 'off'}, {e.reason}" for e in explain(wrapped.effects(), gaussians)],
+        "effects": [str(effect) for effect in explain(wrapped.effects(), gaussians, effects_of(model))],
         "health": examine(model.bake(view) if isinstance(model, AnchorModel) else model).sentences() or ["nothing found"],
         "notes": model.notes,
     }

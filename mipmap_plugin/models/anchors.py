@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchor_decoding import Anchors, decode
@@ -51,6 +52,17 @@ class AnchorModel(ABC):
 
     def __len__(self) -> int:
         return len(self._parameters["means"])
+
+    def effects(self) -> list[Effect]:
+        products = sum(held.numel() for name, held in self.shared_parameters().items() if held.dim() == 2 and not name.startswith("appearance"))
+        size = appearance_size(self._weights)
+        told = f"the embedding has {size} numbers a training view" if size else "the model has no embedding"
+        inputs = f"{size or ''} more inputs of the color network".strip()
+        decoding = f"{products:,} multiplications an anchor in view, of {len(self):,}, for each image"
+        return [
+            Effect("view-dependent geometry", True, "splats are decoded from anchors for each camera", decoding),
+            Effect("appearance embedding", size > 0, told, inputs),
+        ]
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """The splats of the anchors in view, activated: SH of degree 0, opacities above 0."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, NEAR_PLANE
+from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effect
 from mipmap_plugin.gaussians import Gaussians
 
 # The name, among a model's parameters, of columns that go with their rows when rows are removed, and that never move: an anchor's
@@ -73,3 +73,9 @@ class SplatModel(Protocol):
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
         """Write the model in the format it came in, atomically; return the file written. Raises OutputExists."""
+
+
+def effects_of(model: SplatModel) -> list[Effect]:
+    """What a model does for a camera before any splat is drawn, as its method `effects` says: of `effects.OF_OTHER_MODELS`, those that
+    it has. A family that has none needs no such method."""
+    return getattr(model, "effects", list)()

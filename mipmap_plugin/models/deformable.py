@@ -48,6 +48,8 @@ class DeformNetwork:
         require(self._weights, dict.fromkeys(told_by, (-1, -1)), where)
         self._refuse_other_inputs(where)
         require(self._weights, self._shapes(), where)
+        self.is_still = not any(self._weights[f"{head}.{part}"].any() for head in self._heads for part in ("weight", "bias"))
+        self.cost = f"{sum(w.numel() for name, w in self._weights.items() if name.endswith('weight')):,} multiplications a splat and moment"
 
     def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
         """The splats as the original's kernel sees them: scales grow linearly and may turn negative, quaternions do not stay of length 1."""

@@ -52,6 +52,8 @@ class HexPlane:
         self.scales = len(list(takewhile(lambda scale: f"grid.grids.{scale}.0" in self._weights, count())))
         self.depth = len(list(takewhile(lambda layer: f"feature_out.{2 * layer}.weight" in self._weights, count())))
         self._check(where)
+        self.is_still = self._is_still()
+        self.cost = self._cost()
 
     def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
         """The splats at `time`. Every change is made to the raw parameters, before they are activated."""
@@ -103,6 +105,16 @@ class HexPlane:
 
     def _layer(self, name: str, inputs: Tensor) -> Tensor:
         return linear(inputs, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
+
+    def _is_still(self) -> bool:
+        """Whether every change is a sum with 0; products with what the network makes never are."""
+        multiplies = self.heads and (self._options.get("static_mlp") or ("rotations_deform" in self.heads and self._options.get("apply_rotation")))
+        return not multiplies and not any(self._weights[f"{head}.3.{part}"].any() for head in self.heads for part in ("weight", "bias"))
+
+    def _cost(self) -> str:
+        parts = ("feature_out", *self.heads)
+        products = sum(held.numel() for name, held in self._weights.items() if name.split(".")[0] in parts and name.endswith("weight"))
+        return f"{len(PLANES) * self.scales} look-ups and {products:,} multiplications a splat and moment"
 
     def _check(self, where: str) -> None:
         told_by = {f"grid.grids.{scale}.0": (1, -1, -1, -1) for scale in range(max(1, self.scales))}

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import NEAR_PLANE
+from mipmap_plugin.effects import NEAR_PLANE, Effect
 from mipmap_plugin.errors import CheckpointError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import CARRIED, TrainedScale
@@ -66,6 +66,10 @@ class MipModel:
 
     def __len__(self) -> int:
         return len(self.splats)
+
+    def effects(self) -> list[Effect]:
+        told = f"the file gives one for each of {len(self):,} splats" if self._smooths else "the file gives one, but its project does not apply it"
+        return [Effect("3D filter", self._smooths, told, "three roots a splat")]
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated and smoothed. `camera` is not looked at."""

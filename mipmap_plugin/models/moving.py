@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
@@ -27,6 +28,8 @@ class Field(Protocol):
     """What takes canonical splats to a moment. Its weights require no gradient and never change."""
 
     changes_opacities: bool
+    is_still: bool  # no splat ever changes: the field need not be asked
+    cost: str  # of one moment, counted
 
     def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
         """The splats at `time` (0..1), differentiable in the canonical parameters."""
@@ -37,8 +40,6 @@ class Field(Protocol):
 
 class MovingModel:
     """Canonical splats, stored and named as 3DGS does, seen through a frozen field at the time of each camera."""
-
-    moves = True  # `adaptation.views` spreads times over cameras that have none
 
     def __init__(self, family: str, canonical: VanillaModel, field: Field) -> None:
         self.family, self.canonical, self.field = family, canonical, field
@@ -55,8 +56,18 @@ class MovingModel:
     def __len__(self) -> int:
         return len(self.canonical)
 
+    @property
+    def moves(self) -> bool:
+        """Whether time changes anything; `adaptation.views` then spreads times over cameras that have none."""
+        return not self.field.is_still
+
+    def effects(self) -> list[Effect]:
+        return [Effect("time", self.moves, "a field moves the splats" if self.moves else "the field changes no splat", self.field.cost)]
+
     def gaussians(self, camera: Camera) -> Gaussians:
         """All splats at the time of `camera`, 0 if it has none."""
+        if not self.moves:
+            return self.canonical.gaussians()
         return self.field(self.canonical, camera.time or 0.0)
 
     def parameters(self) -> dict[str, Tensor]:
@@ -84,7 +95,7 @@ class MovingModel:
     @torch.no_grad()
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
         """[N], 0..1: how opaque each splat gets at the times of some of `views`, of which there must be one."""
-        if not self.field.changes_opacities:
+        if not (self.moves and self.field.changes_opacities):
             return self.canonical.row_opacities()
         some = views[:: -(-len(views) // ENOUGH_MOMENTS)]
         return torch.stack([self.gaussians(view).opacities for view in some]).amax(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.models.anchor_decoding import Anchors
 from mipmap_plugin.models.anchor_files import AnchorFile, read_anchors
@@ -42,6 +44,10 @@ class OctreeModel(AnchorModel):
             raise CheckpointError(f"{self.source}: its anchors lie in {self._levels:,} levels of detail; the file is damaged, so export it again")
         self.notes.append(f"{self._levels} levels of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
 
+    def effects(self) -> list[Effect]:
+        told = f"{self._levels} of them, chosen by distance and zoom ({self._to_level})"
+        return [*super().effects(), Effect("levels of detail", self._levels > 1, told, f"a distance and a logarithm an anchor, of {len(self):,}")]
+
     def wanted_levels(self, camera: Camera) -> Tensor:
         """[N] the level that `camera` asks for at each anchor, with a fraction where levels fade."""
         level, extra = self._column("level", "extra_level").unbind(1)
@@ -51,6 +57,17 @@ class OctreeModel(AnchorModel):
         if self._to_level == PROGRESSIVE:
             return (wanted + 1).clamp(ALMOST_ONE, self._levels - 1 + ALMOST_ONE)
         return TO_LEVEL[self._to_level](wanted).clamp(0, self._levels - 1)
+
+    def row_opacities(self, views: Sequence[Camera]) -> Tensor:
+        """[N] as for any anchors, but that of one anchor of the coarsest level is 1, and that of two in all, so that they are never pruned.
+
+        The original counts its levels from the coarsest that a file has (scene/gaussian_model.py, load_ply_sparse_gaussian), and shows
+        none that is finer than their number: without the coarsest it would lose the finest. Its constants need two rows.
+        """
+        opacities, levels = super().row_opacities(views), self._column("level")[:, 0]
+        opacities[opacities.where(levels == levels.min(), -1.0).argmax()] = 1.0
+        opacities[opacities.topk(min(2, len(opacities))).indices] = 1.0
+        return opacities
 
     def _chosen(self, camera: Camera) -> Tensor:
         return self._column("level")[:, 0] <= self.wanted_levels(camera).floor()

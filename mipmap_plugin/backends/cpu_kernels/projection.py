@@ -194,7 +194,9 @@ def pull_color(view, mean, sh, table, i, pull, bands, along, d_sh):
 
 @inner
 def sight(view, mean):
-    """The unit vector from the eye to a mean, and the distance; (0, 0, 1) for a splat in the very eye."""
+    """The unit vector from the eye to a mean, and the distance; (0, 0, 1) and 0 for a splat in the very eye, and where nobody asks."""
+    if view.sh_degree == 0:
+        return (0.0, 0.0, 1.0), 0.0
     ray = minus(mean, view.eye)
     length = math.sqrt(dot(ray, ray))
     return (times(1 / length, ray) if length > 0 else (0.0, 0.0, 1.0)), length

@@ -1,0 +1,249 @@
+"""An effect that is off is not computed, not imported and not in the gradient graph; forced on, it gives the same image."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import moving
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import register_upsampler
+from mipmap_plugin.adaptation import density
+from mipmap_plugin.backends import filters, harmonics, reference, supersample
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import PluginError
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.deformable import DeformNetwork
+from mipmap_plugin.models.hexplane import HexPlane
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.wrap import wrap_model
+
+BRIEF = dict(steps=2, extra_views=0)
+
+
+def with_bands(used: int, room: int) -> Gaussians:
+    """Splats with room for SH of degree `room`, of which the bands above `used` are zero."""
+    splats = tiny.gaussians(10, degree=room)
+    splats.sh[:, (used + 1) ** 2 :] = 0
+    return splats
+
+
+def wrapped(splats, **trained):
+    return wrap_model(VanillaModel.from_gaussians(splats, TrainedScale(**trained)), cameras=tiny.cameras(1), backend="reference")
+
+
+def counted(monkeypatch, owner, name) -> list:
+    """The arguments of each call of `owner.name` from now on."""
+    calls, real = [], getattr(owner, name)
+    monkeypatch.setattr(owner, name, lambda *args, **named: calls.append(args) or real(*args, **named))
+    return calls
+
+
+def leaves_of(image: torch.Tensor) -> list[torch.Tensor]:
+    """The leaf tensors that an image's gradient graph reaches."""
+    seen, left, leaves = set(), [image.grad_fn], []
+    while left:
+        node = left.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if hasattr(node, "variable"):
+            leaves.append(node.variable)
+        left += [following for following, _ in node.next_functions]
+    return leaves
+
+
+# View-dependent color
+
+
+@pytest.mark.parametrize("used", [0, 1, 2, 3])
+def test_bands_above_the_last_lit_one_are_not_evaluated(monkeypatch, used):
+    asked = []
+    monkeypatch.setattr(reference, "colors", lambda *given: asked.append(given[-1]) or harmonics.colors(*given))
+    splats = with_bands(used, 3)
+    model = wrapped(splats)
+    image = model.render(tiny.cameras(1)[0]).image
+    assert asked == [used]
+    forced = reference.ReferenceBackend().render(splats, tiny.cameras(1)[0], Effects(3)).image
+    torch.testing.assert_close(image, forced, atol=1e-6, rtol=0)
+
+
+def test_bands_that_are_off_stay_off_while_adapting(monkeypatch):
+    asked = set()
+    monkeypatch.setattr(reference, "colors", lambda *given: asked.add(given[-1]) or harmonics.colors(*given))
+    adapted = wrapped(with_bands(1, 3)).adapt(1 / 4, steps=2, extra_views=0)
+    assert asked == {1}
+    assert (adapted.model.parameters()["shN"][:, 3:] == 0).all()
+
+
+def test_a_color_that_is_the_same_from_everywhere_needs_no_direction(monkeypatch):
+    asked = counted(monkeypatch, harmonics, "basis")
+    splats, camera = with_bands(0, 3), tiny.cameras(1)[0]
+    image = wrapped(splats).render(camera).image
+    assert asked == []
+    torch.testing.assert_close(image, ReferenceBackend().render(splats, camera, Effects(3)).image, atol=1e-6, rtol=0)
+    assert len(asked) == 1
+
+
+def test_the_place_of_a_splat_has_no_gradient_through_a_color_without_direction():
+    means = torch.zeros(2, 3, requires_grad=True)
+    sh = torch.ones(2, 16, 3, requires_grad=True)
+    reached = [[leaf.shape for leaf in leaves_of(harmonics.colors(sh, means, torch.ones(3), degree))] for degree in (0, 1)]
+    assert reached[0] == [sh.shape] and set(reached[1]) == {sh.shape, means.shape}
+
+
+@pytest.mark.parametrize(("used", "moves"), [(0, False), (1, True)])
+def test_coefficients_that_nobody_sees_are_not_in_the_gradient_graph(used, moves):
+    graphs = []
+
+    def look(step, seconds, show):
+        image = show(tiny.cameras(1)[0].zoomed(1 / 4))
+        graphs.append({leaf.data_ptr() for leaf in leaves_of(image)})
+
+    splats = with_bands(used, 3)
+    adapted = wrapped(splats).adapt(1 / 4, observe=look, steps=4, extra_views=0, prune_every=2, min_opacity=0.5)
+    unseen = adapted.model.parameters()["shN"]
+    assert (unseen.data_ptr() in graphs[-1]) == moves
+    assert 0 < len(unseen) < 10  # it stays out when splats are dropped
+    assert unseen.requires_grad == moves and bool(unseen.any()) == moves
+
+
+# Time
+
+
+def still(state):
+    """A field's weights whose last layers give nothing but zeros."""
+    heads = ("gaussian_warp", "branch_", "gaussian_rotation", "gaussian_scaling", "deform.3")
+    return {name: torch.zeros_like(held) if any(head in name for head in heads) else held for name, held in state.items()}
+
+
+FIELDS = {
+    "deformable": (DeformNetwork, moving.write_deformable, lambda: moving.deform_state()),
+    "6-DoF": (DeformNetwork, moving.write_deformable, lambda: moving.deform_state(six_dof=True)),
+    "hexplane": (HexPlane, moving.write_hexplane, lambda: moving.hexplane_state()),
+}
+
+
+@pytest.mark.parametrize("family", FIELDS)
+def test_a_field_that_changes_nothing_is_not_asked(tmp_path, monkeypatch, family):
+    kind, write, state = FIELDS[family]
+    model = wrap_model(write(tmp_path / "still", state=still(state())), cameras=tiny.cameras(2), backend="reference")
+    asked = counted(monkeypatch, kind, "__call__")
+    image = model.render(moving.at(0.3)).image
+    adapted = model.adapt(1 / 4, **BRIEF)
+    assert asked == [] and "time" not in adapted.report.views
+    assert [effect.on for effect in adapted.report.effects if effect.name == "time"] == [False]
+    forced = ReferenceBackend().render(model.model.field(model.model.canonical, 0.3), moving.at(0.3), model.effects()).image
+    assert len(asked) == 1
+    torch.testing.assert_close(image, forced, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("family", FIELDS)
+def test_a_field_that_changes_something_is_asked(tmp_path, monkeypatch, family):
+    kind, write, state = FIELDS[family]
+    model = wrap_model(write(tmp_path / "moving", state=state()), cameras=tiny.cameras(2), backend="reference")
+    model.backend()  # which asks once what the model needs
+    asked = counted(monkeypatch, kind, "__call__")
+    model.render(moving.at(0.3))
+    assert len(asked) == 1
+
+
+@pytest.mark.parametrize(("options", "moves"), [("", False), ("apply_rotation=True", True), ("static_mlp=True", True)])
+def test_products_are_never_taken_for_nothing(tmp_path, options, moves):
+    model = wrap_model(moving.write_hexplane(tmp_path / "new", options, still(moving.hexplane_state())), cameras=tiny.cameras(1))
+    assert model.model.moves == moves
+
+
+def test_a_static_scene_knows_no_field_at_all(monkeypatch):
+    asked = counted(monkeypatch, DeformNetwork, "__call__"), counted(monkeypatch, HexPlane, "__call__")
+    assert "time" not in wrapped(with_bands(1, 1)).adapt(1 / 4, **BRIEF).report.views
+    assert asked == ([], [])
+
+
+# Filters and samples
+
+
+def test_without_compensation_the_opacity_is_the_very_same():
+    splats = tiny.gaussians(3)
+    flat = reference.project(splats, tiny.cameras(1)[0], 0.2)
+    assert filters.footprint(flat, splats.opacities, "classic", 0.3).opacities is splats.opacities
+    assert filters.footprint(flat, splats.opacities, "antialiased", 0.3).opacities is not splats.opacities
+    wide = filters.footprint(flat, splats.opacities, "antialiased", 0.0).opacities  # forced on where nothing is widened
+    torch.testing.assert_close(wide, splats.opacities, atol=1e-6, rtol=0)
+
+
+def test_without_supersampling_the_backend_draws_once_at_the_size_of_the_image(monkeypatch):
+    drawn = counted(monkeypatch, ReferenceBackend, "render")
+    view = tiny.cameras(1)[0]
+    model = wrapped(with_bands(1, 1))
+    image = model.render(view).image
+    assert [args[2] for args in drawn] == [view]
+    forced = supersample.render(ReferenceBackend(), model.model.gaussians(view), view, replace(model.effects(), supersampling=1))
+    assert torch.equal(image, forced.image)
+    model.render(view, supersampling=2)
+    assert (drawn[-1][2].width, len(drawn)) == (2 * view.width, 3)
+
+
+def test_at_scale_one_nothing_is_drawn(monkeypatch):
+    drawn = counted(monkeypatch, ReferenceBackend, "render")
+    wrapped(with_bands(1, 1)).adapt(1)
+    assert drawn == []
+
+
+# Adapting
+
+
+@pytest.mark.parametrize(("settings", "steps"), [({}, 0), (dict(densify_gradient=1e-9), 2)])
+def test_screen_gradients_are_kept_only_where_something_is_densified(monkeypatch, settings, steps):
+    made, added = counted(monkeypatch, density.ScreenGradients, "__init__"), counted(monkeypatch, density.ScreenGradients, "add")
+    model = wrapped(with_bands(1, 1))
+    adapted = model.adapt(1 / 4, views_per_step=1, **BRIEF, **settings)
+    assert (len(made), len(added)) == (bool(steps), steps)
+    forced = model.adapt(1 / 4, views_per_step=1, **BRIEF, densify_gradient=1e9)  # kept, and never used
+    names = adapted.model.parameters()
+    assert steps or all(torch.equal(tensor, names[name]) for name, tensor in forced.model.parameters().items())
+
+
+@pytest.fixture
+def broken_upsampler():
+    """One that cannot be imported."""
+    register_upsampler("broken", "no_such_package.upsampling:enlarge", replace=True)
+    return "broken"
+
+
+@pytest.mark.parametrize(("scale", "settings"), [(1 / 4, {}), (4, {}), (4, dict(compare_at="target", steps=0))])
+def test_an_upsampler_that_is_not_called_for_is_not_imported(broken_upsampler, scale, settings):
+    wrapped(with_bands(1, 1)).adapt(scale, upsampler=broken_upsampler, **{**BRIEF, **settings})
+
+
+def test_an_upsampler_that_is_called_for_is_imported(broken_upsampler):
+    with pytest.raises(PluginError, match="no_such_package"):
+        wrapped(with_bands(1, 1)).adapt(4, upsampler=broken_upsampler, compare_at="target", **BRIEF)
+
+
+IMPORTED = """
+import sys
+from mipmap_plugin import wrap_model
+model = wrap_model(sys.argv[1], backend=sys.argv[2])
+for scale in (1 / 4, 2):
+    adapted = model.adapt(scale, steps=1, extra_views=0)
+    adapted.render(model.cameras[0].zoomed(scale))
+    adapted.save(f"{sys.argv[1]}_{scale}")
+print(sorted(name for name in sys.argv[3:] if name in sys.modules))
+"""
+
+OPTIONAL = ["gsplat", "llvmlite", "lpips", "matplotlib", "numba", "pycolmap", "pytest", "skimage", "spandrel", "torchvision", "triton", "tyro"]
+
+
+@pytest.mark.parametrize(("backend", "needed"), [("reference", []), ("cpu", ["llvmlite", "numba"])])
+def test_adapting_imports_nothing_that_it_does_not_use(tmp_path, backend, needed):
+    if needed:
+        pytest.importorskip("numba")
+    folder = tiny.folder(tmp_path / "base")
+    done = subprocess.run([sys.executable, "-c", IMPORTED, str(folder), backend, *OPTIONAL], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == str(needed)
