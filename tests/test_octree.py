@@ -114,6 +114,17 @@ def test_the_constants_survive_the_loss_of_their_rows(tmp_path):
     assert torch.equal(again.means, student.gaussians(VIEWS[0]).means.detach())
 
 
+@pytest.mark.parametrize("min_opacity", [0.9, 0.999999])
+def test_pruning_leaves_the_coarsest_level_and_a_file_that_shows_the_same(tmp_path, min_opacity):
+    faint = checkpoints.columns(LAYOUTS["plain"])["level"] == 0  # of no features, in other words
+    features = {f"f_anchor_feat_{i}": np.where(faint, 0.0, checkpoints.columns(LAYOUTS["plain"])[f"f_anchor_feat_{i}"]) for i in range(8)}
+    _, adapted = gain(load(tmp_path, LAYOUTS["plain"], **features), 1 / 4, steps=3, prune_every=2, min_opacity=min_opacity)
+    levels = read_ply(adapted.save(tmp_path / "saved", provenance={})).columns["level"]
+    assert 2 <= len(levels) < 40 and levels.min() == 0
+    view = VIEWS[0].zoomed(4)  # which asks for the finest
+    assert torch.equal(load_model(tmp_path / "saved").gaussians(view).means, adapted.gaussians(view).means.detach())
+
+
 def test_a_single_anchor_cannot_hold_the_constants(tmp_path):
     student = load(tmp_path, LAYOUTS["plain"]).copy()
     student.replace_parameters({name: held.detach()[:1] for name, held in student.parameters().items()})
