@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.models.anchor_decoding import Anchors
 from mipmap_plugin.models.anchor_files import AnchorFile, read_anchors
@@ -42,6 +43,10 @@ class OctreeModel(AnchorModel):
         if self._levels > MAX_LEVELS:
             raise CheckpointError(f"{self.source}: its anchors lie in {self._levels:,} levels of detail; the file is damaged, so export it again")
         self.notes.append(f"{self._levels} levels of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
+
+    def effects(self) -> list[Effect]:
+        told = f"{self._levels} of them, chosen by distance and zoom ({self._to_level})"
+        return [*super().effects(), Effect("levels of detail", self._levels > 1, told, f"a distance and a logarithm an anchor, of {len(self):,}")]
 
     def wanted_levels(self, camera: Camera) -> Tensor:
         """[N] the level that `camera` asks for at each anchor, with a fraction where levels fade."""
