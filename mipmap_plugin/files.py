@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import secrets
 import shutil
@@ -35,9 +36,22 @@ def new_folder(path: Path, overwrite: bool) -> Iterator[Path]:
 
 
 def write_json(path: Path, facts: Any, overwrite: bool) -> None:
-    """Write `facts` as an indented JSON file. Raises OutputExists, OutputError."""
+    """Write `facts` as an indented JSON file (`json_text`). Raises OutputExists, OutputError."""
     with new_file(path, overwrite) as temporary:
-        temporary.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+        temporary.write_text(json_text(facts) + "\n", encoding="utf-8")
+
+
+def json_text(facts: Any) -> str:
+    """`facts` as indented JSON that every parser takes: what JSON has no number for, such as the PSNR of equal images, is null."""
+    return json.dumps(_without_infinities(facts), indent=2, allow_nan=False, default=str)
+
+
+def _without_infinities(facts: Any) -> Any:
+    if isinstance(facts, dict):
+        return {name: _without_infinities(value) for name, value in facts.items()}
+    if isinstance(facts, (list, tuple)):
+        return [_without_infinities(value) for value in facts]
+    return None if isinstance(facts, float) and not math.isfinite(facts) else facts
 
 
 def sha256(*paths: Path) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.commands.types import Background, ScreenFilter
+from mipmap_plugin.files import json_text
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -33,7 +33,7 @@ def summary(cameras: Sequence[Camera]) -> str:
 
 def tell(facts: Any, as_json: bool) -> None:
     if as_json:
-        print(json.dumps(facts, indent=2, default=str))
+        print(json_text(facts))
         return
     for name, value in facts.items():
         lines = value if isinstance(value, list) else [value]
