@@ -251,7 +251,7 @@ class _Adaptation:
         before = self.base.gaussians(self.views[0])
         return Report(
             scale=self.scale,
-            base=self.base.digest,
+            base=self.base.digest or _digest(self.base),
             settings=self.config,
             backend=self.why,
             views=self.which,

@@ -19,7 +19,7 @@ class Report(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     scale: float
-    base: str  # sha256 of the base checkpoint
+    base: str  # sha256 of the base checkpoint; of its numbers, where it was made in memory
     settings: AdaptConfig
     backend: str  # which, and why
     views: str  # which, in a sentence

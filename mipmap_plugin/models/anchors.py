@@ -81,8 +81,10 @@ class AnchorModel(ABC):
         return {f"{name}.{key}": held for name, state in self._weights.items() for key, held in state.items()}
 
     def copy(self) -> AnchorModel:
-        """An independent model whose leaves require gradients."""
-        return self._each(lambda tensor: tensor.detach().clone().requires_grad_())
+        """An independent model whose leaves require gradients; as it may change, it has no digest of a file."""
+        other = self._each(lambda tensor: tensor.detach().clone().requires_grad_())
+        other.digest = ""
+        return other
 
     def to(self, device: torch.device | str) -> AnchorModel:
         """A copy on another device, which requires gradients where this one does."""

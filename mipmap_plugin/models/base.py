@@ -42,7 +42,7 @@ class SplatModel(Protocol):
     notes: list[str]  # what a person should know about how it was read, in sentences
     source: Path | None  # the file that was read; None: made in memory
     folder: Path | None  # the model folder around it
-    digest: str  # sha256 of the file, hexadecimal; "" when made in memory
+    digest: str  # sha256 of the file, hexadecimal; "" when made in memory, as a copy is
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """The splats that this camera sees, differentiable in `parameters()`."""

@@ -107,8 +107,9 @@ class VanillaModel:
         return dict(self._parameters)
 
     def copy(self) -> VanillaModel:
-        """An independent model whose leaves require gradients."""
-        return self._with({name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()})
+        """An independent model whose leaves require gradients; as it may change, it has no digest of a file."""
+        leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()}
+        return self._with(leaves, replace(self._origin, digest=""))
 
     def to(self, device: torch.device | str) -> VanillaModel:
         """A copy on another device, which requires gradients where this one does."""
