@@ -84,7 +84,7 @@ class WithoutGradients(ReferenceBackend):
             return super().render(gaussians, camera, effects)
 
 
-FEW = {name: CASES[name] for name in ("no-splat", "one-splat", "sh-degree-1", "nan-in-opacities", "random-1-antialiased-0.3")}
+FEW = {name: CASES[name] for name in ("no-splat", "one-splat", "sh-degree-1", "nan-in-opacities-classic", "random-1-antialiased-0.3")}
 
 
 def failed(backend):
@@ -99,15 +99,15 @@ def test_gradients_one_percent_too_long_are_caught():
 
 def test_the_wrong_order_is_caught():
     wrong = failed(BackToFront())
-    assert set(wrong) == {"sh-degree-1", "nan-in-opacities", "random-1-antialiased-0.3"}
+    assert set(wrong) == {"sh-degree-1", "nan-in-opacities-classic", "random-1-antialiased-0.3"}
     assert "image, pixels:" in wrong["sh-degree-1"]
 
 
 def test_nan_in_one_case_is_caught():
     outcomes = {outcome.case: outcome for outcome in check_backend(SpreadsNan(), FEW)}
-    assert [name for name, outcome in outcomes.items() if not outcome.passed] == ["nan-in-opacities"]
-    assert not outcomes["nan-in-opacities"].finite
-    assert "image: 1296 of 1296 values are not finite" in outcomes["nan-in-opacities"].message
+    assert [name for name, outcome in outcomes.items() if not outcome.passed] == ["nan-in-opacities-classic"]
+    assert not outcomes["nan-in-opacities-classic"].finite
+    assert "image: 1296 of 1296 values are not finite" in outcomes["nan-in-opacities-classic"].message
 
 
 def test_an_exception_fails_its_case_only():

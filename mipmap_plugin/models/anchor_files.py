@@ -18,6 +18,7 @@ from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.cfg_args import format_cfg_args
 from mipmap_plugin.models.columns import NORMAL, POSITION, QUATERNION, numbered, stacked
 from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
+from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.vanilla import Origin
@@ -140,9 +141,9 @@ def _sound(parameters: dict[str, Tensor], weights: Weights, where: Path | str) -
 
 
 def _finite(parameters: dict[str, Tensor], where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
-    """The anchors that are finite once activated, and a note when these are not all."""
+    """The anchors that are finite once activated, and of a size that float32 can reckon with; a note when these are not all."""
     values = [*parameters.values(), parameters["scales"].exp()]
-    sound = torch.stack([value.flatten(1).isfinite().all(1) for value in values]).all(0)
+    sound = torch.stack([(value.flatten(1).abs() <= LARGEST).all(1) for value in values]).all(0)  # not so for NaN
     if sound.all():
         return parameters, []
     if not sound.any():

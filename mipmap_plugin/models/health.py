@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from mipmap_plugin.models.base import SplatModel
@@ -21,6 +20,9 @@ TINY_SHARE = 1e-6
 
 # The scene's size leaves out this share of the splats at either end of each axis, so that a few strays do not set it.
 STRAYS = 0.01
+
+# Positions, lengths and colors above it are no scene's, and float32 has no room for the products of several of them that gradients are.
+LARGEST = 1e12
 
 # Fewer splats than this say nothing about how a parameter is distributed.
 MIN_DISTRIBUTION = 100
@@ -40,12 +42,12 @@ class Health:
     invisible: int  # opacity below MIN_VISIBLE
     scales_look_linear: bool  # stored scales are log lengths; all positive and mostly below 1, they look like lengths
     opacities_look_activated: bool  # stored opacities are logits; all within 0..1, they look like opacities
-    poisonous: Tensor  # [N] bool: activated, not finite, so that one row may turn a whole image or gradient into NaN
+    poisonous: Tensor  # [N] bool: activated, not finite or above LARGEST, so that one row may turn a whole image or gradient into NaN
 
     def sentences(self) -> list[str]:
         """What a person should know; empty for a healthy checkpoint."""
         counts = [
-            (int(self.poisonous.sum()), "are not finite once activated and would spoil images"),
+            (int(self.poisonous.sum()), f"are not finite once activated, or above {LARGEST:g}, and would spoil images"),
             (self.zero_quaternions, "have a zero quaternion and are drawn unrotated"),
             (self.huge, f"are longer than the scene ({self.extent:.3g} units)"),
             (self.tiny, f"have an axis below {TINY_SHARE:g} of the scene: sheets or needles"),
@@ -92,9 +94,11 @@ def drop(model: VanillaModel, mask: Tensor) -> VanillaModel:
 
 
 def _poisonous(raw: dict[str, Tensor], scales: Tensor, opacities: Tensor) -> Tensor:
-    """Legal extremes stay: a logit of infinity is opacity 1, a log scale of -infinity is length 0. Variances must be finite too."""
-    activated = [raw["means"], raw["quats"], scales.square(), opacities, raw["sh0"], raw["shN"]]
-    return ~torch.stack([values.flatten(1).isfinite().all(1) if values.dim() > 1 else values.isfinite() for values in activated]).all(0)
+    """Legal extremes stay: a logit of infinity is opacity 1, a log scale of -infinity is length 0, a quaternion may have any length."""
+    sound = raw["quats"].isfinite().all(1) & opacities.isfinite()
+    for values in (raw["means"], scales, raw["sh0"], raw["shN"]):
+        sound &= (values.abs() <= LARGEST).flatten(1).all(1)  # not so for NaN
+    return ~sound
 
 
 def _rows(marked: Tensor) -> int:

@@ -19,7 +19,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
-from mipmap_plugin.models.health import drop, examine
+from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.ply import read_ply, write_ply
@@ -233,7 +233,8 @@ def without_poison(model: VanillaModel) -> VanillaModel:
     if health.poisonous.all():
         raise CheckpointError(f"{model.source}: none of its {health.splats:,} splats is finite; the training or the export failed")
     model = drop(model, health.poisonous)
-    model.notes.append("found while loading: " + "; ".join(health.non_finite()))
+    reasons = health.non_finite() or [f"they were not finite once activated, or above {LARGEST:g}"]
+    model.notes.append("found while loading: " + "; ".join(reasons))
     return model
 
 

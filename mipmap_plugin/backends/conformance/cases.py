@@ -64,8 +64,8 @@ def odd_row(row: dict[str, Tensor], screen_filter: str = "classic") -> HardCase:
     return HardCase(Gaussians(**held), view(), Effects(1, screen_filter, near_plane=NEAR))
 
 
-def seen_by(camera: Camera) -> HardCase:
-    return HardCase(crowd(), camera, Effects(1, background=(0.2, 0.5, 0.9)))
+def seen_by(camera: Camera, screen_filter: str = "classic") -> HardCase:
+    return HardCase(crowd(), camera, Effects(1, screen_filter, background=(0.2, 0.5, 0.9)))
 
 
 def of_degree(degree: int, evaluated: int) -> HardCase:
@@ -94,14 +94,14 @@ def first_of_the_crowd(rows: list[int]) -> HardCase:
     return HardCase(crowd()[torch.tensor(rows)], view(), Effects(1))
 
 
-def at_one_depth(n: int = 2000) -> HardCase:
+def at_one_depth(n: int = 10_000) -> HardCase:
     """Ties: the splat with the lower index is in front."""
     gaussians = crowd(n)
     gaussians.means[:, 2] = 3
     return HardCase(replace(gaussians, scales=gaussians.scales / 4), view(), Effects(1))
 
 
-def in_one_pixel(n: int = 2000) -> HardCase:
+def in_one_pixel(n: int = 10_000) -> HardCase:
     """Opaque specks, one behind the other, each somewhere in the same pixel."""
     gaussians = crowd(n)
     camera = view(16, 16)
@@ -140,6 +140,7 @@ ROWS = {
     "in-the-eye": _row(means=(0.0, 0.0, 0.0)),
     "center-off-screen-body-on": _row(means=(-1.9, 0.1, 3.0), scales=(0.6, 0.3, 0.2)),
     "center-beyond-the-frustum-body-on": _row(means=(4.0, 2.5, 3.0), scales=(1.9, 1.4, 1.2)),
+    "1e25-units-aside": _row(means=(1e25, -1e25, 2.5)),  # further than integers count
     "1e6-units-ahead": _row(means=(3e4, 2e4, 1e6), scales=(1e5, 7e4, 5e4)),
     "scale-0-on-one-axis": _row(scales=(0.3, 0.2, 0.0)),
     "scale-0-on-two-axes": _row(scales=(0.3, 0.0, 0.0)),
@@ -159,28 +160,32 @@ ROWS = {
     "negative-color": _row(sh=-1e3),
     "saturated-color": _row(sh=1e3),
 }
+CAMERAS = {
+    "image-1x1": view(1, 1),
+    "image-1xN": view(1, 37),
+    "image-Nx1": view(37, 1),
+    "image-of-whole-tiles": view(32, 16),
+    "image-not-of-whole-tiles": view(33, 17),
+    "zoom-0.37": view().zoomed(0.37),
+    "zoom-1/64": view().zoomed(1 / 64),
+    "zoom-64": view().resized(4, 3).zoomed(64),
+    "principal-point-outside": view(cx=-9.0),
+}
+BAD = (math.nan, math.inf)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 FILTERS = ("classic", "antialiased", "mip", "analytic")
 
 CASES: dict[str, Builder] = {
     **{f"{name}-{kind}": partial(odd_row, row, kind) for (name, row), kind in product(ROWS.items(), FILTERS)},
-    **{f"{bad}-in-{field}": partial(odd_row, _row(**{field: bad})) for field, bad in product(FIELDS, (math.nan, math.inf))},
+    **{f"{bad}-in-{field}-{kind}": partial(odd_row, _row(**{field: bad}), kind) for field, bad, kind in product(FIELDS, BAD, FILTERS)},
     "no-splat": partial(none_drawn, 0),
     "no-splat-in-view": partial(none_drawn, 5),
     "one-splat": partial(first_of_the_crowd, [4]),
     "identical-splats": partial(first_of_the_crowd, [4, 4, 4]),
-    "2000-at-one-depth": at_one_depth,
-    "2000-opaque-in-one-pixel": in_one_pixel,
+    "10000-at-one-depth": at_one_depth,
+    "10000-opaque-in-one-pixel": in_one_pixel,
     "1e6-units-from-the-origin": far_from_the_origin,
-    "image-1x1": partial(seen_by, view(1, 1)),
-    "image-1xN": partial(seen_by, view(1, 37)),
-    "image-Nx1": partial(seen_by, view(37, 1)),
-    "image-of-whole-tiles": partial(seen_by, view(32, 16)),
-    "image-not-of-whole-tiles": partial(seen_by, view(33, 17)),
-    "zoom-0.37": partial(seen_by, view().zoomed(0.37)),
-    "zoom-1/64": partial(seen_by, view().zoomed(1 / 64)),
-    "zoom-64": partial(seen_by, view().resized(4, 3).zoomed(64)),
-    "principal-point-outside": partial(seen_by, view(cx=-9.0)),
+    **{f"{name}-{kind}": partial(seen_by, camera, kind) for (name, camera), kind in product(CAMERAS.items(), FILTERS)},
     **{f"sh-degree-{degree}": partial(of_degree, degree, degree) for degree in range(5)},
     "sh-bands-left-out": partial(of_degree, 3, 1),
     **{f"covariances-{kind}": partial(covariances_given, kind) for kind in FILTERS},

@@ -26,10 +26,18 @@ def tile_grid(width, height):
 
 @inner
 def rows_of(table, i, first, last):
-    """The pixel rows first..last that splat i touches. Clipped while still a float: no integer could hold every reach."""
+    """The pixel rows first..last that splat i touches."""
     reach = table[i, col.REACH_Y] + SLACK
-    low, high = math.ceil(table[i, col.Y] - 0.5 - reach), math.floor(table[i, col.Y] - 0.5 + reach)
-    return int(min(max(low, first), last + 1.0)), int(max(min(high, last), first - 1.0))
+    return within(table[i, col.Y] - 0.5 - reach, table[i, col.Y] - 0.5 + reach, first, last)
+
+
+@inner
+def within(low, high, first, last):
+    """The integers of first..last that lie between two floats; none: the second is the smaller.
+
+    Clipped while still floats, for compiled `ceil` and `floor` give 64-bit integers, which do not hold every reach.
+    """
+    return math.ceil(min(max(low, first), last + 1.0)), math.floor(max(min(high, last), first - 1.0))
 
 
 @inner
@@ -47,10 +55,10 @@ def tile_columns(table, i, first, last, width):
     left_most = min(max(-table[i, col.TIP], above), below)
     right = table[i, col.X] + table[i, col.SHEAR] * right_most + half_width(table, i, right_most) - 0.5
     left = table[i, col.X] + table[i, col.SHEAR] * left_most - half_width(table, i, left_most) - 0.5
-    low, high = math.ceil(max(left, 0.0)), math.floor(min(right, width - 1.0))
+    low, high = within(left, right, 0, width - 1)
     if low > high:
         return 0, -1
-    return int(low) // TILE_COLUMNS, int(high) // TILE_COLUMNS
+    return low // TILE_COLUMNS, high // TILE_COLUMNS
 
 
 @inner

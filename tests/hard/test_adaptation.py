@@ -1,0 +1,78 @@
+"""Adaptation of every family in the situations in which optimizers and rasterizers break: it ends, finite, and the base stays as it was."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+
+import pytest
+import tiny
+import torch
+from test_families import FAMILIES
+
+from mipmap_plugin.wrap import Wrapped, wrap_model
+
+VIEWS = tiny.cameras(3, width=8, height=6)
+AWAY = VIEWS[0].looking_from(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)) @ VIEWS[0].viewmat, "away")  # everything is behind it
+SMALL = [view.resized(2, 1) for view in VIEWS]
+
+# Cameras, scale and settings, on top of two steps on the given views.
+SITUATIONS = {
+    "no gradient": ([AWAY], 1 / 4, {}),
+    "everything pruned": (VIEWS, 1 / 4, dict(min_opacity=0.9999, prune_every=1)),
+    "one view": (VIEWS[:1], 1 / 4, {}),
+    "one view twice": (VIEWS[:1] * 2, 4, {}),
+    "scale 1": (VIEWS, 1, {}),
+    "x64": (SMALL, 64, {}),
+    "x1/64": (VIEWS, 1 / 64, {}),
+    "instant": (VIEWS, 1 / 8, dict(recipe="instant")),
+    "paper": (VIEWS, 1 / 4, dict(recipe="paper", densify_gradient=1e-9, prune_every=1)),
+}
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """A sound checkpoint of each family, with hard rows in it."""
+    rows = [("scale", 0, -40.0), ("scale_0", 1, 5.0), ("rot", 2, 0.0), ("opacity", 3, 60.0)]
+    return {name: make(tmp_path_factory.mktemp("base") / "m", rows) for name, make in FAMILIES.items()}
+
+
+def wrapped(folder, cameras, backend="reference") -> Wrapped:
+    return wrap_model(folder, cameras=cameras, backend=backend)
+
+
+def state(model) -> dict[str, torch.Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in {**model.parameters(), **model.shared_parameters()}.items()}
+
+
+def digest(folder) -> str:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+@pytest.mark.parametrize("family", FAMILIES)
+def test_it_ends_finite_and_leaves_the_base_alone(folders, family, situation):
+    cameras, scale, settings = SITUATIONS[situation]
+    base, files = wrapped(folders[family], cameras), digest(folders[family])
+    before = state(base.model)
+    recipe = settings.get("recipe", "default")
+    steps = {} if recipe == "instant" else {"steps": 2, "views": "given", "check_every": 1}
+    adapted = base.adapt(scale, **{**steps, **settings})
+    moved = state(adapted.model)
+    finite_before = {name for name, tensor in before.items() if tensor.isfinite().all()}
+    assert {name for name, tensor in moved.items() if tensor.isfinite().all()} >= finite_before
+    assert adapted.render(cameras[0].zoomed(scale)).image.isfinite().all()
+    assert len(moved["means"]) >= 1
+    after = state(base.model)
+    assert all(torch.equal(before[name], after[name]) for name in before) and digest(folders[family]) == files
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_same_seed_gives_the_same_numbers(folders, family, backend):
+    if backend == "cpu" and importlib.util.find_spec("numba") is None:
+        pytest.skip("numba, the extra `cpu`, is not installed")
+    runs = [state(wrapped(folders[family], VIEWS, backend).adapt(1 / 4, steps=2, extra_views=2, seed=seed).model) for seed in (3, 3, 4)]
+    assert all(torch.equal(runs[0][name], runs[1][name]) for name in runs[0])
+    assert any(not torch.equal(runs[0][name], runs[2][name]) for name in runs[0])

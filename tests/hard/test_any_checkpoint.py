@@ -1,0 +1,80 @@
+"""Whatever numbers a checkpoint holds: a finite image with finite gradients, or one sentence. hypothesis looks for the numbers."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+
+import numpy as np
+import ply_files
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mipmap_plugin.backends import get_backend
+from mipmap_plugin.backends.conformance.cases import view
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.models import load_model
+
+BACKENDS = ["reference", "cpu"] if importlib.util.find_spec("numba") else ["reference"]
+FILTERS = ["classic", "antialiased", "mip", "analytic"]
+NAMES = ply_files.splat_names(3)
+
+# Ordinary numbers, by column: a splat in the middle of the view.
+USUAL = {"z": 3.0, "scale_0": -1.0, "scale_1": -1.5, "scale_2": -2.0, "rot_0": 1.0, "rot_1": 0.3, "opacity": 1.0}
+
+# Where formulas change: overflow of exp, of a square and of a fourth power, denormal numbers, saturated logits, the planes of the view.
+EDGES = [0.0, 1e-45, 1e-38, 1e-30, 1e-12, 0.2, 1.0, 17.0, 30.0, 44.3, 80.0, 88.0, 88.8, 1e4, 1e9, 1e12, 1e15, 1e18, 1.8e19, 1e30, 3.4e38]
+numbers = (
+    st.floats(width=32, allow_nan=False, allow_infinity=False)
+    | st.sampled_from([sign * edge for edge in EDGES for sign in (1, -1)])
+    | st.floats(-3, 3, width=32)
+)
+VIEWS = [view(9, 7, turned=True), view(9, 7).zoomed(16), view(18, 14).zoomed(1 / 64), replace(view(5, 4), fx=1e5, fy=1e-3)]
+
+
+@st.composite
+def rows(draw):
+    """One splat in the view, some of whose numbers are anything."""
+    changed = draw(st.dictionaries(st.sampled_from(NAMES), numbers, max_size=6))
+    if draw(st.booleans()):  # a place that can be seen, however far away
+        changed["z"] = abs(changed.get("z", 3.0))
+        changed |= {axis: changed["z"] * draw(st.floats(-0.4, 0.4)) for axis in "xy"}
+    return {name: float(np.clip(changed.get(name, USUAL.get(name, 0.1)), -3.4e38, 3.4e38)) for name in NAMES}
+
+
+def check(folder, splats, screen_filter, camera):
+    path = ply_files.write(folder / "a.ply", {name: np.array([row[name] for row in splats], np.float32) for name in NAMES})
+    try:
+        model = load_model(path)
+    except MipmapPluginError as error:
+        assert "\n" not in str(error)
+        return
+    for name in BACKENDS:
+        student = model.copy()
+        rendered = get_backend(name).render(student.gaussians(camera), camera, Effects(1, screen_filter, near_plane=0.01))
+        both = torch.cat([rendered.image, rendered.alpha[..., None]], dim=-1)
+        assert both.isfinite().all(), f"{name}: the image is not finite"
+        weights = torch.rand(both.shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
+        (both * weights).sum().backward()
+        wrong = [key for key, leaf in student.parameters().items() if leaf.grad is not None and not leaf.grad.isfinite().all()]
+        assert not wrong, f"{name}: the gradients of {wrong} are not finite"
+
+
+cases = given(splats=st.lists(rows(), min_size=1, max_size=3), screen_filter=st.sampled_from(FILTERS), camera=st.sampled_from(VIEWS))
+known = settings(derandomize=True, database=None, deadline=None)
+
+
+@settings(known, max_examples=300)
+@cases
+def test_any_finite_checkpoint_gives_a_finite_image_and_gradients_or_a_sentence(tmp_path_factory, splats, screen_filter, camera):
+    check(tmp_path_factory.getbasetemp(), splats, screen_filter, camera)
+
+
+@pytest.mark.slow
+@settings(known, max_examples=20_000)
+@cases
+def test_any_finite_checkpoint_at_length(tmp_path_factory, splats, screen_filter, camera):
+    check(tmp_path_factory.getbasetemp(), splats, screen_filter, camera)
