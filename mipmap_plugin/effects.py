@@ -129,4 +129,6 @@ def _of_adapting(config: AdaptConfig | None, scale: float) -> list[Effect]:
 def _upsampler(config: AdaptConfig, scale: float) -> tuple[bool, str]:
     if enlarges(config, scale):
         return True, f"{config.upsampler} makes the truth from the base's image"
+    if scale > 1 and config.compare_at == "both":
+        return True, f"{config.upsampler} adds detail that the base's image has not"
     return False, "no image has to become larger" if scale <= 1 else "images are shrunk and compared with the base's own"

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.closed_form import closed_form
 from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.adaptation.detail import Detail, evenly
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Report, filters, versions
@@ -191,6 +192,10 @@ class _Adaptation:
             self.views, when = with_times(self.views, config.seed)
             self.which += f", {when}"
         self.truth = PseudoTruth(self.base, self.backend, self.trained, scale, config)
+        self.detail = Detail(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
+        if self.detail is not None:
+            self.views = evenly(self.views, config.upsampled_views)
+            self.which += f", {len(self.views)} of them upsampled"
         self.seconds = {"optimization": 0.0}
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
@@ -209,11 +214,16 @@ class _Adaptation:
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[list[CurvePoint], str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""
-        task = Task(self.views, self.scale, self.truth, self._render, self._white)
+        task = Task(self.views, self.scale, self.truth, self._render, self._white, self.detail)
         fingerprint = self._fingerprint()
         run = load_run(resume, student, task, self.config, fingerprint) if resume and resume.exists() else Run.start(student, task, self.config)
         if self.effects.sh_degree == 0 and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no color follows the direction: its coefficients stay out of the gradient
+        if self.detail is not None:
+            began = time.perf_counter()
+            self.detail.prepare(self.views)
+            self.seconds["upsampling"] = time.perf_counter() - began
+            self.seconds["total"] += self.seconds["upsampling"]
         before = self.seconds["total"]
 
         def look(run: Run) -> None:

@@ -29,6 +29,7 @@ class Task:
     truth: Callable[[Camera], Tensor]  # a view of the base scale -> [h, w, 3] at the new scale
     render: Callable[[SplatModel, Camera], Tensor]  # a model and a camera of the new scale -> [h, w, 3]
     white_background: bool
+    detail: Callable[[Camera, Tensor], Tensor] | None = None  # what a view's image adds to the loss besides
 
 
 @dataclass
@@ -88,10 +89,10 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         camera = view.zoomed(task.scale)
         target = task.truth(view)  # r(x̂): the frozen base, resized
         image = task.render(run.student, camera)  # x: the student at the new scale
-        if image.shape != target.shape:
-            image = resize(image, (target.shape[0], target.shape[1]), config.resize)  # compared at the base's scale
-        loss = (image - target).square().mean()
-        loss.backward()
+        # Where the truth is the base itself, it is compared with at the base's scale.
+        shrunk = image if image.shape == target.shape else resize(image, (target.shape[0], target.shape[1]), config.resize)
+        loss = (shrunk - target).square().mean()
+        (loss if task.detail is None else loss + task.detail(view, image)).backward()
         run.square_error += float(loss.detach()) / len(views)
         if run.gradients is not None and means.grad is not None:
             run.gradients.add(means, means.grad - before, camera)

@@ -45,6 +45,7 @@ def filters(scale: float, config: AdaptConfig, base: Effects, file: Effects) -> 
         truth = config.resize
     else:
         truth = config.upsampler if enlarges(config, scale) else f"the base itself, images shrunk by {config.resize}"
+        truth += f", and {config.upsampler} fused with it" if config.compare_at == "both" else ""
     of_base, of_file = (f"{effects.screen_filter} {effects.eps2d:g} px²" for effects in (base, file))
     return f"pseudo truth {truth}; base {of_base}; file {of_file}"
 

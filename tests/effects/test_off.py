@@ -215,7 +215,7 @@ def broken_upsampler():
     return "broken"
 
 
-@pytest.mark.parametrize(("scale", "settings"), [(1 / 4, {}), (4, {}), (4, dict(compare_at="target", steps=0))])
+@pytest.mark.parametrize(("scale", "settings"), [(1 / 4, {}), (4, dict(compare_at="base")), (4, dict(compare_at="target", steps=0))])
 def test_an_upsampler_that_is_not_called_for_is_not_imported(broken_upsampler, scale, settings):
     wrapped(with_bands(1, 1)).adapt(scale, upsampler=broken_upsampler, **{**BRIEF, **settings})
 

@@ -1,0 +1,120 @@
+"""Zoom-in with an upsampler: which part of its image is believed, and that a bad one does no harm."""
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.detail import Detail, evenly
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
+from mipmap_plugin.config import AdaptConfig, recipe
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.wrap import wrap_model
+
+VIEW = tiny.cameras(1)[0]
+SIZE = (48, 64)
+
+
+@pytest.fixture
+def upsampler(monkeypatch):
+    """Register a function as the upsampler `mine`."""
+    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
+    return lambda function: register_upsampler("mine", function, replace=True)
+
+
+def picture(height, width, seed=0):
+    coarse = torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(seed))
+    return (0.1 + 0.8 * resize(coarse, (height, width), "pil-bicubic")).clamp(0, 1)
+
+
+def detail(base, **settings):
+    return Detail(lambda view: base, 2, AdaptConfig(upsampler="mine", compare_at="both", **settings))
+
+
+def test_up_to_what_the_base_samples_the_target_is_the_base(upsampler):
+    base = picture(24, 32)
+    upsampler(lambda image, size: (resize(image, size, "pil-bicubic") + 0.1).clamp(0, 1))
+    target, _ = detail(base)._of(VIEW)
+    assert psnr(resize(target, (24, 32), "pil-bicubic"), base) > 45
+
+
+def test_finer_detail_is_the_upsamplers(upsampler):
+    truth = (picture(*SIZE) + 0.1 * (torch.arange(64) % 2)[None, :, None] - 0.05).clamp(0, 1)
+    base = resize(truth, (24, 32), "pil-bicubic")
+    upsampler(lambda image, size: truth)
+    target, confidence = detail(base)._of(VIEW)
+    torch.testing.assert_close(target, truth, atol=1e-3, rtol=0)
+    assert confidence.min() > 0.99
+
+
+def test_a_pixel_is_believed_as_far_as_it_agrees_with_the_base(upsampler):
+    base = picture(24, 32)
+    wrong = torch.zeros(*SIZE, 1)
+    wrong[:, 40:] = 0.5
+    upsampler(lambda image, size: resize(image, size, "pil-bicubic") - wrong)
+    _, confidence = detail(base)._of(VIEW)
+    assert confidence.shape == (*SIZE, 1)
+    assert confidence[:, :36].min() > 0.9 and confidence[:, 44:].max() < 0.1
+
+
+def test_views_that_deny_what_one_claims_outvote_it(upsampler):
+    """The gradient of a difference is the same however large it is: the minimum over views is their median."""
+    upsampler(lambda image, size: resize(image, size, "pil-bicubic"))
+    base = torch.full((24, 32, 3), 0.5)
+    loss = detail(base, detail_weight=1.0)
+    near, far = (torch.full((*SIZE, 3), value, requires_grad=True) for value in (0.6, 0.9))
+    for image in (near, far):
+        loss(VIEW, image).backward()
+    torch.testing.assert_close(near.grad, far.grad)
+
+
+def test_each_view_is_enlarged_once_and_beforehand(upsampler):
+    given = []
+    upsampler(lambda image, size: given.append(size) or resize(image, size, "pil-bicubic"))
+    part, views = detail(picture(24, 32)), tiny.cameras(3)
+    part.prepare(views)
+    part(views[0], torch.zeros(*SIZE, 3))
+    assert given == [SIZE] * 3
+
+
+def test_views_are_spread_over_their_order():
+    views = tiny.cameras(7)
+    assert evenly(views, 3) == [views[0], views[2], views[4]]
+    assert evenly(views, 7) == views and evenly(views, 100) == views
+
+
+# In an adaptation
+
+
+def adapted(upsampler_name, **settings):
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    return model.adapt(2, upsampler=upsampler_name, **settings)
+
+
+def test_a_network_takes_part_by_default_and_a_kernel_does_not():
+    assert recipe("default", 2, upsampler="net.pth").compare_at == "both"
+    assert recipe("default", 2, upsampler="lanczos") == recipe("default", 2).model_copy(update={"upsampler": "lanczos"})
+    assert recipe("default", 1 / 2, upsampler="net.pth").compare_at == "target"
+    assert recipe("paper", 2, upsampler="net.pth").compare_at == "target"
+
+
+def test_the_report_says_what_was_enlarged(upsampler):
+    upsampler(lambda image, size: resize(image, size, "lanczos"))
+    report = adapted("mine", steps=2, upsampled_views=4).report
+    assert report.views == "the 6 train views, 4 of them upsampled"
+    assert "and mine fused with it" in report.filters
+    assert any("mine adds detail that the base's image has not" in str(effect) for effect in report.effects)
+    assert report.seconds["upsampling"] > 0
+
+
+def test_an_upsampler_that_is_all_noise_does_no_harm(upsampler):
+    """Against the base's own larger render: not below the closed form, whatever the target."""
+    upsampler(lambda image, size: torch.rand(*size, 3, generator=torch.Generator().manual_seed(int(image.sum() * 1000))))
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    views = tiny.cameras(2, seed=9, split="test")
+    truths = [base.render(view.zoomed(2), 2, "scaled").image for view in views]
+
+    def quality(model):
+        return sum(psnr(model.render(view.zoomed(2)).image, truth) for view, truth in zip(views, truths, strict=True))
+
+    assert quality(adapted("mine", steps=30)) > quality(base.adapt(2, recipe="instant"))
