@@ -101,11 +101,12 @@ def _swap_in(new: Path, path: Path) -> None:
         new.rename(path)
         return
     aside = new.with_suffix(".old")
-    path.rename(aside)
     try:
+        path.rename(aside)
         new.rename(path)
-    except OSError:
-        aside.rename(path)
+    except BaseException:  # also Ctrl-C
+        if not path.exists():
+            aside.rename(path)
         raise
     _remove(aside)
 

@@ -20,7 +20,8 @@ from mipmap_plugin.adaptation.detail import Detail, evenly
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Report, filters, versions
-from mipmap_plugin.adaptation.resume import load_run, save_run
+from mipmap_plugin.adaptation.resume import Interrupted as Interrupted  # what `adapt` raises
+from mipmap_plugin.adaptation.resume import Keeper
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.backends import choose_backend, supersample
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
@@ -41,10 +42,6 @@ from mipmap_plugin.scenes import Scene, model_cameras
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
 
 
-class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during adaptation; the text says where the run can be resumed from."""
-
-
 @dataclass(frozen=True, eq=False)
 class Adapted:
     """A model that looks right at its scale, and the report of how it came to."""
@@ -53,6 +50,7 @@ class Adapted:
     report: Report
     backend: Backend
     effects: Effects
+    state: Path | None = None  # of the run, which is of use until the model is saved
 
     def render(self, camera: Camera) -> Rendered:
         """The view of a camera of the new scale."""
@@ -62,6 +60,8 @@ class Adapted:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
         saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
         write_json(saved.with_name(saved.name + ".adaptation.json"), self.report.model_dump(), overwrite=True)
+        if self.state is not None:
+            self.state.unlink(missing_ok=True)
         return saved
 
 
@@ -109,8 +109,8 @@ class Wrapped:
 
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override the recipe's, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
-        and raises Interrupted, and a finished run removes it. `observe` sees the model before the first step and after each.
-        Raises SettingsError and BackendUnavailable.
+        and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` sees the model before
+        the first step and after each. Raises SettingsError and BackendUnavailable.
         """
         if not 0 < scale < float("inf"):
             raise SettingsError(f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4")
@@ -210,13 +210,15 @@ class _Adaptation:
         ended_by = "scale 1, at which the base is right as it is" if nothing_to_do else "0 steps"
         if self.config.steps and not nothing_to_do:
             curve, ended_by = self._optimize(student, resume, observe)
-        return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects)
+        else:
+            resume = None  # whatever run it is of
+        return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects, resume)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[list[CurvePoint], str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""
         task = Task(self.views, self.scale, self.truth, self._render, self._white, self.detail)
-        fingerprint = self._fingerprint()
-        run = load_run(resume, student, task, self.config, fingerprint) if resume and resume.exists() else Run.start(student, task, self.config)
+        keeper = Keeper(resume, self._fingerprint())
+        run = keeper.begin(student, task, self.config)
         if self.effects.sh_degree == 0 and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no color follows the direction: its coefficients stay out of the gradient
         if self.detail is not None:
@@ -227,12 +229,11 @@ class _Adaptation:
         before = self.seconds["total"]
 
         def look(run: Run) -> None:
+            keeper.now_and_then(run)
             if observe is not None:
                 observe(run.step, before + run.watch.seconds, lambda camera: self._render(run.student, camera))
 
-        ended_by = adapt(run, task, self.config, lambda run: _stop(run, resume, fingerprint), look)
-        if resume:
-            resume.unlink(missing_ok=True)
+        ended_by = adapt(run, task, self.config, keeper.stop, look)
         self.seconds["optimization"] = run.watch.seconds
         self.seconds["total"] += run.watch.seconds
         return run.curve, ended_by
@@ -289,10 +290,3 @@ def _digest(model: SplatModel) -> str:
     for tensor in {**model.parameters(), **model.shared_parameters()}.values():
         digest.update(tensor.detach().cpu().numpy().tobytes())
     return digest.hexdigest()
-
-
-def _stop(run: Run, resume: Path | None, fingerprint: str) -> None:
-    if resume is None:
-        raise Interrupted(f"interrupted at step {run.step}; nothing was written, for no file to resume from was named")
-    save_run(run, resume, fingerprint)
-    raise Interrupted(f"interrupted at step {run.step}; run the same command again to go on from {resume}")

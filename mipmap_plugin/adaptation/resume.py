@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
+import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 
@@ -13,9 +15,47 @@ from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.optimizer import make_optimizer
 from mipmap_plugin.adaptation.views import extent
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.files import new_file
+from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.torch_file import save_torch
+
+# Seconds between two states of a long run: what a killed process loses at most. A state is about three times as large as the model.
+KEEP_EVERY_S = 60.0
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during adaptation; the text says where the run can be resumed from."""
+
+
+class Keeper:
+    """Keeps the state of one run in a file, if there is one to keep it in: every minute, and when the run is interrupted."""
+
+    def __init__(self, path: Path | None, fingerprint: str) -> None:
+        self._path, self._fingerprint = path, fingerprint
+        self._kept = time.monotonic()
+
+    def begin(self, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
+        """A new run, or the one in the file. Raises SettingsError (`load_run`)."""
+        if self._path is None or not self._path.exists():
+            return Run.start(student, task, config)
+        return load_run(self._path, student, task, config, self._fingerprint)
+
+    def now_and_then(self, run: Run) -> None:
+        """Write the state if the last one is old. A disk that has no room for it does not end the run."""
+        if self._path is None or time.monotonic() - self._kept < KEEP_EVERY_S:
+            return
+        try:
+            save_run(run, self._path, self._fingerprint)
+        except OutputError as error:
+            warnings.warn(f"the run goes on, but could not be resumed if it were killed: {error}", stacklevel=2)
+        self._kept = time.monotonic()
+
+    def stop(self, run: Run) -> NoReturn:
+        """Write the state and raise Interrupted. Raises OutputError when the disk refuses."""
+        if self._path is None:
+            raise Interrupted(f"interrupted at step {run.step}; nothing was written, for no file to resume from was named")
+        save_run(run, self._path, self._fingerprint)
+        raise Interrupted(f"interrupted at step {run.step}; run the same command again to go on from {self._path}")
 
 
 def save_run(run: Run, path: Path, fingerprint: str) -> None:
@@ -32,14 +72,13 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "optimizer": run.optimizer.state_dict(),
         "gradients": None if run.gradients is None else (run.gradients.total, run.gradients.seen),
     }
-    with new_file(path, overwrite=True) as temporary:
-        torch.save(state, temporary)
+    save_torch(path, state, overwrite=True)
 
 
 def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, fingerprint: str) -> Run:
     """The run that `save_run` wrote, over `student`'s own parameters. Raises SettingsError when it is of another run or unreadable."""
     state = _read(path)
-    if state.get("fingerprint") != fingerprint:
+    if not isinstance(state, dict) or state.get("fingerprint") != fingerprint:
         raise SettingsError(f"{path}: it belongs to another base, other settings or other views; repeat those, or delete the file to start anew")
     device = student.parameters()["means"].device
     if state["rows_changed"]:
@@ -60,7 +99,7 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
     return Run(student, optimizer, Stopwatch(device, state["seconds"]), gradients, state["step"], curve, state["square_error"], state["rows_changed"])
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path) -> Any:
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load fails in many ways on a file that is not its own

@@ -1,0 +1,196 @@
+"""A full disk, Ctrl-C and kill -9, in the middle of adapting and of saving: what was there stays, and no half file has a final name."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+from corpus import SAMPLES
+
+from mipmap_plugin import files
+from mipmap_plugin.adaptation import resume
+from mipmap_plugin.errors import OutputError, SettingsError
+from mipmap_plugin.models import load_model
+from mipmap_plugin.wrap import wrap_model
+
+# One sample of each writer.
+WRITERS = ["ply", "cfg_args", "ply of Mip-Splatting", "checkpoints.pth", "opacity_mlp.pt", "deform.pth", "deformation.pth"]
+WRITERS += ["ckpt of gsplat", "ckpt of splatfacto"]
+
+
+@contextmanager
+def disk_that_holds(size: int):
+    """No file may grow beyond `size` bytes; what is written behind that fails, in Python and in C++."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def contents(folder: Path) -> dict[str, str]:
+    found = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
+
+
+def adapted(path: Path, scale: float):
+    return wrap_model(path, cameras=tiny.cameras(2, width=8, height=6), backend="reference").adapt(scale, recipe="instant")
+
+
+# A full disk
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_leaves_the_old_output_and_nothing_else(tmp_path, name):
+    base = SAMPLES[name].make(tmp_path / "base")
+    out = tmp_path / "out" / ("new.ply" if base.suffix == ".ply" else "new")
+    new = adapted(base, 1 / 4)
+    whole = adapted(base, 1 / 2).save(out).stat().st_size
+    before = contents(out.parent)
+    for size in (0, 1, 100, whole // 2, whole - 1):
+        with disk_that_holds(size), pytest.raises(OutputError, match="cannot be written"):
+            new.save(out, overwrite=True)
+        assert contents(out.parent) == before
+    assert load_model(out)
+    new.save(out, overwrite=True)
+    assert contents(out.parent) != before
+
+
+def test_a_full_disk_while_a_run_is_kept_does_not_end_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    goes_on = pytest.warns(UserWarning, match="the run goes on, but could not be resumed if it were killed: .* cannot be written")
+    with disk_that_holds(100), goes_on:
+        done = model.adapt(1 / 4, steps=2, resume=tmp_path / "state")
+    assert done.report.ended_by == "2 steps" and list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_when_the_finished_model_is_saved_leaves_its_state(tmp_path, monkeypatch):
+    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
+    done = model.adapt(1 / 4, steps=3, resume=state)
+    with disk_that_holds(100), pytest.raises(OutputError):
+        done.save(tmp_path / "new.ply")
+    again = model.adapt(1 / 4, steps=3, resume=state)
+    assert again.report.curve == done.report.curve
+    assert again.save(tmp_path / "new.ply").read_bytes() == done.save(tmp_path / "other.ply").read_bytes()
+    assert not state.exists()
+
+
+# Ctrl-C
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("where", ["write", "first rename", "second rename"])
+def test_ctrl_c_while_saving_leaves_the_old_output_and_nothing_else(tmp_path, monkeypatch, name, where):
+    base = SAMPLES[name].make(tmp_path / "base")
+    out = tmp_path / "out" / ("new.ply" if base.suffix == ".ply" else "new")
+    new = adapted(base, 1 / 4)
+    adapted(base, 1 / 2).save(out)
+    before, waiting = contents(out.parent), {"first rename": 1, "second rename": 2}.get(where, 0)
+
+    def pressed(*_, **__):
+        signal.raise_signal(signal.SIGINT)
+
+    def renamed(self, to, real=Path.rename):
+        nonlocal waiting
+        waiting -= 1
+        if waiting == 0:
+            pressed()
+        return real(self, to)
+
+    if where == "write":
+        monkeypatch.setattr(os, "fsync", pressed)
+        monkeypatch.setattr(torch, "save", pressed)
+    elif out.suffix == ".ply":
+        monkeypatch.setattr(files.os, "replace", pressed)
+    else:
+        monkeypatch.setattr(Path, "rename", renamed)
+    with pytest.raises(KeyboardInterrupt):
+        new.save(out, overwrite=True)
+    monkeypatch.undo()
+    assert contents(out.parent) == before
+
+
+# kill -9
+
+
+def save_for_ever(path: str) -> None:
+    torch.set_num_threads(1)
+    models = [tiny.model(count) for count in (20, 3000)]
+    while True:
+        for model in models:
+            model.save(path, provenance={}, overwrite=True)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
+@pytest.mark.parametrize("name", ["new.ply", "new"])
+def test_a_process_killed_while_it_saves_leaves_a_whole_file(tmp_path, name):
+    """Of a folder, the old one may lie beside the new one for the moment between two renames, which is told by its name."""
+    out = tmp_path / name
+    tiny.model(20).save(out, provenance={})
+    for number in range(12):
+        process = multiprocessing.get_context("fork").Process(target=save_for_ever, args=(str(out),))
+        process.start()
+        time.sleep(0.03 + 0.007 * number)
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+        left = out if out.exists() else next(tmp_path.glob(".new.*.old"))
+        assert len(load_model(left)) in (20, 3000)
+    assert {path.name for path in tmp_path.iterdir() if not path.name.startswith(".")} <= {name}
+
+
+RUN = """
+import os, signal, sys
+sys.path.insert(0, {tests!r})
+import tiny, torch
+from mipmap_plugin.adaptation import resume
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.wrap import wrap_model
+torch.set_num_threads(1)
+resume.KEEP_EVERY_S = 0.0
+render, calls = ReferenceBackend.render, []
+def counted(self, *scene):
+    calls.append(torch.is_grad_enabled())
+    if sum(calls) == {call}:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return render(self, *scene)
+ReferenceBackend.render = counted
+wrap_model(tiny.model(20), cameras=tiny.cameras(3), backend="reference").adapt(1 / 4, steps=6, extra_views=2, resume={state!r})
+"""
+
+
+def test_a_killed_run_goes_on_from_its_last_state_to_the_same_bytes(tmp_path):
+    """Two views a step: it is killed in the middle of the fourth step."""
+    state = tmp_path / "state"
+    code = RUN.format(tests=str(Path(tiny.__file__).parent), call=8, state=str(state))
+    killed = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    model = wrap_model(tiny.model(20), cameras=tiny.cameras(3), backend="reference")
+    assert torch.load(state, weights_only=True)["step"] == 3
+    resumed, whole = (model.adapt(1 / 4, steps=6, extra_views=2, resume=path) for path in (state, None))
+    saved = [each.save(tmp_path / f"{i}.ply").read_bytes() for i, each in enumerate((resumed, whole))]
+    assert saved[0] == saved[1] and not state.exists()
+
+
+# A damaged state
+
+
+@pytest.mark.parametrize("content", [5, {}, {"fingerprint": None}, [torch.ones(2)]], ids=str)
+def test_a_state_that_is_none_is_refused(tmp_path, content):
+    torch.save(content, tmp_path / "state")
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    with pytest.raises(SettingsError, match="state: it belongs to another base, other settings or other views"):
+        model.adapt(1 / 4, steps=1, resume=tmp_path / "state")
