@@ -18,6 +18,7 @@ from mipmap_plugin.adaptation.closed_form import closed_form
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.detail import Detail, evenly
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
+from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.resume import Interrupted as Interrupted  # what `adapt` raises
@@ -103,6 +104,7 @@ class Wrapped:
         cameras: Sequence[Camera] | None = None,
         resume: str | Path | None = None,
         observe: Observer | None = None,
+        images: Scene | None = None,
         **settings: Any,
     ) -> Adapted:
         """A new model for `scale` (target focal length in px over base focal length in px); the base stays as it is.
@@ -110,12 +112,17 @@ class Wrapped:
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override the recipe's, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` sees the model before
-        the first step and after each. Raises SettingsError and BackendUnavailable.
+        the first step and after each.
+        `images`: a scene whose training images are the truth of a zoom-in, instead of what the base shows of them.
+        Raises SettingsError and BackendUnavailable.
         """
         if not 0 < scale < float("inf"):
             raise SettingsError(f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4")
         config = make_config(recipe, scale, **settings)
-        adaptation = _Adaptation(self, scale, config, self.cameras if cameras is None else list(cameras))
+        real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
+        if cameras is None:
+            cameras = real.cameras if real else self.cameras
+        adaptation = _Adaptation(self, scale, config, list(cameras), real)
         return adaptation.run(None if resume is None else Path(resume), observe)
 
     def views(self) -> list[Camera]:
@@ -182,7 +189,7 @@ def own_cameras(model: SplatModel) -> list[Camera]:
 class _Adaptation:
     """One call of adapt: the pieces, made once, and the order they run in."""
 
-    def __init__(self, wrapped: Wrapped, scale: float, config: AdaptConfig, cameras: list[Camera]) -> None:
+    def __init__(self, wrapped: Wrapped, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
         self.base, self.scale, self.config = wrapped.model, scale, config
         self.backend, self.why = wrapped.backend(gradients=config.steps > 0)
         self.trained = wrapped.effects()
@@ -191,7 +198,8 @@ class _Adaptation:
         if getattr(self.base, "moves", False):
             self.views, when = with_times(self.views, config.seed)
             self.which += f", {when}"
-        self.truth = PseudoTruth(self.base, self.backend, self.trained, scale, config)
+        self.which += f", {len(real.cameras)} of them real images" if real else ""
+        self.truth = PseudoTruth(self.base, self.backend, self.trained, scale, config, real)
         self.detail = Detail(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
         if self.detail is not None:
             self.views = evenly(self.views, config.upsampled_views)

@@ -8,25 +8,39 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import Upsampler, check_upsampler, find_upsampler
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, enlarges
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.base import SplatModel
 
 
 class PseudoTruth:
     """The base model's view of a camera, resized to the wanted scale, [H, W, 3] float, cached by camera.
 
-    With `compare_at="base"` a zoom-in's truth keeps the base's size: all that is known is what the wanted image must shrink to.
+    Unless `compare_at` is "target" a zoom-in's truth keeps the base's size: what is known is what the wanted image must shrink to.
+    There a photograph takes the place of the base's image, for the views that have one.
     """
 
-    def __init__(self, base: SplatModel, backend: Backend, effects: Effects, scale: float, config: AdaptConfig) -> None:
+    def __init__(
+        self,
+        base: SplatModel,
+        backend: Backend,
+        effects: Effects,
+        scale: float,
+        config: AdaptConfig,
+        photographs: Photographs | None = None,
+    ) -> None:
         """`effects`: how the base is rendered at the scale that it was trained at. Raises SettingsError for an unknown upsampler."""
         self._base, self._backend, self._effects, self._scale, self._config = base, backend, effects, scale, config
         check_upsampler(config.upsampler)
+        if photographs and (scale <= 1 or config.compare_at == "target"):
+            raise SettingsError("real images take part only in a zoom-in that is compared with the base at its own scale; leave them out")
+        self._photographs = photographs
         self._made: dict[Camera, Tensor] = {}
 
     def __call__(self, view: Camera) -> Tensor:
@@ -46,7 +60,8 @@ class PseudoTruth:
         if enlarges(self._config, self._scale):
             target = self._enlarge(self._render(view, 1.0), size)
         elif self._scale > 1:
-            target = self._render(view, 1.0)
+            real = self._photographs(view) if self._photographs else None
+            target = self._render(view, 1.0) if real is None else real
         else:
             target = resize(self._render(view, self._finest()), size, self._config.resize)
         return target.clamp(0, 1).mul(255).round().div(255) if self._config.quantize_truth else target

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import Recipe, ResizeFilter, ViewPolicy
 from mipmap_plugin.files import refuse_existing
+from mipmap_plugin.scenes import load_scene
 
 
 def adapt(
@@ -24,6 +26,7 @@ def adapt(
     target_db: float | None = None,
     resize: ResizeFilter | None = None,
     upsampler: str | None = None,
+    images: Path | None = None,
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
     backend: str = "auto",
@@ -44,7 +47,8 @@ def adapt(
         time_budget_s: Seconds at most.
         target_db: Stop at this PSNR against the pseudo truth, which is what adapting aims at, and not real photographs.
         resize: Filter that makes the base image smaller.
-        upsampler: What makes the base image larger, by name.
+        upsampler: What makes the base image larger, by name or the file of a super-resolution network.
+        images: Folder of the scene; a zoom-in then aims at its training images, made as small as the base's, instead of at the base's own.
         background: Of the scene; by default what the checkpoint says, else black.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
@@ -60,15 +64,19 @@ def adapt(
     targets = [adapted_path(checkpoint, output, each, len(scales) > 1) for each in scales]
     for target in targets:
         refuse_existing(target, overwrite)
+    real = None if images is None else load_scene(images)
     reports = []
     for each, target in zip(scales, targets, strict=True):
-        adapted = wrapped.adapt(each, recipe=recipe, seed=seed, resume=target.with_name(target.name + ".resume"), **settings)
+        adapted = wrapped.adapt(each, recipe=recipe, seed=seed, images=real, resume=target.with_name(target.name + ".resume"), **settings)
         saved = adapted.save(target, overwrite=overwrite)
-        report = adapted.report
-        reports.append({"file": str(saved), **report.model_dump()})
+        reports.append({"file": str(saved), **adapted.report.model_dump()})
         if not json:
-            print(f"x{each:g}: {saved}")
-            print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
-            print(f"  {report.views}; {report.filters}; backend {report.backend}")
+            _print(saved, adapted.report)
     if json:
         tell(reports, json)
+
+
+def _print(saved: Path, report: Report) -> None:
+    print(f"x{report.scale:g}: {saved}")
+    print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
+    print(f"  {report.views}; {report.filters}; backend {report.backend}")

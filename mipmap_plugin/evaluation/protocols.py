@@ -10,6 +10,7 @@ from typing import Protocol as TypingProtocol
 
 from torch import Tensor
 
+from mipmap_plugin.adaptation.photographs import as_sampled
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
@@ -99,13 +100,7 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
     cameras = [c for c in cameras if c.split == "test"] or cameras
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to judge by")
-    return [TestView(_as_sampled(camera, base), scene.image(camera, background), scene.images[camera], background) for camera in cameras]
-
-
-def _as_sampled(camera: Camera, base: Camera) -> Camera:
-    """`camera` at the pixel density of `base`: where zooming starts from, and not itself a zoom."""
-    ratio = base.fx / camera.fx
-    return camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
+    return [TestView(as_sampled(camera, base), scene.image(camera, background), scene.images[camera], background) for camera in cameras]
 
 
 def resized_base(render: Tensor, size: tuple[int, int], upsampler: str = "bicubic") -> Tensor:

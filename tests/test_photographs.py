@@ -1,0 +1,75 @@
+"""Real images as the truth of a zoom-in, for the views that have one."""
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.photographs import Photographs
+from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.cli import main
+from mipmap_plugin.config import recipe
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.wrap import wrap_model
+
+BLACK = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Photographs at twice the density of the base, of another model than the one that is adapted."""
+    train = tiny.cameras(3, width=2 * tiny.WIDTH, height=2 * tiny.HEIGHT)
+    return tiny.scene(tmp_path_factory.mktemp("scene"), train=train, seed=5)
+
+
+@pytest.fixture
+def scene(folder):
+    return load_scene(folder)
+
+
+def test_images_are_brought_to_the_density_of_the_base(scene):
+    real = Photographs(scene, tiny.cameras()[0], BLACK)
+    assert [camera.size for camera in real.cameras] == [(24, 32)] * 3
+    photograph = scene.image(scene.split("train")[1], BLACK)
+    torch.testing.assert_close(real(real.cameras[1]), resize(photograph, (24, 32), "pil-bicubic").clamp(0, 1))
+    assert real(tiny.cameras()[0]) is None
+
+
+def test_the_truth_is_the_image_where_there_is_one_and_the_bases_elsewhere(scene):
+    real, other = Photographs(scene, tiny.cameras()[0], BLACK), tiny.cameras(1)[0]
+    truth = PseudoTruth(tiny.model(), ReferenceBackend(), Effects(1), 2, recipe("default", 2), real)
+    assert torch.equal(truth(real.cameras[0]), real(real.cameras[0]))
+    torch.testing.assert_close(truth(other), ReferenceBackend().render(tiny.gaussians(), other, Effects(1)).image.clamp(0, 1))
+
+
+def test_adapting_to_images_says_so_and_leads_elsewhere(scene):
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    settings = dict(steps=3, extra_views=1)
+    adapted, alone = model.adapt(2, images=scene, **settings), model.adapt(2, **settings)
+    assert adapted.report.views == "3 train views and 1 around them, 3 of them real images"
+    assert not torch.equal(adapted.model.parameters()["sh0"], alone.model.parameters()["sh0"])
+
+
+def test_images_that_cannot_take_part_are_refused(scene):
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    for scale, settings in ((1 / 2, {}), (2, dict(compare_at="target"))):
+        with pytest.raises(SettingsError, match="real images take part only in a zoom-in"):
+            model.adapt(scale, images=scene, **settings)
+    with pytest.raises(SettingsError, match="the checkpoint has no cameras, so that the scale of the images is not known"):
+        wrap_model(tiny.model(), backend="reference").adapt(2, images=scene)
+
+
+def test_a_scene_without_training_images_is_refused(tmp_path):
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    with pytest.raises(SettingsError, match="there are no training images to adapt to"):
+        model.adapt(2, images=load_scene(tiny.scene(tmp_path / "tests_only")))
+
+
+def test_the_command_takes_a_folder_of_images(folder, tmp_path, capsys):
+    base = tiny.folder(tmp_path / "base")
+    words = ["adapt", base, "--scale", "2", "--images", folder, "--steps", "1", "--backend", "reference"]
+    assert main([str(word) for word in words]) == 0
+    assert "3 of them real images" in capsys.readouterr().out
