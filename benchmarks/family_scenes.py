@@ -85,7 +85,7 @@ FAMILIES = {
     "deformable": Family(
         "Deformable-3D-Gaussians", "needs its folder; the field stays frozen", lambda folder: moving.write_deformable(folder, count=SPLATS), True
     ),
-    "hexplane": Family("4DGaussians", "`empty_voxel` and `grid_pe` are refused", lambda folder: moving.write_hexplane(folder, count=SPLATS), True),
+    "4dgs": Family("4DGaussians", "`empty_voxel` and `grid_pe` are refused", lambda folder: moving.write_hexplane(folder, count=SPLATS), True),
     "mip": Family("Mip-Splatting", "keeps its own filter, so its own viewer is needed", _filtered("mip")),
     "gof": Family("GOF", "drawn as EWA splats, an approximation", _filtered("gof")),
     "analytic": Family("Analytic-Splatting", "as Mip-Splatting", _filtered("analytic")),
