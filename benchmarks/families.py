@@ -40,7 +40,8 @@ Made by `python benchmarks/families.py`: checkpoints in the families' own format
 PSNR against true pictures: each scene's world is known, and is drawn without any dilation, sixteen times finer than x1, and averaged (at x1/4 the
 picture of x1 is resized as photographs are, by Pillow's bicubic). The base has as many splats as its world and was trained on the pictures of
 x1 in the family's own filter, so that gains are larger than on photographs. An entry reads: the base as it is → what the adapted file shows,
-on the {TRAIN_VIEWS} views adapted to · on {HELD_OUT_VIEWS} views that nothing was trained or adapted on. Recipe `default`; seconds on one thread of a shared, busy machine.
+on the {TRAIN_VIEWS} views adapted to · on {HELD_OUT_VIEWS} views that nothing was trained or adapted on. Recipe `default`; seconds on one thread of a
+shared, busy machine.
 """
 
 T = TypeVar("T")
