@@ -99,7 +99,8 @@ def test_outside_libraries_stay_in_their_modules(path):
 
 
 def test_importing_the_package_loads_nothing_optional():
-    optional = "numba", "llvmlite", "gsplat", "triton", "matplotlib", "spandrel", "pycolmap", "pytest", "skimage", "tyro"
+    optional = ["numba", "llvmlite", "gsplat", "triton", "matplotlib", "pycolmap", "pytest", "skimage", "tyro"]
+    optional += ["spandrel", "safetensors", "lpips", "torchvision"]
     code = f"import sys, mipmap_plugin; print([name for name in {optional} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"
