@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,11 @@ from mipmap_plugin.files import new_file
 
 # Marks by what a point is; colors by its name, so that a name is the same in both pictures.
 MARKS = {"base": "X", "filter": "o", "supersampling": "s", "adapted": "D", "renderer": "."}
+
+# Seconds below which the axis is linear, so that 0 is on it.
+BRIEF = 0.1
+
+TITLE_WIDTH = 95  # letters
 
 NO_MATPLOTLIB = "pictures need matplotlib: pip install 'mipmap-plugin[plot]', or ask for none (--no-picture)"
 
@@ -27,7 +33,10 @@ def figure_class() -> Any:
 
 
 def draw(path: Path, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
-    """Write a PNG, a row for each scale. Raises OutputExists, OutputError, and SettingsError without matplotlib."""
+    """Write a PNG: a row for each scale, with the seconds on the left and the frames on the right.
+
+    Raises OutputExists, OutputError, and SettingsError without matplotlib.
+    """
     figure = figure_class()(figsize=(15, 5.4 * len(tradeoffs)), layout="constrained")
     for (left, right), each in zip(figure.subplots(len(tradeoffs), 2, squeeze=False, sharey="row"), tradeoffs, strict=True):
         colors = _colors(each.points)
@@ -50,12 +59,11 @@ def _seconds(axes: Any, each: Tradeoff, colors: dict[str, Any]) -> None:
             axes.plot([seconds(p) for p in part], [p.psnr_db.median for p in part], color=colors[name], linewidth=1, alpha=0.6)
             for point in part:
                 _mark(axes, point, point.adapt_seconds, colors[name], None)
-    spent = [seconds(point) for point in each.points if seconds(point) > 0]
-    axes.set_xscale("symlog", linthresh=min(spent, default=1.0))
+    axes.set_xscale("symlog", linthresh=BRIEF, linscale=0.3)
     axes.set_xlim(left=0)
     axes.set_xlabel("seconds to adapt (dotted: nothing to adapt, but only in a renderer that has it)")
     axes.set_ylabel(each.truth, fontsize=8)
-    axes.set_title(f"x{each.scale:g}: {each.sentences()[0]}", fontsize=9, wrap=True)
+    _title(axes, each, 0)
     _front(axes, files(each.points), seconds)
 
 
@@ -65,8 +73,12 @@ def _frames(axes: Any, each: Tradeoff, colors: dict[str, Any]) -> None:
         _mark(axes, point, point.ms_per_frame, colors[point.name], f"{point.name}, {point.backend}: {point.psnr_db.median:.1f} dB")
     axes.set_xscale("log")
     axes.set_xlabel("milliseconds a frame")
-    axes.set_title(f"x{each.scale:g}: {each.sentences()[1]}", fontsize=9, wrap=True)
+    _title(axes, each, 1)
     _front(axes, frames(each.points), milliseconds)
+
+
+def _title(axes: Any, each: Tradeoff, nth: int) -> None:
+    axes.set_title(textwrap.fill(f"x{each.scale:g}: {each.sentences()[nth]}", TITLE_WIDTH), fontsize=9)
 
 
 def _mark(axes: Any, point: Point, cost: Spread, color: Any, label: str | None) -> None:
