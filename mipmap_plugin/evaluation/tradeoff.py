@@ -95,8 +95,6 @@ class Plan:
 
 def measure(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> Iterator[Point]:
     """Each point as soon as it is measured. Raises SettingsError and BackendUnavailable."""
-    if scale == 1:
-        raise SettingsError("at scale 1 the base is right as it is, and nothing is to be traded; give another scale")
     runs = [(name, steps, backend) for backend in plan.backends for name in plan.recipes for steps in plan.steps or (None,)]
     free = [way for backend in plan.backends for way in _free_ways(on_backend(model, backend), scale, plan.supersampling)]
     free = [way for way in free if not (yardstick.is_resized_base and way[1] == RESIZED)]  # it is the truth

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.tradeoff import Plan, measure
 from mipmap_plugin.evaluation.tradeoff_files import write
 from mipmap_plugin.evaluation.tradeoff_front import Tradeoff
@@ -21,6 +22,8 @@ def run(
     Ctrl-C raises Interrupted after what was measured until then is written. Raises SettingsError, BackendUnavailable, OutputExists
     and OutputError.
     """
+    if 1 in scales:
+        raise SettingsError("at scale 1 the base is right as it is, and nothing is to be traded; give another scale")
     yardsticks = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
     found = [Tradeoff(scale, yardstick.label, []) for scale, yardstick in zip(scales, yardsticks, strict=True)]
     try:

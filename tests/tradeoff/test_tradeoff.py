@@ -12,6 +12,7 @@ import torch
 
 from mipmap_plugin import cli
 from mipmap_plugin.backends.filters import SCREEN_FILTERS
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.evaluation import tradeoff as measuring
 from mipmap_plugin.evaluation.tradeoff import LOOKS, RENDERERS, Plan, measure
@@ -121,13 +122,21 @@ def test_the_base_resized_stands_beside_photographs(tmp_path):
     assert "base, resized" in [point.name for point in measure(model, yardstick, 1 / 4, replace(PLAN, recipes=()))]
 
 
-def test_measuring_is_not_billed():
+def test_measuring_is_not_billed(monkeypatch):
     model = wrapped()
     yardstick = base_itself(model, 1 / 4, 1)
-    nap = 0.3  # seconds, and a run is looked at three times and once more at its end
-    slow = replace(yardstick, psnr=lambda *pair: (time.sleep(nap), yardstick.psnr(*pair))[1])
-    end = list(measure(model, slow, 1 / 4, replace(PLAN, repeats=1)))[-1]
-    assert end.adapt_seconds.median < 2 * nap and end.ms_per_frame.median < 1000 * nap
+    now, draw = [0.0], ReferenceBackend.render  # seconds: each image takes one, and each look at its quality a thousand
+
+    def passes(seconds, result):
+        now[0] += seconds
+        return result
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(ReferenceBackend, "render", lambda *scene: passes(1, draw(*scene)))
+    slow = replace(yardstick, psnr=lambda *pair: passes(1000, yardstick.psnr(*pair)))
+    points = list(measure(model, slow, 1 / 4, replace(PLAN, repeats=1)))
+    assert points[0].ms_per_frame.median == points[-1].ms_per_frame.median == 1000
+    assert 6 <= points[-1].adapt_seconds.median < 100
 
 
 def test_the_first_use_of_a_backend_is_not_billed(monkeypatch):
@@ -143,10 +152,11 @@ def test_the_first_use_of_a_backend_is_not_billed(monkeypatch):
     assert asked == [(1, "warm-up"), (6, "measured"), (6, "measured")]
 
 
-def test_scale_one_has_nothing_to_trade():
-    model = wrapped()
+def test_scale_one_has_nothing_to_trade(tmp_path, monkeypatch):
+    monkeypatch.setattr(measuring, "_judged", lambda *_: pytest.fail("it is refused before anything is measured"))
     with pytest.raises(SettingsError, match="give another scale"):
-        list(measure(model, base_itself(model, 1, 1), 1, PLAN))
+        run(wrapped(), None, [1 / 4, 1], PLAN, 1, tmp_path, picture=False, overwrite=False)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("wrong", [dict(repeats=0), dict(supersampling=(1,))])
