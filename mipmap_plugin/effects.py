@@ -20,6 +20,9 @@ MIN_TRANSMITTANCE = 1e-4  # a pixel this opaque is finished
 
 TILE = 16  # px
 
+# Screen filters that integrate over the pixel, or over what is seen through it.
+INTEGRATED = frozenset({"analytic", "window"})
+
 # Screen filters that dim what they widen.
 COMPENSATED = frozenset({"antialiased", "mip"})
 
@@ -45,7 +48,7 @@ class Effects:
     """
 
     sh_degree: int = 3  # bands above it are not evaluated
-    screen_filter: str = "classic"  # "classic" dilates; "antialiased", "mip" also keep a splat's light; "analytic" integrates over pixels
+    screen_filter: str = "classic"  # "classic" dilates; "antialiased", "mip" also keep a splat's light; the rest integrate
     eps2d: float = DILATION  # px²
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear RGB
     supersampling: int = 1  # N: N x N samples per pixel, averaged
@@ -94,7 +97,7 @@ def enlarges(config: AdaptConfig, scale: float) -> bool:
 
 
 def _of_rendering(effects: Effects, gaussians: Gaussians) -> list[Effect]:
-    integrates, n, given = effects.screen_filter == "analytic", effects.supersampling, gaussians.covariances is not None
+    integrates, n, given = effects.screen_filter in INTEGRATED, effects.supersampling, gaussians.covariances is not None
     size = "over the area of a pixel" if integrates else f"{effects.eps2d:g} px²"
     exponentials = "five exponentials more for each splat on each pixel" if integrates else "two sums and a determinant a splat"
     extra = "two products of matrices a splat"

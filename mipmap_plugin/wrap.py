@@ -26,7 +26,7 @@ from mipmap_plugin.adaptation.resume import Keeper
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.backends import choose_backend, supersample
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
-from mipmap_plugin.backends.filters import USUAL_EPS2D
+from mipmap_plugin.backends.filters import INTEGRALS, USUAL_EPS2D
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig, Recipe
 from mipmap_plugin.config import recipe as make_config
@@ -77,14 +77,18 @@ class Wrapped:
         """How this model is rendered at `scale`.
 
         `screen_filter`: None for what it was trained with, a filter's name, or "scaled" for the training-free filter
-        whose dilation keeps its size in the world.
+        whose dilation keeps its size in the world. The filters that integrate over the pixel see splats so dilated too: a
+        classic model was trained to look right with it.
         """
         trained = self.trained
         degree = self._needs.sh_degree
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
-        return Effects(degree, screen_filter, USUAL_EPS2D.get(screen_filter, DILATION), self.background, supersampling, trained.near_plane)
+        eps2d = USUAL_EPS2D.get(screen_filter, DILATION)
+        if screen_filter in INTEGRALS and trained.screen_filter == "classic":
+            eps2d = trained.eps2d * scale**2
+        return Effects(degree, screen_filter, eps2d, self.background, supersampling, trained.near_plane)
 
     def backend(self, *, gradients: bool = False, screen_filter: str | None = None) -> tuple[Backend, str]:
         """The backend that serves this model, and why it was taken."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 
+import numpy as np
 import torch
 
 
@@ -19,11 +20,11 @@ def brute_force(gaussians, camera, eps2d=0.3, background=(0.0, 0.0, 0.0), screen
     image = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
     through = torch.ones(camera.height, camera.width, dtype=torch.float64)
     done = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    see = ThroughWindows() if screen_filter == "window" else partial(alone, FALLOFFS[screen_filter])
     for i in order:
         covariance, mean = project_one(g, i, p[i], camera)
         offset = torch.stack([xs - mean[0], ys - mean[1]], -1)
-        alpha = (g.opacities[i] * FALLOFFS[screen_filter](covariance, offset, eps2d)).clamp_max(0.99)
-        alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+        alpha = see(covariance, offset, eps2d, g.opacities[i])
         done = done | ((through * (1 - alpha) < 1e-4) & (alpha > 0))
         alpha = torch.where(done, 0.0, alpha)
         image = image + (through * alpha)[..., None] * color_one(g, i, camera)
@@ -38,9 +39,43 @@ def dilated(covariance, offset, eps2d, least_light=1.0):
     return light * torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(wider), offset))
 
 
-def integrated(covariance, offset, _):
-    """FORMATS.md 6.4: the Gaussian times its area, integrated over squares that lie along its axes."""
-    variances, axes = torch.linalg.eigh(covariance)
+def alone(falloff, covariance, offset, eps2d, opacity):
+    """Alpha of a splat that does not depend on those in front."""
+    alpha = (opacity * falloff(covariance, offset, eps2d)).clamp_max(0.99)
+    return torch.where(alpha >= 1 / 255, alpha, 0.0)
+
+
+class ThroughWindows:
+    """Gaussian Blending with windows kept within a pixel of the centers, its integrals as sums over many points."""
+
+    def __init__(self):
+        self.center, self.width = torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+        nodes, weights = np.polynomial.legendre.leggauss(64)
+        self.nodes, self.weights = torch.from_numpy(nodes) / 2, torch.from_numpy(weights) / 2
+
+    def __call__(self, covariance, offset, eps2d, opacity):
+        variances, axes = torch.linalg.eigh(covariance + eps2d * torch.eye(2, dtype=torch.float64))
+        if axes[0, 0].abs() < axes[0, 1].abs():  # the first axis is the one nearer to x
+            variances, axes = variances.flip(0), axes.flip(1)
+        s = self.width[..., None] * self.nodes
+        share = self.weights * torch.exp(-0.5 * (((offset + self.center) @ axes)[..., None] + s) ** 2 / variances[:, None])
+        p, m, q = (moment.sum(-1) for moment in (share, s * share, s**2 * share))
+        opacity = (0.99 / p.prod(-1).clamp_min(0.5)).clamp_max(opacity)  # where it is less, 0.99 is out of reach
+        alpha = opacity * p.prod(-1)
+        hidden, rest = opacity[..., None] * p.flip(-1), 1 - alpha[..., None]
+        mean = -hidden * m / rest
+        variance = (self.width**2 / 12 - hidden * q) / rest - mean**2
+        width = (12 * variance.clamp_min(1e-3)).sqrt().clamp_max(2)
+        center = self.center + mean @ axes.T
+        center = torch.minimum(torch.maximum(center, width / 2 - 1), 1 - width / 2)
+        seen = alpha[..., None] >= 1 / 255
+        self.center, self.width = torch.where(seen, center, self.center), torch.where(seen, width, self.width)
+        return torch.where(seen[..., 0], alpha, 0.0)
+
+
+def integrated(covariance, offset, eps2d):
+    """The Gaussian times its area, integrated over squares that lie along its axes."""
+    variances, axes = torch.linalg.eigh(covariance + eps2d * torch.eye(2, dtype=torch.float64))
     places, sigmas = offset @ axes, variances.sqrt()
     return 2 * math.pi * (sigmas * (below((places + 0.5) / sigmas) - below((places - 0.5) / sigmas))).prod(-1)
 

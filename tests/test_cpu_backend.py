@@ -65,7 +65,7 @@ def assert_gradients_close(actual, expected, relative=2e-5):
 
 
 @needs_numba
-@pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic"])
+@pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic", "window"])
 @pytest.mark.parametrize("view", [camera(), WIDE], ids=["one-tile", "many-tiles"])
 def test_equals_a_sum_over_every_pixel(view, screen_filter):
     g = leaf(gaussians(80, dtype=torch.float32).to(dtype=torch.float64))  # the same numbers in both precisions
@@ -117,7 +117,7 @@ def test_covariances_need_not_be_symmetric_to_have_their_gradient():
 
 
 @needs_numba
-@pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic"])
+@pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic", "window"])
 def test_the_number_of_threads_changes_no_bit(screen_filter):
     g = gaussians(2000)
     results = []

@@ -29,8 +29,9 @@ def test_equals_a_sum_over_every_pixel(screen_filter, eps2d):
     effects = Effects(1, screen_filter, eps2d, (0.2, 0.5, 0.9))
     rendered = BACKEND.render(g, view, effects)
     image, alpha = brute_force(g, view, eps2d, effects.background, screen_filter)
-    torch.testing.assert_close(rendered.image, image, atol=1e-10, rtol=0)
-    torch.testing.assert_close(rendered.alpha, alpha, atol=1e-10, rtol=0)
+    error = 1e-7 if screen_filter == "window" else 1e-10  # sums over five points instead of many
+    torch.testing.assert_close(rendered.image, image, atol=error, rtol=0)
+    torch.testing.assert_close(rendered.alpha, alpha, atol=error, rtol=0)
 
 
 def test_float32_equals_float64_but_for_pixels_on_a_cut_off():

@@ -27,7 +27,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.filters import SQUARE_VARIANCE, footprint, keeps_light, widening
+from mipmap_plugin.backends.filters import INTEGRALS, SQUARE_VARIANCE, footprint, keeps_light, widening
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -92,7 +92,7 @@ def _light(gaussians: Gaussians, views: Sequence[Camera], effects: Effects) -> T
     if not keeps_light(effects.screen_filter):
         return 1.0
     # An integral over the pixel dims as a Gaussian of the pixel's variance does.
-    name = "mip" if effects.screen_filter == "analytic" else effects.screen_filter
+    name = "mip" if effects.screen_filter in INTEGRALS else effects.screen_filter
     ones = torch.ones_like(gaussians.opacities)
     return _mean_in_front(gaussians, views, effects.near_plane, lambda _, shown: footprint(shown, ones, name, _width(effects)).opacities)
 

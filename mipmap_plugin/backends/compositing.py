@@ -33,7 +33,19 @@ class Splats:
     feet: Tensor  # [M, F], what `alpha` needs of each
     colors: Tensor  # [M, 3]
     least_alpha: Tensor  # [M], below it a splat is not drawn
-    alpha: Callable[[Tensor, Tensor, Tensor], Tensor]  # (feet [..., F], dx, dy px from the center) -> alpha
+    # (feet [B, K, 1, F], dx, dy [B, K, P] px from the centers, least [B, K, 1]) -> alpha [B, K, P] of K splats one behind the other
+    alphas: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+    room: int = 1  # how many times the memory of a Gaussian `alphas` takes
+
+
+def alone(alpha: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
+    """`Splats.alphas` of splats whose alpha does not depend on those in front."""
+
+    def alphas(feet: Tensor, dx: Tensor, dy: Tensor, least: Tensor) -> Tensor:
+        found = alpha(feet, dx, dy).clamp_max(MAX_ALPHA)
+        return torch.where(found >= least, found, 0.0)
+
+    return alphas
 
 
 def composite(splats: Splats, extents: Tensor, camera: Camera, settings: RenderSettings) -> tuple[Tensor, Tensor]:
@@ -44,8 +56,8 @@ def composite(splats: Splats, extents: Tensor, camera: Camera, settings: RenderS
     # The empty sum ties the image to the splats even where none is drawn: its gradient is then 0, not an error.
     color = splats.colors[:0].sum() + splats.colors.new_zeros(rows * columns, tile**2, 3)
     through = splats.colors.new_ones(rows * columns, tile**2)
-    parts = (splats.alpha, splats.means2d, splats.feet, splats.colors, splats.least_alpha, settings.min_transmittance)
-    for tiles, ids in _batches(starts, members, tile**2):
+    parts = (splats.alphas, splats.means2d, splats.feet, splats.colors, splats.least_alpha, settings.min_transmittance)
+    for tiles, ids in _batches(starts, members, splats.room * tile**2):
         pixels = _pixel_centers(tiles, columns, tile).to(splats.colors)
         if torch.is_grad_enabled():
             batch = checkpoint(_composite_batch, *parts, ids, pixels, use_reentrant=False, preserve_rng_state=False)
@@ -87,14 +99,13 @@ def _batches(starts: Tensor, members: Tensor, pixels: int) -> Iterator[tuple[Ten
 
 
 def _composite_batch(
-    falloff: Callable, means2d: Tensor, feet: Tensor, colors: Tensor, least: Tensor, stop: float, ids: Tensor, pixels: Tensor
+    alphas: Callable, means2d: Tensor, feet: Tensor, colors: Tensor, least: Tensor, stop: float, ids: Tensor, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:
     """One batch of tiles: ids [B, K], pixels [B, P, 2] -> color [B, P, 3], transmittance [B, P]."""
     shown = (ids >= 0)[:, :, None]
     ids = ids.clamp_min(0)
     dx, dy = (pixels[:, None] - means2d[ids][:, :, None]).unbind(-1)  # [B, K, P]
-    alpha = falloff(feet[ids][:, :, None], dx, dy).clamp_max(MAX_ALPHA)
-    alpha = torch.where(shown & (alpha >= least[ids][:, :, None]), alpha, 0.0)
+    alpha = torch.where(shown, alphas(feet[ids][:, :, None], dx, dy, least[ids][:, :, None]), 0.0)
     after = torch.cumprod(1 - alpha, dim=1)
     open_ = after.detach() >= stop  # a pixel stops before the splat that would finish it
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)

@@ -23,7 +23,9 @@ class CpuBackend:
     api_version = API_VERSION
     speed = 10
     capabilities = Capabilities(
-        devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased", "mip", "analytic"})
+        devices=frozenset({"cpu"}),
+        dtypes=frozenset({torch.float32}),
+        screen_filters=frozenset({"classic", "antialiased", "mip", "analytic", "window"}),
     )
 
     def lacking(self, needs: Needs) -> list[str]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.pixel_integral import PixelIntegral, pixel_integral
+from mipmap_plugin.backends.pixel_integral import PixelIntegral, integral_of
 from mipmap_plugin.backends.projection import Projected
+from mipmap_plugin.backends.window import WindowIntegral
 from mipmap_plugin.effects import DILATION
 
 # The least share of its opacity that a compensating filter leaves to a splat. Below it the gradient is cut off, and light is too bright.
@@ -17,8 +18,11 @@ from mipmap_plugin.effects import DILATION
 # whose det is below 1e-6 px⁴ at once, which here fades.
 LEAST_LIGHT = {"classic": 1.0, "antialiased": 0.005, "mip": 0.001}
 
-# px², what each filter dilates by where nobody says otherwise. "analytic" integrates over the pixel instead.
-USUAL_EPS2D = {"classic": DILATION, "antialiased": DILATION, "mip": 0.1, "analytic": 0.0}
+# px², what each filter dilates by where nobody says otherwise. Those that integrate over the pixel need none of their own.
+USUAL_EPS2D = {"classic": DILATION, "antialiased": DILATION, "mip": 0.1, "analytic": 0.0, "window": 0.0}
+
+# What integrates instead of looking at the center of the pixel.
+INTEGRALS = {"analytic": PixelIntegral, "window": WindowIntegral}
 
 SCREEN_FILTERS = frozenset(USUAL_EPS2D)
 
@@ -29,7 +33,7 @@ SQUARE_VARIANCE = 1 / 12
 
 def widening(screen_filter: str, eps2d: float) -> float:
     """px²: the variance that a filter adds to a splat, along every direction."""
-    return SQUARE_VARIANCE if screen_filter == "analytic" else eps2d
+    return eps2d + SQUARE_VARIANCE if screen_filter in INTEGRALS else eps2d
 
 
 def keeps_light(screen_filter: str) -> bool:
@@ -76,12 +80,12 @@ def footprint(projected: Projected, opacities: Tensor, screen_filter: str, eps2d
     """What the screen filter makes of splats.
 
     "classic" dilates by `eps2d` px²; "antialiased" and "mip" also scale the opacity so that the splat's light stays what it
-    was; "analytic" integrates the splat over each pixel, whatever `eps2d` is.
+    was; "analytic" and "window" dilate, and integrate the splat over each pixel or what is seen through it.
     """
-    if screen_filter == "analytic":
-        return pixel_integral(projected, opacities)
     xx, yy = projected.xx + eps2d, projected.yy + eps2d
     det = projected.det + eps2d * (projected.xx + projected.yy) + eps2d**2  # = xx·yy - xy² without its cancellation
+    if screen_filter in INTEGRALS:
+        return integral_of(INTEGRALS[screen_filter], (xx, projected.xy, yy, det), opacities)
     if keeps_light(screen_filter):
         opacities = opacities * (projected.det / det).clamp_min(LEAST_LIGHT[screen_filter] ** 2).sqrt()
     return Footprint(yy, projected.xy / yy, det / yy, xx, opacities)

@@ -17,8 +17,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.projection import Projected
-
 # S(x) = 1 / (1 + exp(-x·(LINEAR + CUBIC·x²))), within 4e-4 of the normal distribution.
 LINEAR, CUBIC = 1.6, 0.07
 
@@ -68,9 +66,9 @@ class PixelIntegral:
         return (reach[:, None] * torch.stack([self.xx, self.yy], -1).sqrt() + pixel[:, None]).detach()
 
 
-def pixel_integral(projected: Projected, opacities: Tensor) -> PixelIntegral:
-    """The axes of every splat. Round ones lie along x and y, and have no gradient of their direction."""
-    xx, xy, yy = projected.xx, projected.xy, projected.yy
+def integral_of(kind: type[PixelIntegral], covariance: tuple[Tensor, Tensor, Tensor, Tensor], opacities: Tensor) -> PixelIntegral:
+    """`kind` with the axes of every splat, from (xx, xy, yy, det). Round ones lie along x and y, and have no gradient of their direction."""
+    xx, xy, yy, det = covariance
     mean, half = (xx + yy) / 2, (xx - yy) / 2
     is_round = half.square() + xy.square() <= (ROUND * mean).square()
     # `where` before the root and the angle as well as after: their gradients at 0 are infinite, and infinity times zero is NaN.
@@ -78,7 +76,7 @@ def pixel_integral(projected: Projected, opacities: Tensor) -> PixelIntegral:
     spread = torch.where(is_round, 0.0, (half.square() + xy.square()).sqrt())
     angle = torch.atan2(xy, half) / 2
     longer = mean + spread
-    return PixelIntegral(longer.sqrt(), (projected.det / longer).sqrt(), angle.cos(), angle.sin(), opacities, xx=projected.xx, yy=yy)
+    return kind(longer.sqrt(), (det / longer).sqrt(), angle.cos(), angle.sin(), opacities, covariance[0], yy)
 
 
 def integral(u: Tensor, sigma: Tensor) -> Tensor:

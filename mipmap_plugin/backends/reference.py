@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.compositing import Splats, composite
+from mipmap_plugin.backends.compositing import Splats, alone, composite
 from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
 from mipmap_plugin.backends.harmonics import colors
 from mipmap_plugin.backends.pixel_integral import PixelIntegral
 from mipmap_plugin.backends.projection import Projected, project
+from mipmap_plugin.backends.window import WindowIntegral
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
@@ -37,7 +38,9 @@ class ReferenceBackend:
         degree = min(effects.sh_degree, gaussians.sh_degree)
         rgb = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), degree)
         least = least_alpha(feet, effects.settings)
-        color, through = composite(Splats(projected.means2d, feet.packed(), rgb, least, feet.alpha), feet.extents(least), camera, effects.settings)
+        alphas, room = (feet.alphas, feet.ROOM) if isinstance(feet, WindowIntegral) else (alone(feet.alpha), 1)
+        splats = Splats(projected.means2d, feet.packed(), rgb, least, alphas, room)
+        color, through = composite(splats, feet.extents(least), camera, effects.settings)
         return Rendered(color + through[..., None] * color.new_tensor(effects.background), 1 - through)
 
 

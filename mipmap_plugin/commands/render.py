@@ -23,7 +23,7 @@ def render(
     output: Path,
     scale: Scale = 1.0,
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    screen_filter: Literal["trained", "scaled", "classic", "antialiased", "mip", "analytic"] = "trained",
+    screen_filter: Literal["trained", "scaled", "classic", "antialiased", "mip", "analytic", "window"] = "trained",
     supersampling: int = 1,
     cameras: Path | None = None,
     background: Background | None = None,

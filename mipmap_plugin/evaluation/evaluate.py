@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import Recipe
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, resized_base, test_views
@@ -85,12 +85,22 @@ def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: st
     def resized(by: str) -> Callable[[Camera], Tensor]:
         return lambda camera: resized_base(model.render(camera).image.clamp(0, 1), camera.zoomed(scale).size, by)
 
-    shows = {"naive": filtered(None), "scaled": filtered("scaled"), "antialiased": filtered("antialiased"), "resized base": resized("bicubic")}
+    served = [name for name in ("scaled", "window", "antialiased") if _served(model, name)]
+    shows = {"naive": filtered(None), **{name: filtered(name) for name in served}, "resized base": resized("bicubic")}
     if scale > 1 and upsampler != "bicubic":
         shows[f"base upsampled by {Path(upsampler).name}"] = resized(upsampler)
     if scale == 1:
         shows = {"base": filtered(None)}
     return [judge.row(name, scale, show, gaussians=count) for name, show in shows.items()]
+
+
+def _served(model: Wrapped, screen_filter: str) -> bool:
+    """Whether the backend that was asked for has the filter."""
+    try:
+        model.backend(screen_filter=screen_filter)
+    except BackendUnavailable:
+        return False
+    return True
 
 
 def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:

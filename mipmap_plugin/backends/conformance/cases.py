@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from mipmap_plugin.backends.filters import USUAL_EPS2D
 from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, Effects
@@ -61,7 +62,7 @@ def odd_row(row: dict[str, Tensor], screen_filter: str = "classic") -> HardCase:
     row = {**_row(means=(0.1, 0.05, 2.5)), **row}
     held = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
     held = {name: tensor if name not in row else tensor.index_put((torch.tensor(5),), row[name]) for name, tensor in held.items()}
-    return HardCase(Gaussians(**held), view(), Effects(1, screen_filter, near_plane=NEAR))
+    return HardCase(Gaussians(**held), view(), Effects(1, screen_filter, USUAL_EPS2D[screen_filter], near_plane=NEAR))
 
 
 def seen_by(camera: Camera, screen_filter: str = "classic") -> HardCase:
@@ -81,7 +82,7 @@ def covariances_given(screen_filter: str, broken: bool = False) -> HardCase:
     given = covariances(gaussians)
     if broken:
         given[5, 0, 0] = math.nan
-    return HardCase(replace(gaussians, covariances=given), view(turned=True), Effects(1, screen_filter))
+    return HardCase(replace(gaussians, covariances=given), view(turned=True), Effects(1, screen_filter, USUAL_EPS2D[screen_filter]))
 
 
 def none_drawn(n: int) -> HardCase:
@@ -173,7 +174,7 @@ CAMERAS = {
 }
 BAD = (math.nan, math.inf)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
-FILTERS = ("classic", "antialiased", "mip", "analytic")
+FILTERS = ("classic", "antialiased", "mip", "analytic", "window")
 
 CASES: dict[str, Builder] = {
     **{f"{name}-{kind}": partial(odd_row, row, kind) for (name, row), kind in product(ROWS.items(), FILTERS)},

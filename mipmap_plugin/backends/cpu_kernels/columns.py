@@ -9,6 +9,7 @@ TIP = 10  # px from Y to the row where the splat reaches furthest right; as far 
 SPREAD = 11  # 1 / FALL_X
 # Of a splat that is integrated over pixels (`integrals`), those are of an ellipse around it, and it is itself in
 MASS = FALL_X  # opacity · 2π · both standard deviations, px²
+OPACITY = FALL_X  # instead, where it is seen through windows
 COS, SIN, PER_LONG, PER_SHORT = 12, 13, 14, 15  # the direction of its longer axis, and 1 / standard deviation, 1/px
 COLUMNS = 16  # a row is one cache line
 

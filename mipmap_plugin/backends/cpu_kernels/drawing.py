@@ -9,13 +9,15 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import compositing, projection, sorting
-from mipmap_plugin.backends.cpu_kernels.records import Frame, Lists, Splats, View
+from mipmap_plugin.backends.cpu_kernels import compositing, projection, sorting, window_tiles
+from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW, Frame, Lists, Splats, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.backends.filters import LEAST_LIGHT
 from mipmap_plugin.backends.projection import FRUSTUM_MARGIN
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+
+SEEN = {"analytic": SEEN_IN_PIXEL, "window": SEEN_IN_WINDOW}
 
 # float32 in a cache line.
 LINE = 16
@@ -41,7 +43,10 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
         threads.share(projection.project, count, view, splats, table, depths, counts)
         slots = np.concatenate([[0], np.cumsum(counts)])
         lists = sorting.tile_lists(table, depths, slots, width, height, threads)
-        threads.share(compositing.composite, len(lists.starts) - 1, view.integrated, table, lists, frame, image)
+        if view.seen == SEEN_IN_WINDOW:
+            threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, image)
+        else:
+            threads.share(compositing.composite, len(lists.starts) - 1, view.seen == SEEN_IN_PIXEL, table, lists, frame, image)
     return image, Drawing(view, table, slots, lists, frame)
 
 
@@ -50,7 +55,11 @@ def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np
     view, table, slots, lists, frame = drawing
     pulls, grads = _empty(len(lists.members), col.PULLS), Splats(*(_empty(*array.shape) for array in splats))
     with team() as threads:
-        threads.share(compositing.composite_back, len(lists.starts) - 1, view.integrated, table, lists, frame, (d_image, d_alpha), pulls)
+        if view.seen == SEEN_IN_WINDOW:
+            threads.share(window_tiles.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), pulls)
+        else:
+            integrated = view.seen == SEEN_IN_PIXEL
+            threads.share(compositing.composite_back, len(lists.starts) - 1, integrated, table, lists, frame, (d_image, d_alpha), pulls)
         threads.share(projection.project_back, len(splats.means), view, splats, table, slots, pulls, grads)
     return grads
 
@@ -76,7 +85,7 @@ def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
         near=float(effects.near_plane),
         eps2d=float(effects.eps2d),
         least_light=LEAST_LIGHT.get(effects.screen_filter, 1.0),
-        integrated=effects.screen_filter == "analytic",
+        seen=SEEN.get(effects.screen_filter, SEEN_AT_CENTER),
         sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
     )
 

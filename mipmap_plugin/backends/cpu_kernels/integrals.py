@@ -16,6 +16,9 @@ from mipmap_plugin.effects import MIN_ALPHA
 
 LOG2E = 1 / math.log(2)
 
+# A Gaussian of so many times the opacity is nowhere darker than the integral.
+BRIGHTER = BOUND * BOUND
+
 # px: from a pixel's center to its corner.
 CORNER = math.sqrt(0.5)
 
@@ -70,26 +73,32 @@ def grown(x):
 
 
 @inner
-def around(flat, along, opacity):
-    """A shape and an opacity whose ellipse alpha >= 1/255 holds all pixels that the splat touches.
+def around(flat, along, opacity, corner):
+    """A shape and an opacity whose ellipse alpha >= 1/255 holds all pixels within `corner` px of which the splat reaches that.
 
     The ellipse of reach r and the disc of radius c add up to no more than the one with (1 + k)·Σ + (1 + 1/k)·(c/r)², for any k.
     """
     xx, xy, yy, det = flat
-    bound = max(BOUND * BOUND * opacity, MARGIN * MIN_ALPHA)
+    bound = max(opacity, MARGIN * MIN_ALPHA)
     reach = math.sqrt(2 * math.log(bound / MIN_ALPHA))
-    corner = CORNER / reach
+    corner /= reach
     k = min(1.0, corner / along[3])
     a, e = 1 + k, (1 + 1 / k) * corner * corner
     return (a * xx + e, a * xy, a * yy + e, a * a * det + e * a * (xx + yy) + e * e), bound
 
 
 @inner
-def fill(along, opacity, table, i):
+def mass(along, opacity):
+    """opacity · 2π · both standard deviations, px²."""
+    return opacity * 2 * math.pi * along[2] * along[3]
+
+
+@inner
+def fill(along, mass, table, i):
     """Write what `alpha` needs of a splat."""
     cos, sin, long, short = along
     table[i, col.COS], table[i, col.SIN], table[i, col.PER_LONG], table[i, col.PER_SHORT] = cos, sin, 1 / long, 1 / short
-    table[i, col.MASS] = opacity * 2 * math.pi * long * short
+    table[i, col.MASS] = mass
 
 
 @inner

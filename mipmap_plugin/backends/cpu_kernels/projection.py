@@ -5,8 +5,9 @@ import math
 import numpy as np
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, integrals, kernel
+from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, integrals, kernel, windows
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
+from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, blend, dot, minus, plus, row, set_row, times
 from mipmap_plugin.effects import MIN_ALPHA
 
@@ -43,15 +44,21 @@ def project(start, stop, view, splats, table, depths, counts):
 def fill_shape(view, p, flat, opacity, table, i):
     """Write what a splat's ellipse is on the image; False where there is none to draw."""
     x, y = view.fx * p[0] / p[2] + view.cx, view.fy * p[1] / p[2] + view.cy
-    if not view.integrated:
-        dilated, light = ellipses.screen_filter(view, flat)
+    dilated, light = ellipses.screen_filter(view, flat)
+    if view.seen == SEEN_AT_CENTER:
         return fill_ellipse(x, y, dilated, opacity * light, table, i)
-    along = integrals.axes(flat)
-    if not integrals.brightest(along, opacity) >= MIN_ALPHA:
+    along = integrals.axes(dilated)
+    if view.seen == SEEN_IN_PIXEL:
+        mass, bound, corner = integrals.mass(along, opacity), integrals.BRIGHTER * opacity, integrals.CORNER
+        drawn = integrals.brightest(along, opacity) >= MIN_ALPHA
+    else:
+        mass, bound, corner = opacity, opacity, windows.CORNER
+        drawn = opacity >= MIN_ALPHA and along[3] * FAR > 1
+    if not drawn:
         return False
-    wider, bound = integrals.around(flat, along, opacity)
+    wider, bound = integrals.around(dilated, along, bound, corner)
     drawn = fill_ellipse(x, y, wider, bound, table, i)
-    integrals.fill(along, opacity, table, i)
+    integrals.fill(along, mass, table, i)
     return drawn
 
 
@@ -145,9 +152,9 @@ def add_up(pulls, first, last, pull):
 @inner
 def pull_shape(view, flat, opacity, pull):
     """Gradients of the shape before the screen filter, of the opacity, and of the place on the image."""
-    if view.integrated:
-        return pull_integral(flat, opacity, pull)
     dilated, light = ellipses.screen_filter(view, flat)
+    if view.seen != SEEN_AT_CENTER:
+        return pull_integral(view, flat, dilated, opacity, pull)
     _, xy, yy, det = dilated
     shear, per_yy, per_across = xy / yy, 1 / yy, yy / det
 
@@ -163,10 +170,11 @@ def pull_shape(view, flat, opacity, pull):
 
 
 @inner
-def pull_integral(flat, opacity, pull):
-    """As `pull_shape`, of a splat that is integrated over pixels."""
-    cos, sin, long, short = integrals.axes(flat)
-    d_flat = integrals.pull_axes(flat, pull[col.GROW_LONG], pull[col.GROW_SHORT], pull[col.TURN])
+def pull_integral(view, flat, dilated, opacity, pull):
+    """As `pull_shape`, of a splat that is integrated over pixels or windows."""
+    cos, sin, long, short = integrals.axes(dilated)
+    d_dilated = integrals.pull_axes(dilated, pull[col.GROW_LONG], pull[col.GROW_SHORT], pull[col.TURN])
+    d_flat = ellipses.pull_screen_filter(view, flat, dilated, 1.0, d_dilated, 0.0)
     d_u, d_v = pull[col.BY_LONG] / long, pull[col.BY_SHORT] / short
     return d_flat, pull[col.SUM] / opacity, sin * d_v - cos * d_u, -sin * d_u - cos * d_v
 

@@ -6,6 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+# What of a splat its alpha is: what lies at the pixel's center, or its mean over the pixel's square, or over the pixel's window.
+SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW = range(3)
+
 
 class View(NamedTuple):
     """A camera and the effects that concern a splat. Numbers alone, no arrays."""
@@ -26,7 +29,7 @@ class View(NamedTuple):
     near: float
     eps2d: float
     least_light: float  # the share of its opacity that compensation leaves at least; 1: there is no compensation
-    integrated: bool  # over each pixel's square, instead of dilated
+    seen: int  # one of the three above
     sh_degree: int
 
 
