@@ -46,7 +46,7 @@ class AdaptConfig(BaseModel):
     resize: ResizeFilter = Field("pil-bicubic", description="How the base image is made smaller; the filter of the protocol that is aimed at.")
     upsampler: str = Field("bicubic", description="How the base image is made larger, by name in the registry.")
     compare_at: Literal["target", "base", "both"] = Field("target", description="Zoom-in: with the upsampled base, with the base itself, or both.")
-    detail_weight: float = Field(0.01, ge=0, description="`both`: of the difference from the upsampled base, beside the square from the base.")
+    detail_weight: float = Field(0.1, ge=0, description="`both`: of the difference from the upsampled base, beside the square from the base.")
     upsampled_views: int = Field(50, gt=0, description="`both`: views at most, spread over those of the policy; each is upsampled.")
     quantize_truth: bool = Field(False, description="Round the pseudo truth to 8 bits, as files of PNG do.")
     truth_oversampling: int | None = Field(None, gt=0, description="Render the base at most this many times finer than the target; None: at its own.")
@@ -88,10 +88,10 @@ _DEFAULT_IN = dict(
     rates=LearningRates(opacities=0.02, networks=5e-4),
 )  # fmt: skip
 
-# With a super-resolution network there is something to learn at the new scale too, and more steps and bolder rates pay.
+# With a super-resolution network there is something to learn at the new scale too: more steps and bolder rates pay, LPIPS above all.
 _DEFAULT_UPSAMPLED = dict(
-    _DEFAULT_IN, steps=400, compare_at="both", resize="pil-bicubic", patience=None, views="train",
-    rates=LearningRates(means=4e-4, scales=0.015, quats=0.003, opacities=0.05, sh0=0.01, shN=0.001, networks=5e-4),
+    _DEFAULT_IN, steps=800, compare_at="both", resize="pil-bicubic", patience=None, views="train",
+    rates=LearningRates(scales=0.015, quats=0.003, opacities=0.05, sh0=0.01, shN=0.001, networks=5e-4),
 )  # fmt: skip
 
 # What knows nothing that the base does not: kernels.
