@@ -5,6 +5,7 @@ Run as `python worker.py FOLDER FIRST LAST NAME...`: damages FIRST to LAST of ea
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import random
 import resource
@@ -48,6 +49,7 @@ def damage(sample: Sample, file: Path, rng: random.Random, canary: Path) -> None
 def outcome(sample: Sample, path: Path) -> str:
     """How opening ended: "loaded", "refused: ...", or "fault: ..."."""
     signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    faulthandler.dump_traceback_later(10 * SECONDS, exit=True)  # compiled code does not hear the alarm
     try:
         (open_scene if sample.is_scene else open_checkpoint)(path)
         return "loaded"
@@ -58,6 +60,7 @@ def outcome(sample: Sample, path: Path) -> str:
         return f"fault: {type(error).__name__}: {str(error)[:200]} at {' < '.join(reversed(where))}"
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
+        faulthandler.cancel_dump_traceback_later()
 
 
 def address_space() -> int:
