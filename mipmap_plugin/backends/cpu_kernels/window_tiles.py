@@ -10,7 +10,7 @@ import numpy as np
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner, kernel, windows
-from mipmap_plugin.backends.cpu_kernels.binning import TILE_COLUMNS, TILE_ROWS
+from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, TILE_COLUMNS, TILE_ROWS
 from mipmap_plugin.backends.cpu_kernels.compositing import AHEAD, PATIENCE, bounds, close_tile, finished, open_tile, reopen_tile, trace
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, load, lowest, prefetch, ramp, select, spread, store, total
 from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, END, ENDS, LIGHT, PLANE, STATE, STRIDE, cover, uncover
@@ -73,9 +73,11 @@ def choose(mask, yes, no):
 
 
 @inner
-def look(splat, dx, dy, unfinished, color, n, at, state, kept, places, visits):
+def look(splat, room, dx, dy, unfinished, color, n, at, state, kept, places, visits):
     """Lay a splat over the 16 pixels at `at`, as their windows show it. 1 if it is seen at all, else 0."""
     window = load_windows(state, WINDOWS + at, PLANE)
+    if bits(both(unfinished, windows.reached(splat, room, dx, dy, window))) == 0:
+        return 0
     alpha, seen = windows.look(splat, dx, dy, window)
     bright = both(alpha >= MIN_ALPHA, unfinished)
     if bits(bright) == 0:
@@ -93,7 +95,7 @@ def look(splat, dx, dy, unfinished, color, n, at, state, kept, places, visits):
 def lay(table, i, n, box, state, kept, places, visits):
     """Lay splat i, the n-th of its tile, behind what is there. Where there is room in `kept`, keep the windows it was seen through."""
     color, splat = (table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]), windows.splat_of(table, i)
-    rows = trace(table, i, box, state)
+    room, rows = table[i, col.PEAK] - LOG_MIN_ALPHA, trace(table, i, box, state)
     while rows != 0:
         r = lowest(rows)
         rows &= rows - 1
@@ -103,7 +105,7 @@ def lay(table, i, n, box, state, kept, places, visits):
         while column <= end:
             unfinished = both(load(state, LIGHT + at) >= 0, end >= ramp(column))
             if bits(unfinished) != 0:
-                visits += look(splat, ramp(column - center), dy, unfinished, color, n, at, state, kept, places, visits)
+                visits += look(splat, room, ramp(column - center), dy, unfinished, color, n, at, state, kept, places, visits)
             column += WIDTH
             at += WIDTH
     return visits

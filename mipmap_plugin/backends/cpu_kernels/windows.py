@@ -21,12 +21,31 @@ CORNER = 2 * FARTHEST
 TAIL, TAILS = 0.2316419, (0.319381530, -0.356563782, 1.781477937, -1.821255978, 1.330274429)
 ROOT = math.sqrt(2 * math.pi)
 
+# log2, what rounding may take off a splat that just reaches a window.
+ROUNDING = 1e-3
+
 
 @inner
 def splat_of(table, i):
     """The direction of a splat's longer axis, whether that is nearer to y, 1 / standard deviation along it and across, and the opacity."""
     cos, sin = table[i, col.COS], table[i, col.SIN]
     return cos, sin, abs(cos) < abs(sin), table[i, col.PER_LONG], table[i, col.PER_SHORT], table[i, col.OPACITY]
+
+
+@inner
+def reached(splat, room, dx, dy, window):
+    """Which windows a splat may show 1/255 through: its Gaussian is nowhere higher in a window than at the point nearest to its center.
+
+    `room`: log2 of how far the splat's opacity lies above 1/255.
+    """
+    cos, sin, upright, per_long, per_short, _ = splat
+    x, y, width, height = window
+    dx, dy = dx + x, y + dy
+    u, v = fma(dx, cos, dy * sin), fma(dy, cos, dx * (0 - sin))
+    a, b = (height, width) if upright else (width, height)
+    along = maximum(maximum(u, 0 - u) - a * 0.5, 0) * per_long
+    across = maximum(maximum(v, 0 - v) - b * 0.5, 0) * per_short
+    return fma(along, along, across * across) * HALF_LOG2E < room + ROUNDING
 
 
 @inner
