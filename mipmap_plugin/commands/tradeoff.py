@@ -43,7 +43,7 @@ def tradeoff(
         recipe: default and paper, if none is given.
         steps: Optimizer steps at most, one run for each; what each recipe says, if none is given.
         backend: What to adapt and render with; auto, if none is given.
-        supersampling: N for N x N samples a pixel, beside the adapted models; 2, 4 and 8, if none is given.
+        supersampling: N for N x N samples a pixel, finer than the base's pixels left out; 2, 4 and 8, if none is given.
         renderers: Also draw the first adapted model with other cut-offs, tiles and float types, by the reference backend.
         repeats: Runs of each, with a seed of their own; the median and the whole range are shown.
         views: Views to judge on, at most.

@@ -3,6 +3,7 @@ needs no adapting. Measuring quality is not billed as adapting, and no view that
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -134,7 +135,8 @@ def _free_ways(model: Wrapped, scale: float, supersampling: Sequence[int]) -> li
     served = {name: _backend_for(model, name) for name in sorted(SCREEN_FILTERS - {model.trained.screen_filter})}
     ways: list[tuple[Kind, str, str, Show]] = [("base", "base as it is", own, rendered(None)), ("filter", "scaled filter", own, rendered("scaled"))]
     ways += [("filter", f"{name} filter", backend, rendered(name)) for name, backend in served.items() if backend]
-    ways += [("supersampling", f"{n} x {n} samples", own, rendered("scaled", n)) for n in supersampling]
+    enough = max(2, math.ceil(1 / scale))  # samples as fine as the base's own pixels; finer ones show nothing more
+    ways += [("supersampling", f"{n} x {n} samples", own, rendered("scaled", n)) for n in supersampling if n <= enough]
     ways += [("supersampling" if scale < 1 else "filter", RESIZED, own, resized)]
     return [(*way, count) for way in ways]
 

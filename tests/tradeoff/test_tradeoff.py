@@ -92,6 +92,12 @@ def test_everything_that_needs_no_adapting_stands_beside_the_adapted(points):
     assert all(point.adapt_seconds.high == 0 for point in points if point.kind in ("base", "filter", "supersampling"))
 
 
+@pytest.mark.parametrize(("scale", "samples"), [(1 / 4, [2, 4]), (4, [2])])
+def test_samples_finer_than_the_pixels_of_the_base_are_left_out(scale, samples):
+    ways = measuring._free_ways(wrapped(), scale, (2, 4, 8))
+    assert [name for kind, name, *_ in ways if kind == "supersampling" and "samples" in name] == [f"{n} x {n} samples" for n in samples]
+
+
 def test_a_run_is_looked_at_on_its_way_and_at_its_end(points):
     way = [point for point in points if point.kind == "adapted"]
     assert [point.step for point in way] == [step for step in LOOKS if step <= 6] + [None]
