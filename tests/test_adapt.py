@@ -27,7 +27,7 @@ from mipmap_plugin.wrap import Interrupted, wrap_model
 WHITE = (1.0, 1.0, 1.0)
 
 # A few steps in which everything happens: both ways to choose views, two views a step, points of the curve, and splats that are dropped.
-BRIEF = dict(steps=7, extra_views=2, check_every=2, prune_every=3, min_opacity=0.4, patience=None)
+BRIEF = dict(steps=7, views_per_step=2, merge_to=1.0, extra_views=2, check_every=2, prune_every=3, min_opacity=0.4, patience=None)
 BRIEF_PAPER = dict(steps=7, check_every=2, prune_every=3, densify_gradient=1e-9)
 
 
@@ -209,6 +209,17 @@ def test_a_run_interrupted_twice_equals_an_uninterrupted_one(tmp_path, ctrl_c):
         with pytest.raises(Interrupted):
             wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
     resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
+    assert torch.equal(shown(resumed), shown(whole))
+
+
+def test_a_resumed_run_merges_as_the_whole_one_did(tmp_path, ctrl_c):
+    merging = {**BRIEF, "merge_to": 0.5}
+    whole = wrapped().adapt(1 / 4, **merging)
+    ctrl_c(5)
+    with pytest.raises(Interrupted):
+        wrapped().adapt(1 / 4, resume=tmp_path / "state", **merging)
+    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **merging)
+    assert resumed.report.gaussians_after < resumed.report.gaussians_before
     assert torch.equal(shown(resumed), shown(whole))
 
 

@@ -10,7 +10,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.scenes import jittered, load_scene, orbit
-from mipmap_plugin.scenes.trajectories import guess_up, rotation_matrix, rotation_vector
+from mipmap_plugin.scenes.trajectories import BEYOND, guess_up, rotation_matrix, rotation_vector
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -131,23 +131,37 @@ def test_jittered_views_see_the_scene():
     assert all(in_view(camera, middle).all() for camera in jittered(ring(), 100, seeded()))
 
 
-def test_without_amount_the_views_lie_on_the_line_between_two_given_ones():
-    first, second = (camera.center for camera in ring(2))
-    left, right = (replace(camera, viewmat=ring(2)[0].viewmat.clone()) for camera in ring(2))
-    right.viewmat[:3, 3] = -right.viewmat[:3, :3] @ second
-    for view in jittered([left, right], 10, seeded(), amount=0.0):
-        along = (view.center - first).norm() + (view.center - second).norm()
-        torch.testing.assert_close(along, (second - first).norm())
+def test_parallel_cameras_have_views_on_the_line_through_both_and_a_little_beyond():
+    left = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
+    right = replace(left, viewmat=torch.eye(4, dtype=torch.float64))
+    right.viewmat[0, 3] = -2.0
+    centers = torch.stack([view.center for view in jittered([left, right], 50, seeded(), amount=0.0)])
+    assert torch.equal(centers[:, 1:], torch.zeros(50, 2, dtype=torch.float64))
+    assert centers[:, 0].min() >= -2 * BEYOND and centers[:, 0].max() <= 2 + 2 * BEYOND
+    assert centers[:, 0].min() < 0 < 2 < centers[:, 0].max()
 
 
-def test_halfway_rotations_turn_by_part_of_the_angle():
+def test_cameras_around_something_have_views_as_far_from_it_as_they_are():
+    focus = torch.linalg.lstsq(*sights(ring())).solution
+    given = torch.stack([(camera.center - focus).norm() for camera in ring()])
+    new = torch.stack([(view.center - focus).norm() for view in jittered(ring(), 50, seeded(), amount=0.0)])
+    torch.testing.assert_close(new, given.mean().expand(50))
+
+
+def sights(cameras: list[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
+    """The system whose solution is the point that all cameras look at."""
+    across = [torch.eye(3, dtype=torch.float64) - torch.outer(c.viewmat[2, :3], c.viewmat[2, :3]) for c in cameras]
+    return torch.cat(across), torch.cat([a @ c.center for a, c in zip(across, cameras, strict=True)])
+
+
+def test_rotations_turn_by_part_of_the_angle_and_a_little_beyond():
     turned = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
     turned.viewmat[:3, :3] = rotation_matrix(torch.tensor([0.0, 0.5, 0.0], dtype=torch.float64))
     straight = Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4))
     for view in jittered([straight, turned], 10, seeded(), amount=0.0):
         x, y, z = rotation_vector(view.viewmat[:3, :3]).tolist()
         assert (x, z) == pytest.approx((0, 0), abs=1e-12)
-        assert 0 <= y <= 0.5
+        assert -0.5 * BEYOND <= y <= 0.5 * (1 + BEYOND)
 
 
 def test_cameras_that_look_apart_are_not_mixed():

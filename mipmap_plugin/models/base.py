@@ -65,6 +65,10 @@ class SplatModel(Protocol):
         `views` are there for families whose splats exist only for a camera. Only ever called on a copy.
         """
 
+    # Optional: a family whose rows are splats that look the same to every camera offers
+    #     rebuild(form: Callable[[Gaussians], Gaussians]) -> None
+    # which holds what `form` makes of its splats instead of them. Without it, splats are never merged.
+
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
         """[N], 0..1, without gradient: how much each row of the parameters can show; rows that show nothing may be pruned."""
 

@@ -76,10 +76,7 @@ class VanillaModel:
         """The model that activates to `gaussians`, but for scales and opacities at their ends (`MIN_SCALE`, `OPACITY_MARGIN`)."""
         if gaussians.covariances is not None:
             raise SettingsError("Gaussians with covariances of their own have no 3DGS parameters; give quaternions and scales")
-        held = gaussians.detach()
-        scales, opacities = _log(held.scales), _logit(held.opacities)
-        named = {"means": held.means, "scales": scales, "quats": held.quats, "opacities": opacities, "sh0": held.sh[:, :1], "shN": held.sh[:, 1:]}
-        return cls({name: tensor.clone() for name, tensor in named.items()}, trained)
+        return cls(_raw(gaussians), trained)
 
     @property
     def sh_degree(self) -> int:
@@ -143,6 +140,13 @@ class VanillaModel:
                 raise ShapeError(f"{name}: expected shape {list(held.shape)}, got {list(wanted.shape)}")
             with torch.no_grad():
                 held.copy_(wanted)
+
+    def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
+        """Hold the splats that `form` makes of these, fewer or more, instead of them."""
+        held = self.gaussians().detach()
+        made = form(held)
+        if made is not held:
+            self.replace_parameters(_raw(made))
 
     def save(
         self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False, companions: Callable[[Path], Any] = lambda ply: None
@@ -249,6 +253,13 @@ def _check(parameters: dict[str, Tensor]) -> None:
             raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(parameters[name].shape)}")
     if 3 * bands not in SH_DEGREES:
         raise ShapeError(f"shN: {bands} coefficients fit no SH degree; 0, 3, 8, 15 or 24 do")
+
+
+def _raw(gaussians: Gaussians) -> dict[str, Tensor]:
+    """Copies of what `VanillaModel` stores of splats."""
+    held = gaussians.detach()
+    named = {"means": held.means, "scales": _log(held.scales), "quats": held.quats, "opacities": _logit(held.opacities)}
+    return {name: tensor.clone() for name, tensor in {**named, "sh0": held.sh[:, :1], "shN": held.sh[:, 1:]}.items()}
 
 
 def _log(scales: Tensor) -> Tensor:
