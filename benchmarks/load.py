@@ -9,6 +9,7 @@ Each load has a process of its own; what Python and torch themselves take is mea
 from __future__ import annotations
 
 import argparse
+import re
 import resource
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 RUNS = 3
+STATUS = Path("/proc/self/status")
 
 # 3DGS's columns of SH degree 3 with normals, 62 of them.
 COLUMNS = [*"xyz", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(45))]
@@ -37,14 +39,15 @@ def write(path: Path, splats: int, chunk: int = 50_000) -> Path:
 
 
 def peak() -> int:
-    """Bytes."""
+    """Bytes that this process held at most. Linux tells them of the process alone; `getrusage` counts what its parent held, too."""
+    if STATUS.exists():
+        return 1024 * int(re.search(r"VmHWM:\s+(\d+) kB", STATUS.read_text())[1])
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def held() -> int:
     """Bytes that this process holds now; where the system does not tell, what it held at most."""
-    pages = Path("/proc/self/statm")
-    return int(pages.read_text().split()[1]) * resource.getpagesize() if pages.exists() else peak()
+    return 1024 * int(re.search(r"VmRSS:\s+(\d+) kB", STATUS.read_text())[1]) if STATUS.exists() else peak()
 
 
 def load(path: Path) -> None:

@@ -12,10 +12,10 @@ sys.path.insert(0, str(BENCHMARK.parent))
 load = pytest.importorskip("load", reason="the benchmarks are not installed with the package")
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="the system does not tell what a process holds now")
+@pytest.mark.skipif(not load.STATUS.exists(), reason="the system does not tell what a process holds now")
 def test_a_large_ply_loads_within_three_times_its_size(tmp_path):
-    """25 MB; the numbers of the libraries, which are the same for any file, are in the measurement and count for less in larger ones."""
-    path = load.write(tmp_path / "large.ply", 100_000)
+    """50 MB: what libraries take at their first use is in the measurement too, and the same for any file."""
+    path = load.write(tmp_path / "large.ply", 200_000)
     _, extra, splats = load.measure(path)
-    assert splats == 100_000
+    assert splats == 200_000
     assert extra < 3 * path.stat().st_size
