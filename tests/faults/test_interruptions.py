@@ -29,6 +29,14 @@ WRITERS = ["ply", "cfg_args", "ply of Mip-Splatting", "checkpoints.pth", "opacit
 WRITERS += ["ckpt of gsplat", "ckpt of splatfacto"]
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c_is_heard():
+    """Also where the tests run in the background, whose processes are started deaf to it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @contextmanager
 def disk_that_holds(size: int):
     """No file may grow beyond `size` bytes; what is written behind that fails, in Python and in C++."""
@@ -83,6 +91,7 @@ def test_a_full_disk_when_the_finished_model_is_saved_leaves_its_state(tmp_path,
     done = model.adapt(1 / 4, steps=3, resume=state)
     with disk_that_holds(100), pytest.raises(OutputError):
         done.save(tmp_path / "new.ply")
+    assert state.exists()
     again = model.adapt(1 / 4, steps=3, resume=state)
     assert again.report.curve == done.report.curve
     assert again.save(tmp_path / "new.ply").read_bytes() == done.save(tmp_path / "other.ply").read_bytes()
