@@ -31,7 +31,7 @@ from mipmap_plugin.scenes.cameras_json import write_cameras
 WHITE = (1.0, 1.0, 1.0)
 DEGREE = 2
 TRAINED = TrainedScale(background=WHITE)
-RATES = LearningRates(means=1.6e-4, scales=0.005, quats=0.001, opacities=0.05, sh0=0.0025, shN=0.0025 / 20)
+RATES = LearningRates(means=0.045, scales=0.005, quats=0.001, opacities=0.05, sh0=0.0025, shN=0.0025 / 20)
 
 
 def first_guess(count: int) -> VanillaModel:

@@ -18,13 +18,13 @@ class LearningRates(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    means: float = Field(0.0, ge=0, description="Times the extent of the cameras, as INRIA's spatial_lr_scale.")
+    means: float = Field(0.0, ge=0, description="Target pixels at the median splat: in a scene of any size a step is as large on the screen.")
     scales: float = Field(0.005, ge=0, description="Of the log scales.")
     quats: float = Field(0.001, ge=0)
     opacities: float = Field(0.05, ge=0, description="Of the logits.")
     sh0: float = Field(0.0025, ge=0)
     shN: float = Field(0.0025 / 20, ge=0)
-    offsets: float = Field(0.0, ge=0, description="Of an anchor's splats around it, times the extent.")
+    offsets: float = Field(0.0, ge=0, description="Of an anchor's splats around it, in units of its own size.")
     features: float = Field(0.0075, ge=0, description="Of an anchor's feature vector.")
     networks: float = Field(0.0, ge=0, description="Of networks that all anchors share; a deformation network never moves.")
 
@@ -78,8 +78,8 @@ _INSTANT = dict(steps=0)
 # A classic file dilates by more than an image filter does, so sharpness has to come from colors that depend on the view: bands
 # above 0 move as fast as the base color, towards hundreds of views, or held-out views gain nothing by it.
 _DEFAULT_OUT = dict(
-    steps=400, patience=2, decay=0.1, truth_oversampling=4, views_per_step=4, extra_views=500,
-    rates=LearningRates(means=1e-3, scales=0.02, quats=0.004, opacities=0.1, sh0=0.03, shN=0.04, networks=5e-4),
+    steps=400, patience=2, decay=0.1, truth_oversampling=4, views_per_step=4, extra_views=200,
+    rates=LearningRates(means=0.1, scales=0.02, quats=0.004, opacities=0.1, sh0=0.03, shN=0.04, networks=5e-4),
 )  # fmt: skip
 
 # Of a zoom-out's splats, times the scale: at x1/8 a tenth is left.
@@ -87,8 +87,7 @@ MERGE_TO = 0.8
 
 # Towards a bicubic or Lanczos target every step loses real dB against the closed form: the target knows nothing that the
 # base does not, and adds the kernel's ringing. So the image is shrunk and compared with the base itself, at gentle rates. Centers
-# stay: on lego moving them gains 0.02 dB, but in an unbounded scene a step, being a share of the cameras' extent, is up to a third of a
-# pixel, which on flowers cost 5 dB against the closed form, where other steps gain 1.6.
+# stay: moving them gains 0.02 dB on lego, and steps of a third of a pixel cost 5 dB on flowers.
 _DEFAULT_IN = dict(
     steps=200, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
     rates=LearningRates(opacities=0.02, networks=5e-4),

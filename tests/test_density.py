@@ -25,7 +25,7 @@ def student():
 @pytest.fixture
 def optimizer(student):
     """Adam whose moments tell which row they belong to: row i holds i + 1 everywhere."""
-    adam = make_optimizer(student, AdaptConfig(), extent=1.0)
+    adam = make_optimizer(student, AdaptConfig(), pixel=1.0)
     for tensor in student.parameters().values():
         tensor.grad = torch.zeros_like(tensor)
     adam.step()
@@ -218,9 +218,9 @@ def test_two_views_in_one_step_count_as_two_views_each_with_its_own_gradient():
 # Rates
 
 
-def test_rates_fall_to_their_share_and_the_means_scale_with_the_scene(student):
+def test_rates_fall_to_their_share_and_the_means_are_in_pixels(student):
     config = AdaptConfig(steps=10, decay=0.01, rates=LearningRates(means=0.1, sh0=0.5, quats=0))
-    adam = make_optimizer(student, config, extent=3.0)
+    adam = make_optimizer(student, config, pixel=3.0)
     rate = lambda name: next(group["lr"] for group in adam.param_groups if group["name"] == name)  # noqa: E731
     assert (rate("means"), rate("sh0"), rate("quats")) == (pytest.approx(0.3), 0.5, 0)
     set_rates(adam, config, 5)

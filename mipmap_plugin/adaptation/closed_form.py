@@ -69,7 +69,11 @@ def closed_form(gaussians: Gaussians, views: Sequence[Camera], scale: float, bas
 
 
 def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
-    """[N] world units: the size of a pixel at each centre in the closest view that sees it (of all views, if none does)."""
+    """[N] world units: the size of a pixel at each centre in the closest view that sees it (of all views, if none does).
+
+    Of many views some are asked, evenly spread.
+    """
+    views = views[:: -(-len(views) // ENOUGH_VIEWS)]
     finest, anywhere = (torch.full_like(means[:, 0], torch.inf) for _ in range(2))
     for view in views:
         viewmat = view.viewmat.to(means)

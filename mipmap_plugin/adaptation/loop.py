@@ -10,6 +10,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mipmap_plugin.adaptation import density
+from mipmap_plugin.adaptation.closed_form import pixel_size
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, reason_to_stop
 from mipmap_plugin.adaptation.interrupt import interruptible
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
@@ -31,6 +32,10 @@ class Task:
     white_background: bool
     detail: Callable[[Camera, Tensor], Tensor] | None = None  # what a view's image adds to the loss besides
 
+    def pixel(self, means: Tensor) -> float:
+        """World units: the size of a target pixel at the median of `means` [N, 3]."""
+        return float(pixel_size(means.detach(), self.views).median()) / self.scale
+
 
 @dataclass
 class Run:
@@ -48,7 +53,7 @@ class Run:
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
         means = student.parameters()["means"]
-        optimizer = make_optimizer(student, config, extent(task.views))
+        optimizer = make_optimizer(student, config, task.pixel(means))
         return cls(student, optimizer, Stopwatch(means.device), density.ScreenGradients.of(means, config))
 
 

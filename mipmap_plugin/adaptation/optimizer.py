@@ -14,11 +14,10 @@ from mipmap_plugin.models.base import CARRIED, SplatModel
 ADAM_EPS = 1e-15
 
 
-def make_optimizer(model: SplatModel, config: AdaptConfig, extent: float) -> torch.optim.Adam:
-    """One group per parameter that moves; the rates of means and offsets are times `extent`, in world units."""
+def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torch.optim.Adam:
+    """One group per parameter that moves; that of means is in pixels of `pixel` world units."""
     rates = {**config.rates.model_dump(), CARRIED: 0.0}
-    rates["means"] *= extent
-    rates["offsets"] *= extent
+    rates["means"] *= pixel
     groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]
     if shared := list(model.shared_parameters().values()):
         groups.append({"params": shared, "lr": rates["networks"], "base_lr": rates["networks"], "name": "networks"})

@@ -13,7 +13,6 @@ from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.density import ScreenGradients
 from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.optimizer import make_optimizer
-from mipmap_plugin.adaptation.views import extent
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.models.base import SplatModel
@@ -90,7 +89,7 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
     with torch.no_grad():
         for name, tensor in student.shared_parameters().items():
             tensor.copy_(state["shared"][name])
-    optimizer = make_optimizer(student, config, extent(task.views))
+    optimizer = make_optimizer(student, config, pixel=1.0)  # the state knows the rates
     optimizer.load_state_dict(state["optimizer"])
     gradients = ScreenGradients.of(student.parameters()["means"], config)
     if gradients is not None:
