@@ -393,7 +393,7 @@ def test_a_scale_that_is_no_zoom_is_refused(scale):
         (dict(views="some"), "setting views: Input should be 'given'"),
         (dict(time_budget_s=0), "setting time_budget_s: Input should be greater than 0"),
         (dict(rates={"means": -1}), "setting rates.means: Input should be greater than or equal to 0"),
-        (dict(upsampler="swin"), "there is no 'swin'; known are bicubic, lanczos"),
+        (dict(upsampler="swin"), "there is no upsampler 'swin'; known are bicubic, lanczos"),
         (dict(views="test"), "there are no test views among the 4 cameras; ask for the views 'given'"),
         (dict(resize="box", scale=0.3, steps=1), "is not a whole multiple of"),
     ],
