@@ -26,8 +26,8 @@ INTRO = """# Zoom-in with super-resolution networks
 
 Made by `python benchmarks/zoom_in.py DATA`. Protocol P3, mean of the test views, nothing adapted to any of them. X2.pt and X4.pt are DCTLSA
 transformers, realesr-animevideov3.pth is a GAN that is worse in dB than bicubic. *Enlarged by* is the network's image of the base's,
-no splat touched. Seconds on one thread of a shared machine, very busy here; those to enlarge the views are among them where the cache did not have
-them: 1.5 s (X2), 1.0 s (X4) and 0.2 s (GAN) a view of 100 x 100 px. The ms of a first row hold the compilation of the backend.
+no splat touched. Seconds on one thread of a shared machine, those to enlarge the views among them (about 2 s a view with a transformer,
+and an empty cache). The ms of the first row hold the compilation of the backend.
 
 The networks' own images stay ahead in LPIPS, which a static set of splats that has to satisfy all views did not reach in 800 steps.
 """
