@@ -57,6 +57,7 @@ class AdaptConfig(BaseModel):
     closed_form: bool = Field(True, description="Start from the closed form instead of from the base.")
     merge_to: float = Field(1.0, gt=0, le=1, description="Zoom-out: share of the splats that is left when like ones that share pixels are merged.")
     rates: LearningRates = LearningRates()
+    loss: Literal["l2", "l1"] = Field("l2", description="Of an image against the truth: mean square or mean absolute difference.")
     decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling exponentially.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
     prune_every: int = Field(100, gt=0, description="Steps between two prunings.")

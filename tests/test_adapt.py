@@ -466,3 +466,9 @@ def test_an_adapted_model_can_be_adapted_again():
     half = [camera.zoomed(1 / 2) for camera in tiny.cameras()]
     again = wrap_model(first.model, cameras=half, backend="reference").adapt(1 / 2, steps=1, extra_views=0)
     assert is_finite(again.model) and again.model is not first.model
+
+
+def test_the_loss_is_what_was_asked_for_and_the_curve_is_in_decibel_all_the_same():
+    squares, absolutes = (wrapped().adapt(1 / 4, **{**BRIEF, "loss": loss, "steps": 2}) for loss in ("l2", "l1"))
+    assert not torch.equal(shown(squares), shown(absolutes))
+    assert absolutes.report.curve[0].psnr_db == pytest.approx(squares.report.curve[0].psnr_db, abs=3)

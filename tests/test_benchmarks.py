@@ -12,11 +12,13 @@ from conftest import SHARED
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
 
+from ablations import ABLATIONS  # noqa: E402
 from scenes import make  # noqa: E402
 from workloads import activated, count_pairs, effects_of, from_scene  # noqa: E402
 
 from mipmap_plugin.backends import get_backend  # noqa: E402
 from mipmap_plugin.backends.projection import project  # noqa: E402
+from mipmap_plugin.config import recipe as make_config  # noqa: E402
 
 
 def brute_force_pairs(gaussians, camera):
@@ -69,3 +71,10 @@ def test_gsplat_twins_draw_what_the_reference_draws():
         grads.append(torch.cat([leaf.grad.flatten() for leaf in leaves.values()]))
     torch.testing.assert_close(images[1], images[0], atol=1e-4, rtol=0)
     assert (grads[1] - grads[0]).norm() < 1e-4 * grads[0].norm()
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
+def test_an_ablation_varies_one_thing_of_its_recipe(name):
+    recipe, variants = ABLATIONS[name]
+    made = [make_config(recipe, 1 / 4, **settings) for settings in variants.values()]
+    assert len({config.model_dump_json() for config in made}) == len(made)

@@ -96,9 +96,10 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         image = task.render(run.student, camera)  # x: the student at the new scale
         # Where the truth is the base itself, it is compared with at the base's scale.
         shrunk = image if image.shape == target.shape else resize(image, (target.shape[0], target.shape[1]), config.resize)
-        loss = (shrunk - target).square().mean()
+        difference = shrunk - target
+        loss = difference.square().mean() if config.loss == "l2" else difference.abs().mean()
         (loss if task.detail is None else loss + task.detail(view, image)).backward()
-        run.square_error += float(loss.detach()) / len(views)
+        run.square_error += float(difference.detach().square().mean()) / len(views)
         if run.gradients is not None and means.grad is not None:
             run.gradients.add(means, means.grad - before, camera)
             before = means.grad.clone()
