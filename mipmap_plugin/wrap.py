@@ -22,10 +22,12 @@ from mipmap_plugin.config import AdaptConfig, Recipe
 from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel, TrainedScale
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
+from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
 from mipmap_plugin.scenes import Scene, model_cameras
 
 
@@ -58,10 +60,25 @@ class Wrapped:
         needs = replace(self._needs, gradients=gradients, screen_filter=self.effects(screen_filter=screen_filter).screen_filter)
         return choose_backend(self._backend, needs)
 
-    def render(self, camera: Camera, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1) -> Rendered:
-        """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did."""
+    def render(
+        self, camera: Camera, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, filter_3d: bool = False
+    ) -> Rendered:
+        """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did.
+
+        `filter_3d`: every splat is smoothed first by what the cameras could see of it at best (Mip-Splatting's 3D filter).
+        """
         backend, _ = self.backend(screen_filter=screen_filter)
-        return shown(self.model, backend, camera, self.effects(scale, screen_filter, supersampling))
+        form = self._smoothed if filter_3d else None
+        return shown(self.model, backend, camera, self.effects(scale, screen_filter, supersampling), form)
+
+    def _smoothed(self, gaussians: Gaussians) -> Gaussians:
+        """Raises SettingsError where no splat can be smoothed, or nothing says by how much."""
+        if not self.cameras:
+            raise SettingsError("the 3D filter follows from the cameras, and this checkpoint has none; give --cameras")
+        if gaussians.covariances is not None or isinstance(self.model, MipModel):
+            raise SettingsError(f"{self.model.family}: its splats have no scales of their own, or a 3D filter already; leave filter_3d out")
+        scales, opacities = smooth_3d(gaussians.scales, gaussians.opacities, filter_3d_of(gaussians.means, self.cameras))
+        return replace(gaussians, scales=scales, opacities=opacities)
 
     def adapt(
         self,

@@ -27,15 +27,6 @@ MISSING = next((name for name in ("numba", CPU) if importlib.util.find_spec(name
 SINGLE = TOLERANCE[torch.float32]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Tensors this small cost more to share out than to compute."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 class TestReference(BackendSuite):
     backend = ReferenceBackend()
 

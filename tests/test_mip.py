@@ -211,3 +211,19 @@ def test_the_command_line_is_told_the_filter(tmp_path, capsys):
     assert "mip, 0.1 px²" in capsys.readouterr().out
     assert main(["adapt", str(fused), "--scale", "4", "--screen-filter", "mip", "--steps", "0"]) == 0
     assert "base mip 0.1 px²; file classic 0.3 px²" in capsys.readouterr().out
+
+
+def test_any_model_can_be_rendered_with_a_3d_filter():
+    base = tiny.model()
+    wrapped = wrap_model(base, cameras=tiny.cameras())
+    view = tiny.cameras()[0].zoomed(4)
+    scales, opacities = smooth_3d(base.gaussians().scales, base.gaussians().opacities, filter_3d_of(base.gaussians().means, tiny.cameras()))
+    smooth = VanillaModel.from_gaussians(replace(base.gaussians(), scales=scales, opacities=opacities))
+    expected = wrap_model(smooth, cameras=tiny.cameras()).render(view, 4).image
+    torch.testing.assert_close(wrapped.render(view, 4, filter_3d=True).image, expected, atol=1e-5, rtol=0)
+    assert not torch.allclose(wrapped.render(view, 4).image, expected, atol=1e-2)
+
+
+def test_a_3d_filter_needs_cameras():
+    with pytest.raises(SettingsError, match="follows from the cameras"):
+        wrap_model(tiny.model(), cameras=[]).render(tiny.cameras()[0], filter_3d=True)

@@ -29,6 +29,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects, explain
 from mipmap_plugin.files import write_json
+from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
 
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
@@ -180,9 +181,11 @@ class Session:
 
 
 @torch.no_grad()
-def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects) -> Rendered:
-    """What the model shows to a camera, and the effects that it called for."""
-    gaussians = model.gaussians(camera)
+def shown(
+    model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None
+) -> Rendered:
+    """What the model, its splats changed by `form`, shows to a camera, and the effects that it called for."""
+    gaussians = model.gaussians(camera) if form is None else form(model.gaussians(camera))
     rendered = supersample.render(backend, gaussians, camera, effects)
     return replace(rendered, effects=explain(effects, gaussians, effects_of(model)))
 

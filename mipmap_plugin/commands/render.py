@@ -25,6 +25,7 @@ def render(
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     screen_filter: Literal["trained", "scaled", "classic", "antialiased", "mip", "analytic", "window"] = "trained",
     supersampling: int = 1,
+    filter_3d: bool = False,
     cameras: Path | None = None,
     background: Background | None = None,
     backend: str = "auto",
@@ -39,6 +40,7 @@ def render(
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
         screen_filter: trained: what the checkpoint was trained with; scaled: the training-free filter for this scale.
         supersampling: N: N x N samples a pixel.
+        filter_3d: Smooth every splat by what the cameras could see of it at best, as Mip-Splatting's 3D filter does.
         cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         background: Of the scene; by default what the checkpoint says, else black.
         backend: A backend's name; auto takes the fastest that can do it.
@@ -50,7 +52,8 @@ def render(
     for name in names:
         refuse_existing(output / name, overwrite)
     for camera, name in zip(views, names, strict=True):
-        image = wrapped.render(camera.zoomed(scale), scale, None if screen_filter == "trained" else screen_filter, supersampling).image
+        asked = None if screen_filter == "trained" else screen_filter
+        image = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, filter_3d).image
         write_image(output / name, image, overwrite=overwrite)
     print(f"{len(views)} pictures in {output}")
 
