@@ -75,8 +75,11 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return fmean(known) if len(known) == len(values) else None
 
 
-def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic") -> list[Row]:
-    """The base as it is, each screen filter that needs no training, and the base's own render resized (for zoom-out, supersampling)."""
+def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic", without: Sequence[str] = ()) -> list[Row]:
+    """The base as it is, each screen filter that needs no training, and the base's own render resized (for zoom-out, supersampling).
+
+    `without`: filters that are left out.
+    """
     count = len(model.model.gaussians(model.any_camera()))
 
     def filtered(screen_filter: str | None) -> Callable[[Camera], Tensor]:
@@ -85,7 +88,7 @@ def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: st
     def resized(by: str) -> Callable[[Camera], Tensor]:
         return lambda camera: resized_base(model.render(camera).image.clamp(0, 1), camera.zoomed(scale).size, by)
 
-    served = [name for name in ("scaled", "window", "antialiased") if _served(model, name)]
+    served = [name for name in ("scaled", "window", "antialiased") if name not in without and _served(model, name)]
     shows = {"naive": filtered(None), **{name: filtered(name) for name in served}, "resized base": resized("bicubic")}
     if scale > 1 and upsampler != "bicubic":
         shows[f"base upsampled by {Path(upsampler).name}"] = resized(upsampler)
