@@ -64,7 +64,7 @@ def main(
     """
     wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
     scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
-    judge = Judge(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"])
+    judge = Judge(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
     scored = dict(views="given", cameras=[view.camera for view in judge.views])
     for name in only or ABLATIONS:
         recipe, variants = ABLATIONS[name]

@@ -75,7 +75,7 @@ def kept(file: Path, measured: Sequence[Recipe], long: bool) -> list[Row]:
 
 def long_rows(wrapped: Wrapped, scene: Scene, scales: Sequence[float]) -> list[Row]:
     scene = wrapped.place(scene)
-    judge = Judge(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"])
+    judge = Judge(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
     scored = dict(views="given", cameras=[view.camera for view in judge.views])
     rows = []
     for scale in scales:
