@@ -33,7 +33,7 @@ SAMPLES = {True: 64, False: 4}  # zoomed out, zoomed in
 SHOWN = 480
 
 # Seconds for each scale; the demo should end within three minutes, whichever backend it finds.
-BUDGET_S = 60.0
+BUDGET_S = 45.0
 
 # Every which training view is adapted to, one a step: where there is only the reference, the truth of a view costs as much as some steps.
 EVERY = 4
