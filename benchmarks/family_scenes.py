@@ -46,7 +46,7 @@ USUAL_DISTURBANCE = 0.1
 
 TRAINING = AdaptConfig(
     steps=1000, decay=0.1, prune_every=10_000,
-    rates=LearningRates(means=1e-3, scales=0.01, quats=0.005, sh0=0.01, shN=0.002, offsets=1e-3, networks=1e-3),
+    rates=LearningRates(means=0.07, scales=0.01, quats=0.005, sh0=0.01, shN=0.002, offsets=3e-3, networks=1e-3),
 )  # fmt: skip
 
 
