@@ -6,6 +6,7 @@ import hashlib
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -151,6 +152,8 @@ def test_a_process_killed_while_it_saves_leaves_a_whole_file(tmp_path, name):
     out = tmp_path / name
     tiny.model(20).save(out, provenance={})
     for number in range(12):
+        for leftover in tmp_path.glob(f".{name}.*"):  # of an earlier kill, perhaps half removed
+            shutil.rmtree(leftover) if leftover.is_dir() else leftover.unlink()
         process = multiprocessing.get_context("fork").Process(target=save_for_ever, args=(str(out),))
         process.start()
         time.sleep(0.03 + 0.007 * number)
