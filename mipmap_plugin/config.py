@@ -55,7 +55,7 @@ class AdaptConfig(BaseModel):
     extra_views: int = Field(100, ge=0, description="How many views `jittered` adds, or an orbit has.")
 
     closed_form: bool = Field(True, description="Start from the closed form instead of from the base.")
-    merge_to: float = Field(1.0, gt=0, le=1, description="Zoom-out: share of the splats that is left when like ones that share pixels are merged.")
+    merge_to: float = Field(1.0, gt=0, le=1, description="Share of the splats that is left when like ones that share pixels are merged.")
     rates: LearningRates = LearningRates()
     loss: Literal["l2", "l1"] = Field("l2", description="Of an image against the truth: mean square or mean absolute difference.")
     decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling exponentially.")

@@ -102,6 +102,8 @@ class Wrapped:
         """
         if not 0 < scale < float("inf"):
             raise SettingsError(f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4")
+        if not hasattr(self.model, "rebuild") and settings.setdefault("merge_to", 1.0) < 1:
+            raise SettingsError(f"{self.model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
         config = make_config(recipe, scale, **settings)
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mip_checkpoints
 import pytest
 import torch
 from tiny import cameras
@@ -10,6 +11,7 @@ from tiny import model as tiny_model
 from mipmap_plugin.adaptation.merging import LARGEST_CELL, merge
 from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.config import recipe
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.wrap import wrap_model
 
@@ -87,3 +89,10 @@ def test_adapting_merges_and_reports_it():
     adapted = wrap_model(base, cameras=cameras()).adapt(1 / 4, steps=1, merge_to=0.01, views="given")
     assert adapted.report.gaussians_after < adapted.report.gaussians_before == len(base)
     assert adapted.report.seconds["merging"] > 0
+
+
+def test_a_family_whose_splats_are_not_its_rows_says_so(tmp_path):
+    base = wrap_model(mip_checkpoints.folder(tmp_path / "mip"), cameras=cameras())
+    assert base.adapt(1 / 4, steps=1, views="given").report.settings.merge_to == 1
+    with pytest.raises(SettingsError, match="none are merged; leave merge_to out"):
+        base.adapt(1 / 4, merge_to=0.5)

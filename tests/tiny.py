@@ -30,6 +30,13 @@ def gaussians(count: int = 60, degree: int = 1, seed: int = 0, spread: float = 0
     return Gaussians(spread * torch.randn(count, 3, generator=rng), torch.randn(count, 4, generator=rng), scales, opacities, sh)
 
 
+def with_bands(used: int, room: int) -> Gaussians:
+    """Splats with room for SH of degree `room`, of which the bands above `used` are zero."""
+    splats = gaussians(10, degree=room)
+    splats.sh[:, (used + 1) ** 2 :] = 0
+    return splats
+
+
 def model(count: int = 60, trained: TrainedScale = TrainedScale(), **options) -> VanillaModel:  # noqa: B008
     return VanillaModel.from_gaussians(gaussians(count, **options), trained)
 

@@ -41,6 +41,11 @@ class Stopwatch:
         return time.perf_counter()
 
 
+def progress(step: int, seconds: float, config: AdaptConfig) -> float:
+    """0..1: how much of its steps or of its time budget a run has used, whichever is more."""
+    return min(1.0, max(step / max(1, config.steps), seconds / (config.time_budget_s or math.inf)))
+
+
 def decibel(mean_square: float) -> float:
     """PSNR of images in 0..1."""
     return -10 * math.log10(max(mean_square, 1e-12))  # 120 dB: beyond single precision

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from mipmap_plugin.adaptation import density
 from mipmap_plugin.adaptation.closed_form import pixel_size
-from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, reason_to_stop
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress, reason_to_stop
 from mipmap_plugin.adaptation.interrupt import interruptible
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
 from mipmap_plugin.adaptation.resize import resize
@@ -87,7 +87,7 @@ def adapt(
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
-    set_rates(run.optimizer, config, run.step)
+    set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config))
     means = run.student.parameters()["means"]
     before: Tensor | float = 0.0  # the gradient of the means from the views before this one
     for view in views:

@@ -24,9 +24,9 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torc
     return torch.optim.Adam(groups, eps=ADAM_EPS, fused=True)
 
 
-def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, step: int) -> None:
-    """Each rate at `step` of its exponential decay."""
-    share = config.decay ** (step / max(1, config.steps))
+def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float) -> None:
+    """Each rate at `progress` (0..1) of its exponential decay."""
+    share = config.decay**progress
     for group in optimizer.param_groups:
         group["lr"] = group["base_lr"] * share
 

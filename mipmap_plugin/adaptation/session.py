@@ -20,7 +20,6 @@ from mipmap_plugin.adaptation.merging import merge
 from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Report, filters, versions
-from mipmap_plugin.adaptation.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.resume import Keeper
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.backends import supersample
@@ -94,7 +93,7 @@ class Session:
         student = self.base.copy()
         student.trained = replace(student.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
         nothing_to_do = self.scale == 1 and self.effects == self.trained
-        if self.config.merge_to < 1 and self.scale < 1 and self.effects.screen_filter == "classic":
+        if self.config.merge_to < 1:
             self._merge(student)
         if self.config.closed_form and not nothing_to_do:
             self._closed_form(student)
@@ -133,12 +132,12 @@ class Session:
 
     @torch.no_grad()
     def _merge(self, student: SplatModel) -> None:
-        """Fewer splats, in families whose splats are their rows."""
-        rebuild = getattr(student, "rebuild", None)
-        if rebuild is None:
-            return
+
+        def fewer(gaussians: Gaussians) -> Gaussians:
+            return merge(gaussians, pixel_size(gaussians.means, self.views) / self.scale, self.config.merge_to)
+
         began = time.perf_counter()
-        rebuild(lambda gaussians: merge(gaussians, pixel_size(gaussians.means, self.views) / self.scale, self.config.merge_to))
+        student.rebuild(fewer)  # type: ignore[attr-defined]
         self.seconds["merging"] = time.perf_counter() - began
 
     @torch.no_grad()

@@ -11,6 +11,7 @@ import pytest
 import tiny
 import torch
 from anchor_checkpoints import Layout
+from tiny import with_bands
 
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation.report import Report
@@ -21,13 +22,6 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel, load_mip
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
-
-
-def with_bands(used: int, room: int) -> Gaussians:
-    """Splats with room for SH of degree `room`, of which the bands above `used` are zero."""
-    splats = tiny.gaussians(10, degree=room)
-    splats.sh[:, (used + 1) ** 2 :] = 0
-    return splats
 
 
 def wrapped(splats, **trained):

@@ -8,6 +8,7 @@ import moving
 import pytest
 import tiny
 import torch
+from tiny import with_bands
 
 from mipmap_plugin import register_upsampler
 from mipmap_plugin.adaptation import density
@@ -16,7 +17,6 @@ from mipmap_plugin.backends import filters, harmonics, reference, supersample
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import PluginError
-from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.deformable import DeformNetwork
 from mipmap_plugin.models.hexplane import HexPlane
@@ -24,13 +24,6 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
 BRIEF = dict(steps=2, extra_views=0)
-
-
-def with_bands(used: int, room: int) -> Gaussians:
-    """Splats with room for SH of degree `room`, of which the bands above `used` are zero."""
-    splats = tiny.gaussians(10, degree=room)
-    splats.sh[:, (used + 1) ** 2 :] = 0
-    return splats
 
 
 def wrapped(splats, **trained):
