@@ -1,0 +1,142 @@
+"""What gsplat is asked for, and what its own torch twins make of it where there is no GPU."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from gsplat_stand_in import StandIn
+from samples import camera, gaussians
+
+from mipmap_plugin.backends import BACKENDS, survey
+from mipmap_plugin.backends import gsplat as module
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.conformance import CASES, check_backend
+from mipmap_plugin.backends.conformance.cases import covariances
+from mipmap_plugin.backends.gsplat import NO_CUDA, NO_GSPLAT, NOT_COMPILED, GsplatBackend, arguments
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import BackendUnavailable
+
+gsplat = pytest.importorskip("gsplat", reason="gsplat is in the test extra")
+
+USUAL = Needs("cuda", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
+WIDE = camera(50, 40, 30.0, 26.0, cx=21.3, cy=18.9)
+
+# Where gsplat 1.5 differs from the reference by more than rounding, and why.
+FEWER_DIGITS = {f"needle-1e12-{kind}" for kind in ("classic", "antialiased", "mip")}
+LARGER_ALPHA = {f"opacity-{how}-{kind}" for how in ("1", "1-1e-7", "logit-80") for kind in ("classic", "antialiased", "mip")}
+NO_LEAST_LIGHT = {"scale-0-on-two-axes-antialiased", "scale-0-on-three-axes-antialiased"}
+TWINS_ROOT_AT_ZERO = {"scale-0-on-three-axes-antialiased", "scale-0-on-three-axes-mip"}  # gsplat's own kernel divides by a little more
+KNOWN = FEWER_DIGITS | LARGER_ALPHA | NO_LEAST_LIGHT | TWINS_ROOT_AT_ZERO
+
+
+class OnProcessor(GsplatBackend):
+    capabilities = replace(GsplatBackend.capabilities, devices=frozenset({"cpu"}))
+
+    def lacking(self, needs):
+        return self.capabilities.lacking(needs)
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    twin = StandIn()
+    monkeypatch.setattr(gsplat, "rasterization", twin)
+    return twin
+
+
+def test_gsplat_is_asked_in_its_own_words(stand_in):
+    splats = gaussians(20, 2, dtype=torch.float32)
+    effects = Effects(1, "classic", 0.3 * 4**2, (0.2, 0.5, 0.9), near_plane=0.25)  # the `scaled` filter at x4
+    OnProcessor().render(splats, WIDE, effects)
+    asked, named = stand_in.asked, arguments(splats, WIDE, effects)
+    assert set(named) <= set(stand_in.signature.parameters)
+    assert (asked["width"], asked["height"], asked["sh_degree"], asked["eps2d"], asked["rasterize_mode"]) == (50, 40, 1, 4.8, "classic")
+    assert asked["Ks"][0].tolist() == [[30.0, 0.0, pytest.approx(21.3)], [0.0, 26.0, pytest.approx(18.9)], [0.0, 0.0, 1.0]]
+    assert asked["backgrounds"].tolist() == [[pytest.approx(0.2), 0.5, pytest.approx(0.9)]]
+    assert (asked["packed"], asked["covars"], asked["render_mode"]) == (False, None, "RGB")
+    assert 0.25 < asked["near_plane"] < 0.25 + 1e-7
+    assert torch.equal(asked["colors"], splats.sh) and torch.equal(asked["quats"], splats.quats)
+
+
+def test_the_eye_is_where_the_world_begins(stand_in):
+    splats = gaussians(20, dtype=torch.float32)
+    OnProcessor().render(splats, WIDE, Effects(1))
+    viewmat, means = stand_in.asked["viewmats"][0], stand_in.asked["means"]
+    assert viewmat[:3, 3].tolist() == [0.0, 0.0, 0.0]
+    there = splats.means.double() @ WIDE.viewmat[:3, :3].T + WIDE.viewmat[:3, 3]
+    torch.testing.assert_close(means @ viewmat[:3, :3].T, there.float())
+
+
+@pytest.mark.parametrize("screen_filter", ["antialiased", "mip"])
+def test_filters_that_keep_light_are_gsplats_antialiased(stand_in, screen_filter):
+    OnProcessor().render(gaussians(20, dtype=torch.float32), WIDE, Effects(1, screen_filter, 0.1))
+    assert (stand_in.asked["rasterize_mode"], stand_in.asked["eps2d"]) == ("antialiased", 0.1)
+
+
+def test_covariances_are_handed_on(stand_in):
+    splats = gaussians(20, dtype=torch.float32)
+    splats = replace(splats, covariances=covariances(splats))
+    OnProcessor().render(splats, WIDE, Effects(1))
+    assert torch.equal(stand_in.asked["covars"], splats.covariances)
+
+
+def test_gsplats_twins_draw_the_reference_but_for_what_is_known(stand_in):
+    cases = {name: build for name, build in CASES.items() if not name.startswith("10000")}  # too many for the twins' loops in Python
+    outcomes = check_backend(OnProcessor(), cases)
+    assert {outcome.case for outcome in outcomes if not outcome.passed} == KNOWN
+    drawn = [outcome for outcome in outcomes if not outcome.skipped]
+    assert {case for case in cases if "analytic" not in case and "window" not in case} == {outcome.case for outcome in drawn}
+    assert max(outcome.max_error for outcome in drawn if outcome.case in LARGER_ALPHA) < 0.009
+
+
+def test_with_the_cap_of_later_versions_opaque_splats_are_the_references(stand_in):
+    stand_in.max_alpha = 0.99
+    assert all(outcome.passed for outcome in check_backend(OnProcessor(), {case: CASES[case] for case in sorted(LARGER_ALPHA)}))
+
+
+def test_nothing_is_cut_that_the_reference_draws(stand_in):
+    splats = gaussians(1, dtype=torch.float32)
+    splats = replace(splats, opacities=torch.ones(1), scales=torch.full((1, 3), 0.4))
+    ours = OnProcessor().render(splats, WIDE, Effects(1))
+    assert torch.equal(ours.alpha > 0, ReferenceBackend().render(splats, WIDE, Effects(1)).alpha > 0)
+
+
+def test_what_is_missing_is_said(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert GsplatBackend().lacking(USUAL) == [NO_CUDA]
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(module, "_nvcc", lambda: False)
+    assert GsplatBackend().lacking(USUAL) == [NOT_COMPILED]
+    monkeypatch.setattr(module, "_nvcc", lambda: True)
+    assert GsplatBackend().lacking(USUAL) == []
+    assert "not window" in GsplatBackend().lacking(replace(USUAL, screen_filter="window"))[0]
+    assert "not in torch.float64" in GsplatBackend().lacking(replace(USUAL, dtype=torch.float64))[0]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert GsplatBackend().lacking(USUAL) == [NO_GSPLAT]
+
+
+def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert "gsplat" in BACKENDS.names()
+    assert survey(replace(USUAL, device="cpu"))["gsplat"] == [NO_CUDA, "it runs on cuda, not on cpu"]
+    with pytest.raises(BackendUnavailable, match="backend 'gsplat' cannot do this: it needs a CUDA GPU"):
+        GsplatBackend().render(gaussians(2, dtype=torch.float32), WIDE, Effects(1))
+
+
+def test_the_module_loads_no_gsplat():
+    code = "import sys; import mipmap_plugin.backends.gsplat; sys.exit('gsplat' in sys.modules)"
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_gsplat_itself_draws_the_reference_but_for_what_is_known():
+    wrong = {outcome.case: outcome.message for outcome in check_backend(GsplatBackend(), device="cuda") if not outcome.passed}
+    assert set(wrong) <= KNOWN, wrong
