@@ -19,7 +19,8 @@ from mipmap_plugin.backends import gsplat as module
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, check_backend
 from mipmap_plugin.backends.conformance.cases import covariances
-from mipmap_plugin.backends.gsplat import NO_CUDA, NO_GSPLAT, NOT_COMPILED, GsplatBackend, arguments
+from mipmap_plugin.backends.gsplat import NO_GSPLAT, NOT_COMPILED, GsplatBackend, arguments
+from mipmap_plugin.backends.guests import NO_CUDA
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable

@@ -14,6 +14,7 @@ BACKENDS = Registry(
         "reference": "mipmap_plugin.backends.reference:ReferenceBackend",
         "cpu": "mipmap_plugin.backends.cpu:CpuBackend",
         "gsplat": "mipmap_plugin.backends.gsplat:GsplatBackend",
+        "inria": "mipmap_plugin.backends.inria:InriaBackend",
     },
 )
 

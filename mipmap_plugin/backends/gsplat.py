@@ -24,17 +24,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.reference import ReferenceBackend, finite_rows
+from mipmap_plugin.backends.guests import NO_CUDA, sound, turned
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 
 NO_GSPLAT = "it needs gsplat: pip install 'mipmap-plugin[gsplat]'"
-NO_CUDA = "it needs a CUDA GPU, and torch sees none here"
 NOT_COMPILED = "gsplat's CUDA part is not compiled and there is no nvcc to compile it with; install its wheel for your torch and CUDA"
 
 
@@ -59,9 +58,7 @@ class GsplatBackend:
         reasons = self.lacking(Needs.of(gaussians, effects, gradients=True))
         if reasons:
             raise BackendUnavailable(f"backend 'gsplat' cannot do this: {'; '.join(reasons)}")
-        sound = finite_rows(gaussians)
-        if not sound.all():
-            gaussians = gaussians[sound]
+        gaussians = sound(gaussians)
         if len(gaussians) == 0:
             return ReferenceBackend().render(gaussians, camera, effects)
         image, alpha, _ = importlib.import_module("gsplat").rasterization(**arguments(gaussians, camera, effects))
@@ -88,7 +85,7 @@ def arguments(gaussians: Gaussians, camera: Camera, effects: Effects) -> dict[st
     means = gaussians.means
     return {
         "means": means - camera.center.to(means),
-        "quats": _turned(gaussians.quats),
+        "quats": turned(gaussians.quats),
         "scales": gaussians.scales,
         "covars": gaussians.covariances,
         "opacities": gaussians.opacities,
@@ -104,12 +101,6 @@ def arguments(gaussians: Gaussians, camera: Camera, effects: Effects) -> dict[st
         "backgrounds": means.new_tensor(effects.background)[None],
         "packed": False,  # packing saves memory where few splats are in view, and makes the host wait once more
     }
-
-
-def _turned(quats: Tensor) -> Tensor:
-    """`quats` [N, 4] with the identity where one is zero; gsplat would divide by its length."""
-    zero = (quats == 0).all(1, keepdim=True)
-    return torch.where(zero, quats.new_tensor([1.0, 0.0, 0.0, 0.0]), quats)
 
 
 def _just_above(near: float) -> float:
