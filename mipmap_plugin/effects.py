@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 
 # px²: the variance that every 3DGS rasterizer adds to a projected splat (diff-gaussian-rasterization, forward.cu).
@@ -25,6 +26,12 @@ INTEGRATED = frozenset({"analytic", "window"})
 
 # Screen filters that dim what they widen.
 COMPENSATED = frozenset({"antialiased", "mip"})
+
+# What can be drawn beside the image (`backends.geometry`), and what each costs.
+OUTPUTS = {
+    "depth": "an image more, whose colors are distances",
+    "normals": "an image more, whose colors are directions, and the shortest axis of each splat",
+}
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,12 @@ class Effects:
     supersampling: int = 1  # N: N x N samples per pixel, averaged
     near_plane: float = NEAR_PLANE  # world units
     settings: RenderSettings = USUAL
+    outputs: tuple[str, ...] = ()  # of OUTPUTS
+    exposure: bool = False  # the colors are those of the view's photograph (`models.exposure`)
+
+    def __post_init__(self) -> None:
+        if unknown := [name for name in self.outputs if name not in OUTPUTS]:
+            raise SettingsError(f"there is no output {unknown[0]!r}; what can be drawn beside the image is {', '.join(OUTPUTS)}")
 
 
 @dataclass(frozen=True)
@@ -69,12 +82,15 @@ class Effect:
         return f"{self.name}: {'on' if self.on else 'off'}, {self.reason} ({'costs' if self.on else 'saves'} {self.cost})"
 
 
+EXPOSURE = Effect("exposure", False, "the checkpoint has none", "a product with a 3 x 3 matrix a pixel")
+
 # What only some families do; a model that does it says so itself (`models.base.effects_of`).
 OF_OTHER_MODELS = (
     Effect("view-dependent geometry", False, "the splats are the same for every camera", "decoding them for each"),
     Effect("levels of detail", False, "every splat is there at every distance", "a distance and a comparison a splat"),
     Effect("time", False, "nothing moves", "a pass through a field for each image"),
     Effect("appearance embedding", False, "all views share one appearance", "more inputs of a color network"),
+    EXPOSURE,
     Effect("3D filter", False, "no splat has one", "three roots a splat"),
 )
 
@@ -86,8 +102,10 @@ def explain(
 
     `of_model`: what the model says of itself; `config` and `scale`: of an adaptation, if it is one that is asked about.
     """
-    said = {effect.name: effect for effect in of_model}
-    own = [said.get(effect.name, effect) for effect in OF_OTHER_MODELS]
+    said = {effect.name: effect for effect in (*OF_OTHER_MODELS, *of_model)}
+    if effects.exposure:
+        said["exposure"] = replace(said["exposure"], on=True, reason="asked for: exposure.json has this view's")
+    own = [said[effect.name] for effect in OF_OTHER_MODELS]
     return (*own, *_of_rendering(effects, gaussians), *_of_adapting(config, scale))
 
 
@@ -107,6 +125,7 @@ def _of_rendering(effects: Effects, gaussians: Gaussians) -> list[Effect]:
         Effect("compensation", effects.screen_filter in COMPENSATED, f"the screen filter is {effects.screen_filter}", "one root a splat"),
         Effect("supersampling", n > 1, f"{n * n} sample{'s' if n > 1 else ''} a pixel", f"{n * n if n > 1 else 'N x N'} times the pixels"),
         Effect("covariances", given, "the model gives them" if given else "quaternions and scales suffice", extra),
+        *(Effect(name, name in effects.outputs, "asked for" if name in effects.outputs else "not asked for", cost) for name, cost in OUTPUTS.items()),
     ]
 
 

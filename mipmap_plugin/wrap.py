@@ -24,7 +24,7 @@ from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import SplatModel, TrainedScale
+from mipmap_plugin.models.base import SplatModel, TrainedScale, exposures_of
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
@@ -61,15 +61,26 @@ class Wrapped:
         return choose_backend(self._backend, needs)
 
     def render(
-        self, camera: Camera, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, filter_3d: bool = False
+        self,
+        camera: Camera,
+        scale: float = 1.0,
+        screen_filter: str | None = None,
+        supersampling: int = 1,
+        filter_3d: bool = False,
+        *,
+        outputs: Sequence[str] = (),
+        exposure: bool = False,
     ) -> Rendered:
         """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did.
 
         `filter_3d`: every splat is smoothed first by what the cameras could see of it at best (Mip-Splatting's 3D filter).
+        `outputs`: "depth" and "normals" are drawn beside the image (`Rendered`). `exposure`: the colors become those of the
+        photograph that `camera` is named after, as the checkpoint's exposure.json has it. Raises SettingsError where it has none.
         """
+        effects = replace(self.effects(scale, screen_filter, supersampling), outputs=tuple(outputs), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter)
         form = self._smoothed if filter_3d else None
-        return shown(self.model, backend, camera, self.effects(scale, screen_filter, supersampling), form)
+        return shown(self.model, backend, camera, effects, form)
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
         """Raises SettingsError where no splat can be smoothed, or nothing says by how much."""
@@ -104,6 +115,8 @@ class Wrapped:
             raise SettingsError(f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4")
         if not hasattr(self.model, "rebuild") and settings.setdefault("merge_to", 1.0) < 1:
             raise SettingsError(f"{self.model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
+        if images is not None and exposures_of(self.model).changed:
+            raise SettingsError("the images were exposed differently, which adapting to them does not know (exposure.json); leave them out")
         config = make_config(recipe, scale, **settings)
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:

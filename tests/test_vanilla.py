@@ -139,7 +139,7 @@ def test_exposure_is_told(tmp_path):
     identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
     for content, told in {
         json.dumps({"a": identity}): "only identities",
-        json.dumps({"a": identity, "b": [[2, 0, 0, 0]]}): "changes 1 of 2 views",
+        json.dumps({"a": identity, "b": [[2, 0, 0, 0], *identity[1:]]}): "changes 1 of 2 images",
         "[]": "cannot be read",
     }.items():
         (folder / "exposure.json").write_text(content)

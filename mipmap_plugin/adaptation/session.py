@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -29,7 +29,8 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects, explain
 from mipmap_plugin.files import write_json
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, effects_of
+from mipmap_plugin.models.base import SplatModel, effects_of, exposures_of
+from mipmap_plugin.models.exposure import exposed
 
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
@@ -45,9 +46,9 @@ class Adapted:
     effects: Effects
     state: Path | None = None  # of the run, which is of use until the model is saved
 
-    def render(self, camera: Camera) -> Rendered:
-        """The view of a camera of the new scale."""
-        return shown(self.model, self.backend, camera, self.effects)
+    def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False) -> Rendered:
+        """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`."""
+        return shown(self.model, self.backend, camera, replace(self.effects, outputs=tuple(outputs), exposure=exposure))
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
@@ -183,9 +184,16 @@ class Session:
 def shown(
     model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None
 ) -> Rendered:
-    """What the model, its splats changed by `form`, shows to a camera, and the effects that it called for."""
+    """What the model, its splats changed by `form`, shows to a camera, and the effects that it called for. Raises SettingsError."""
+    matrix = exposures_of(model).of(camera) if effects.exposure else None
     gaussians = model.gaussians(camera) if form is None else form(model.gaussians(camera))
     rendered = supersample.render(backend, gaussians, camera, effects)
+    if effects.outputs:
+        from mipmap_plugin.backends import geometry  # an effect that is off is not imported
+
+        rendered = geometry.beside(rendered, backend, gaussians, camera, effects)
+    if matrix is not None:
+        rendered = replace(rendered, image=exposed(rendered.image, matrix))
     return replace(rendered, effects=explain(effects, gaussians, effects_of(model)))
 
 

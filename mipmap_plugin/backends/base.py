@@ -22,7 +22,10 @@ class Rendered:
 
     image: Tensor  # [H, W, 3], background included, not clamped
     alpha: Tensor  # [H, W], 1 - transmittance
-    effects: tuple[Effect, ...] = ()  # what was simulated for it and what was not; a wrapped model says so, a backend need not
+    # What a wrapped model adds, and a backend need not.
+    depth: Tensor | None = None  # [H, W] world units, where asked for (`geometry.depth`)
+    normals: Tensor | None = None  # [H, W, 3] unit, world axes, where asked for (`geometry.normals`)
+    effects: tuple[Effect, ...] = ()  # what was simulated for it and what was not
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import refuse_existing
-from mipmap_plugin.scenes.images import write_image
+from mipmap_plugin.models.base import exposures_of
+from mipmap_plugin.scenes.images import write_array, write_image
 from mipmap_plugin.wrap import Wrapped
 
 
@@ -26,12 +27,15 @@ def render(
     screen_filter: Literal["trained", "scaled", "classic", "antialiased", "mip", "analytic", "window"] = "trained",
     supersampling: int = 1,
     filter_3d: bool = False,
+    depth: bool = False,
+    normals: bool = False,
+    exposure: bool = False,
     cameras: Path | None = None,
     background: Background | None = None,
     backend: str = "auto",
     overwrite: bool = False,
 ) -> None:
-    """Render views of a checkpoint as PNG files.
+    """Render views of a checkpoint as PNG files, and depth and normals beside them.
 
     Args:
         checkpoint: A PLY or a model folder.
@@ -41,6 +45,9 @@ def render(
         screen_filter: trained: what the checkpoint was trained with; scaled: the training-free filter for this scale.
         supersampling: N: N x N samples a pixel.
         filter_3d: Smooth every splat by what the cameras could see of it at best, as Mip-Splatting's 3D filter does.
+        depth: Also write NAME_depth.npy, [height, width] float32: world units along the optical axis, 0 where nothing is.
+        normals: Also write NAME_normals.npy, [height, width, 3] float32: unit vectors in world axes, 0 where nothing is.
+        exposure: Show each view by the exposure of its photograph, where training made one (exposure.json of 3DGS).
         cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         background: Of the scene; by default what the checkpoint says, else black.
         backend: A backend's name; auto takes the fastest that can do it.
@@ -48,14 +55,24 @@ def render(
     """
     wrapped = wrap(checkpoint, cameras, background, backend)
     views = _named(wrapped, view)
-    names = picture_names(views)
-    for name in names:
-        refuse_existing(output / name, overwrite)
-    for camera, name in zip(views, names, strict=True):
-        asked = None if screen_filter == "trained" else screen_filter
-        image = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, filter_3d).image
-        write_image(output / name, image, overwrite=overwrite)
+    asked = None if screen_filter == "trained" else screen_filter
+    outputs = [name for name, wanted in {"depth": depth, "normals": normals}.items() if wanted]
+    pictures = [output / name for name in picture_names(views)]
+    for camera, picture in zip(views, pictures, strict=True):
+        for path in (picture, *(_beside(picture, name) for name in outputs)):
+            refuse_existing(path, overwrite)
+        if exposure:
+            exposures_of(wrapped.model).of(camera)  # before anything is written
+    for camera, picture in zip(views, pictures, strict=True):
+        shown = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, filter_3d, outputs=outputs, exposure=exposure)
+        write_image(picture, shown.image, overwrite=overwrite)
+        for name in outputs:
+            write_array(_beside(picture, name), getattr(shown, name), overwrite=overwrite)
     print(f"{len(views)} pictures in {output}")
+
+
+def _beside(picture: Path, name: str) -> Path:
+    return picture.with_name(f"{picture.stem}_{name}.npy")
 
 
 def _named(wrapped: Wrapped, names: Sequence[str]) -> list[Camera]:

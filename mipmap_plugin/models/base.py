@@ -13,6 +13,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effect
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 
 # The name, among a model's parameters, of columns that go with their rows when rows are removed, and that never move: an anchor's
 # level, for example.
@@ -67,7 +68,9 @@ class SplatModel(Protocol):
 
     # Optional: a family whose rows are splats that look the same to every camera offers
     #     rebuild(form: Callable[[Gaussians], Gaussians]) -> None
-    # which holds what `form` makes of its splats instead of them. Without it, splats are never merged.
+    # which holds what `form` makes of its splats instead of them. Without it, splats are never merged. A family whose photographs
+    # were exposed differently has
+    #     exposures: Exposures
 
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
         """[N], 0..1, without gradient: how much each row of the parameters can show; rows that show nothing may be pruned."""
@@ -82,4 +85,9 @@ class SplatModel(Protocol):
 def effects_of(model: SplatModel) -> list[Effect]:
     """What a model does for a camera before any splat is drawn, as its method `effects` says: of `effects.OF_OTHER_MODELS`, those that
     it has. A family that has none needs no such method."""
-    return getattr(model, "effects", list)()
+    return [exposures_of(model).effect(), *getattr(model, "effects", list)()]
+
+
+def exposures_of(model: SplatModel) -> Exposures:
+    """By what training changed the colors for each photograph; nothing in most families."""
+    return getattr(model, "exposures", NO_EXPOSURES)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.files import new_folder, refuse_to_lose
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args
+from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 
 # Copied byte for byte: the cameras, and what SIBR's viewer and `load_ply` of 3DGS look for.
 COMPANIONS = ("cameras.json", "input.ply", "exposure.json")
@@ -59,15 +59,15 @@ def _screen_filter(options: dict[str, Any], tag: str | None) -> tuple[str, float
     return tag or TrainedScale.screen_filter, TrainedScale.eps2d
 
 
-def companion_notes(folder: Path | None, options: dict[str, Any], sh_degree: int) -> list[str]:
+def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposures) -> list[str]:
     """What differs from the plain case, in sentences."""
     notes = []
     if options.get("sh_degree", sh_degree) != sh_degree:
         notes.append(f"cfg_args says SH degree {options['sh_degree']}, but the PLY holds degree {sh_degree}; the PLY is trusted")
     if options.get("train_test_exp"):
-        notes.append("trained with train_test_exp: the original multiplies each training view by its exposure, which is not applied here")
-    if folder is not None and (folder / "exposure.json").is_file():
-        notes.append(_exposure_note(folder / "exposure.json"))
+        notes.append("trained with train_test_exp: the original shows each view by its exposure, which is done here only where asked for")
+    if exposures is not NO_EXPOSURES:
+        notes.append(exposures.found())
     return notes
 
 
@@ -93,15 +93,3 @@ def cfg_args_for(source: Path | None, target: Path, trained: TrainedScale, sh_de
     usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": False}
     white = trained.background == (1.0, 1.0, 1.0)
     return format_cfg_args({**usual, "white_background": white, **options, "sh_degree": sh_degree})
-
-
-def _exposure_note(path: Path) -> str:
-    try:
-        exposures = json.loads(path.read_text(encoding="utf-8"))
-        identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
-        changed = sum(matrix != identity for matrix in exposures.values())
-    except (OSError, ValueError, AttributeError, RecursionError) as error:
-        return f"exposure.json cannot be read ({error}); exposures are not applied here"
-    if not changed:
-        return "exposure.json holds only identities: no exposure was trained"
-    return f"exposure.json changes {changed} of {len(exposures)} views; the splats are rendered without exposure"

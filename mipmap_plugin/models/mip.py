@@ -55,6 +55,7 @@ class MipModel:
             raise ShapeError(f"{COLUMN}: expected shape [{len(splats)}], got {list(filter_3d.shape)}")
         self.family, self.splats, self.filter_3d = family, splats, filter_3d
         self.source, self.folder, self.digest, self.notes = splats.source, splats.folder, splats.digest, splats.notes
+        self.exposures = splats.exposures
 
     @property
     def trained(self) -> TrainedScale:

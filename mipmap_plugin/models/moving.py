@@ -44,6 +44,7 @@ class MovingModel:
     def __init__(self, family: str, canonical: VanillaModel, field: Field) -> None:
         self.family, self.canonical, self.field = family, canonical, field
         self.source, self.folder, self.digest, self.notes = canonical.source, canonical.folder, canonical.digest, canonical.notes
+        self.exposures = canonical.exposures
 
     @property
     def trained(self) -> TrainedScale:

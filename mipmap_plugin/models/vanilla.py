@@ -19,6 +19,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
+from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
@@ -45,6 +46,7 @@ class Origin:
     iteration: int | None = None
     comments: tuple[str, ...] = ()
     extras: dict[str, np.ndarray] = field(default_factory=dict)  # columns that 3DGS does not know, [N] each
+    exposures: Exposures = NO_EXPOSURES
     host: Host | None = None  # the other project whose file holds the splats; None: a PLY of 3DGS
 
 
@@ -67,7 +69,7 @@ class VanillaModel:
         self.host = origin.host
         if origin.host:
             self.family = origin.host.family
-        self.source, self.folder, self.digest = origin.source, origin.folder, origin.digest
+        self.source, self.folder, self.digest, self.exposures = origin.source, origin.folder, origin.digest, origin.exposures
         self.trained = trained
         self.notes: list[str] = list(notes)
 
@@ -203,10 +205,10 @@ def read_vanilla(found: Checkpoint) -> VanillaModel:
     parameters, extras = to_parameters(ply.columns, found.path), extra_columns(ply.columns)
     options, notes = read_options(found.folder)
     screen_filter = render_mode(ply.comments)
-    origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, ply.comments, extras)
+    origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, ply.comments, extras, read_exposures(found.folder))
     model = VanillaModel(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
     del ply  # as large as the model, and no longer needed by what follows
-    model.notes += companion_notes(found.folder, options, model.sh_degree)
+    model.notes += companion_notes(options, model.sh_degree, model.exposures)
     if screen_filter:
         model.notes.append(f"the header says that the splats were trained {screen_filter}, so they are rendered so")
     if extras:

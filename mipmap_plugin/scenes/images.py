@@ -1,4 +1,4 @@
-"""Image files: read, put on a background, write. Pillow (which scikit-image brings along) is used nowhere else."""
+"""Image files: read, put on a background, write; and arrays beside them. Pillow (which scikit-image brings along) is used nowhere else."""
 
 from __future__ import annotations
 
@@ -77,6 +77,16 @@ def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> 
     pixels = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     with new_file(path, overwrite) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
+    return path
+
+
+def write_array(path: str | Path, values: Tensor, *, overwrite: bool = False) -> Path:
+    """Write `values` as 32-bit floats of NumPy's .npy; return the path. Atomic; raises OutputExists, and SceneError for NaN and infinity."""
+    path = Path(path)
+    if not values.isfinite().all():
+        raise SceneError(f"{path}: the values hold NaN or infinity and are not written; check the render that they came from")
+    with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
+        np.save(file, values.detach().to("cpu", torch.float32).numpy())
     return path
 
 

@@ -38,12 +38,15 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
         "levels of detail": (False, "every splat is there at every distance"),
         "time": (False, "nothing moves"),
         "appearance embedding": (False, "all views share one appearance"),
+        "exposure": (False, "the checkpoint has none"),
         "3D filter": (False, "no splat has one"),
         "view-dependent color": (False, "SH up to degree 0 of 3: above it every coefficient is 0"),
         "screen filter": (True, "classic, 0.3 px²"),
         "compensation": (False, "the screen filter is classic"),
         "supersampling": (False, "1 sample a pixel"),
         "covariances": (False, "quaternions and scales suffice"),
+        "depth": (False, "not asked for"),
+        "normals": (False, "not asked for"),
         "upsampler": (False, "nothing is optimised"),
         "densification statistics": (False, "nothing is optimised"),
     }
@@ -53,7 +56,7 @@ def test_everything_on():
     splats = tiny.gaussians(4)
     given = Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, torch.eye(3).expand(4, 3, 3))
     of_model = [replace(effect, on=True) for effect in OF_OTHER_MODELS]
-    effects = explain(Effects(1, "antialiased", 0.1, supersampling=4), given, of_model, recipe("paper", 4), 4)
+    effects = explain(Effects(1, "antialiased", 0.1, supersampling=4, outputs=("depth", "normals")), given, of_model, recipe("paper", 4), 4)
     assert all(effect.on for effect in effects)
     reasons = {effect.name: effect.reason for effect in effects}
     assert [reasons[name] for name in ("supersampling", "covariances")] == ["16 samples a pixel", "the model gives them"]
@@ -68,7 +71,7 @@ def test_each_effect_tells_its_cost():
     said = {effect.name: str(effect) for effect in on}
     assert said["supersampling"] == "supersampling: on, 9 samples a pixel (costs 9 times the pixels)"
     assert said["view-dependent color"].endswith("(costs a direction and 9 of 16 coefficients a splat)")
-    assert str(off[5]).endswith("(saves a direction and 15 of 16 coefficients a splat)")
+    assert str(off[6]).endswith("(saves a direction and 15 of 16 coefficients a splat)")
     assert all(effect.reason and effect.cost for effect in (*on, *off))
 
 

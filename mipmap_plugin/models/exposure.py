@@ -1,0 +1,89 @@
+"""exposure.json of 3DGS (since 2024-08): what training made of the colors for each photograph, by the name of its image.
+
+The file is written by every training; only `--train_test_exp` makes it other than identities. As in the original, a view has the
+exposure of its name, also a test view, of which that option trains on a half.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from os.path import splitext
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import EXPOSURE, Effect
+from mipmap_plugin.errors import SettingsError
+
+FILE = "exposure.json"
+
+# What json and torch raise for text, values and shapes that are no matrices.
+UNREADABLE = (OSError, ValueError, TypeError, AttributeError, RuntimeError, RecursionError, OverflowError)
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures:
+    """Those of one checkpoint."""
+
+    matrices: Mapping[str, Tensor] = field(default_factory=dict)  # [3, 4] float64 by image name
+    why_none: str = EXPOSURE.reason
+
+    @property
+    def changed(self) -> int:
+        """How many are not the identity."""
+        return sum(not torch.equal(matrix, torch.eye(3, 4, dtype=matrix.dtype)) for matrix in self.matrices.values())
+
+    def effect(self) -> Effect:
+        """What there is, where it was not asked for."""
+        return replace(EXPOSURE, reason=self.found() + ", not asked for" * bool(self.changed))
+
+    def of(self, camera: Camera) -> Tensor:
+        """[3, 4] float64, of the image that `camera` is named after, with or without its suffix. Raises SettingsError where there is none."""
+        if not self.matrices:
+            raise SettingsError(f"exposure: {self.found()}; leave it out")
+        without_suffix = {splitext(name)[0]: matrix for name, matrix in self.matrices.items()}
+        matrix = self.matrices.get(camera.name, without_suffix.get(camera.name))
+        if matrix is None:
+            some = ", ".join(list(self.matrices)[:5])
+            raise SettingsError(f"view {camera.name!r} has no exposure; the first of {len(self.matrices)} that have one are {some}")
+        return matrix
+
+    def found(self) -> str:
+        """What there is, as the beginning of a sentence."""
+        if not self.matrices:
+            return self.why_none
+        if not self.changed:
+            return f"{FILE} holds only identities: no exposure was trained"
+        return f"{FILE} changes {self.changed} of {len(self.matrices)} images"
+
+
+NO_EXPOSURES = Exposures()
+
+
+def read_exposures(folder: Path | None) -> Exposures:
+    """The exposures of a model folder; none, with the reason, where its file is missing or cannot be read."""
+    if folder is None or not (folder / FILE).is_file():
+        return NO_EXPOSURES
+    try:
+        held = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        return Exposures({name: _matrix(name, rows) for name, rows in held.items()}, f"{FILE} names no image")
+    except UNREADABLE as error:
+        return Exposures(why_none=f"{FILE} cannot be read ({error})")
+
+
+def exposed(image: Tensor, matrix: Tensor) -> Tensor:
+    """`image` [H, W, 3] as its photograph has it: each color as a row times E[:, :3], plus E[:, 3] (gaussian_renderer of 3DGS). Not clamped."""
+    matrix = matrix.to(image)
+    return image @ matrix[:, :3] + matrix[:, 3]
+
+
+def _matrix(name: str, rows: Any) -> Tensor:
+    matrix = torch.tensor(rows, dtype=torch.float64)
+    if matrix.shape != (3, 4) or not matrix.isfinite().all():
+        raise ValueError(f"{name!r} is not three rows of four numbers")
+    return matrix
