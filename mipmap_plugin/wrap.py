@@ -21,7 +21,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig, Recipe
 from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.effects import DILATION, Effects
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel, TrainedScale, exposures_of
@@ -59,6 +59,14 @@ class Wrapped:
         """The backend that serves this model, and why it was taken."""
         needs = replace(self._needs, gradients=gradients, screen_filter=self.effects(screen_filter=screen_filter).screen_filter)
         return choose_backend(self._backend, needs)
+
+    def lacks(self, screen_filter: str) -> str:
+        """Why what renders this model does not have a screen filter, in a sentence; empty where it does."""
+        try:
+            self.backend(screen_filter=screen_filter)
+        except BackendUnavailable as error:
+            return str(error)
+        return ""
 
     def render(
         self,

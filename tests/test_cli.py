@@ -207,14 +207,29 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     code, out, _ = run(*words)
     assert code == 0
     assert "truth: P1" in out and "| x1 " in out and "| x0.25 " in out and "resized base" in out and "instant, held out" in out
-    rows = json.loads((tmp_path / "rows.json").read_text())
+    written = json.loads((tmp_path / "rows.json").read_text())
+    rows = written["rows"]
+    assert written["notes"] == []
     assert [row["name"] for row in rows][:2] == ["base", "naive"] and rows[0]["psnr_db"] > 50
     refused(run(*words), "rows.json exists already; pass --overwrite")
 
 
 def test_evaluate_as_json(run, model_folder, tmp_path):
     code, out, _ = run("evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1", "--json", "--backend", "reference")
-    assert code == 0 and json.loads(out)[0]["name"] == "base"
+    assert code == 0 and json.loads(out)["rows"][0]["name"] == "base"
+
+
+def test_evaluate_says_which_rows_are_missing_and_that_no_row_is_exposed(run, model_folder, tmp_path, monkeypatch):
+    few = replace(ReferenceBackend.capabilities, screen_filters=frozenset({"classic", "antialiased"}))
+    monkeypatch.setattr(ReferenceBackend, "capabilities", few)
+    (model_folder / "exposure.json").write_text(json.dumps({"view_0": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}))
+    words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--backend", "reference"]
+    exposed = "exposure.json changes 1 of 1 images, which is not applied here: part of every difference from a photograph is exposure"
+    missing = "there is no row 'window', since backend 'reference' cannot do this: it has the screen filters antialiased, classic, not window"
+    code, out, _ = run(*words, "--scale", "1/2")
+    assert code == 0 and out.splitlines()[-2:] == [missing, exposed] and "| window" not in out
+    code, out, _ = run(*words, "--scale", "1", "--json")
+    assert code == 0 and json.loads(out)["notes"] == [exposed]
 
 
 def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, model_folder, tmp_path):

@@ -52,7 +52,7 @@ def evaluate(
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
         seed: Everything random follows from it.
-        output: Also write the rows as JSON to this file.
+        output: Also write the rows, and notes on what they lack, as JSON to this file.
         overwrite: Replace that file if it exists.
         json: Print JSON instead of a table.
     """
@@ -64,17 +64,17 @@ def evaluate(
     perceptual = Perceptual(lpips, lpips_weights) if lpips else None
     settings = {name: value for name, value in dict(seed=seed, steps=steps, upsampler=upsampler).items() if value is not None}
     rows: list[Any] = []
+    notes: dict[str, None] = {}  # each once, in their order
     for each, folder in zip(checkpoint, images, strict=True):
         wrapped = wrap(each, None, background, backend, screen_filter)
         rows += evaluation.evaluate(wrapped, load_scene(folder), each_once(scale), recipe, protocol, perceptual, **settings)
+        notes |= dict.fromkeys(evaluation.notes(wrapped, scale))
     rows += evaluation.means(rows) if len(checkpoint) > 1 else []
+    facts = {"rows": records(rows), "notes": list(notes)}
     if output:
-        write_json(output, records(rows), overwrite)
-    if json:
-        tell(records(rows), json)
-    else:
-        print(f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views")
-        _print_tables(rows, published, each_once(scale))
+        write_json(output, facts, overwrite)
+    title = f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views"
+    tell(facts, json) if json else _print_tables(title, rows, [*notes], published, each_once(scale))
 
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], output: Path | None, overwrite: bool) -> None:
@@ -88,11 +88,11 @@ def _listed(paths: Sequence[Path]) -> str:
     return ", ".join(map(str, paths))
 
 
-def _print_tables(rows: Sequence[Any], dataset: Any, scales: list[float]) -> None:
+def _print_tables(title: str, rows: Sequence[Any], notes: Sequence[str], dataset: Any, scales: list[float]) -> None:
     from mipmap_plugin.evaluation.published import TITLE, published
     from mipmap_plugin.evaluation.report import published_table, table
 
-    print(table(rows))
+    print("\n".join([title, table(rows), *notes]))
     if dataset:
         print(f"\npublished, {TITLE[dataset]}; rows of different protocols are not comparable")
         print(published_table(published(dataset, scales)))

@@ -16,12 +16,15 @@ from tqdm import tqdm
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import Recipe
-from mipmap_plugin.errors import BackendUnavailable, SettingsError
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, resized_base, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, not_exposed, resized_base, test_views
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.wrap import Adapted, Wrapped
+
+# Screen filters that need no training, for the rows beside the base as it is.
+FILTERS = ("scaled", "window", "antialiased")
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,7 @@ def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: st
     def resized(by: str) -> Callable[[Camera], Tensor]:
         return lambda camera: resized_base(model.render(camera).image.clamp(0, 1), camera.zoomed(scale).size, by)
 
-    served = [name for name in ("scaled", "window", "antialiased") if name not in without and _served(model, name)]
+    served = [name for name in FILTERS if name not in without and not model.lacks(name)]
     shows = {"naive": filtered(None), **{name: filtered(name) for name in served}, "resized base": resized("bicubic")}
     if scale > 1 and upsampler != "bicubic":
         shows[f"base upsampled by {Path(upsampler).name}"] = resized(upsampler)
@@ -97,13 +100,11 @@ def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: st
     return [judge.row(name, scale, show, gaussians=count) for name, show in shows.items()]
 
 
-def _served(model: Wrapped, screen_filter: str) -> bool:
-    """Whether the backend that was asked for has the filter."""
-    try:
-        model.backend(screen_filter=screen_filter)
-    except BackendUnavailable:
-        return False
-    return True
+def notes(model: Wrapped, scales: Sequence[float]) -> list[str]:
+    """What the rows of these scales do not have, in sentences."""
+    missing = {name: model.lacks(name) for name in FILTERS if any(scale != 1 for scale in scales)}
+    told = [f"there is no row {name!r}, since {why}" for name, why in missing.items() if why]
+    return told + not_exposed(model.model)
 
 
 def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:

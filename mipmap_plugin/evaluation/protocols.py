@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models.base import SplatModel, exposures_of
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.scenes.images import image_size, read_image
 
@@ -101,6 +102,12 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to judge by")
     return [TestView(as_sampled(camera, base), scene.image(camera, background), scene.images[camera], background) for camera in cameras]
+
+
+def not_exposed(model: SplatModel) -> list[str]:
+    """That photographs have exposures of their own, in a sentence, where the model knows of them; none is applied in judging."""
+    exposures = exposures_of(model)
+    return [f"{exposures.found()}, which is not applied here: part of every difference from a photograph is exposure"] if exposures.changed else []
 
 
 def resized_base(render: Tensor, size: tuple[int, int], upsampler: str = "bicubic") -> Tensor:

@@ -20,7 +20,7 @@ from mipmap_plugin.backends.filters import SCREEN_FILTERS
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings
-from mipmap_plugin.errors import BackendUnavailable, SettingsError
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.protocols import resized_base
 from mipmap_plugin.evaluation.tradeoff_truth import Yardstick
 from mipmap_plugin.models.base import SplatModel
@@ -132,21 +132,23 @@ def _free_ways(model: Wrapped, scale: float, supersampling: Sequence[int]) -> li
         return resized_base(model.render(view).image.clamp(0, 1), view.zoomed(scale).size)
 
     own = model.backend()[0].name
-    served = {name: _backend_for(model, name) for name in sorted(SCREEN_FILTERS - {model.trained.screen_filter})}
+    served = [name for name in _other_filters(model) if not model.lacks(name)]
     ways: list[tuple[Kind, str, str, Show]] = [("base", "base as it is", own, rendered(None)), ("filter", "scaled filter", own, rendered("scaled"))]
-    ways += [("filter", f"{name} filter", backend, rendered(name)) for name, backend in served.items() if backend]
+    ways += [("filter", f"{name} filter", model.backend(screen_filter=name)[0].name, rendered(name)) for name in served]
     enough = max(2, math.ceil(1 / scale))  # samples as fine as the base's own pixels; finer ones show nothing more
     ways += [("supersampling", f"{n} x {n} samples", own, rendered("scaled", n)) for n in supersampling if n <= enough]
     ways += [("supersampling" if scale < 1 else "filter", RESIZED, own, resized)]
     return [(*way, count) for way in ways]
 
 
-def _backend_for(model: Wrapped, screen_filter: str) -> str | None:
-    """The name of the backend that draws with another filter than the base's; None where the one asked for lacks it."""
-    try:
-        return model.backend(screen_filter=screen_filter)[0].name
-    except BackendUnavailable:
-        return None
+def _other_filters(model: Wrapped) -> list[str]:
+    return sorted(SCREEN_FILTERS - {model.trained.screen_filter})
+
+
+def left_out(model: Wrapped, plan: Plan) -> list[str]:
+    """The filters that a backend of the plan lacks, in sentences."""
+    on = [on_backend(model, name) for name in plan.backends]
+    return [f"there is no {name} filter, since {why}" for each in on for name in _other_filters(each) if (why := each.lacks(name))]
 
 
 def _judged(point: Point, show: Show, yardstick: Yardstick, repeats: int) -> Point:

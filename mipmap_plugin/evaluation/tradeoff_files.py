@@ -40,7 +40,8 @@ def _facts_of(each: Tradeoff) -> dict[str, Any]:
     fronts = (front(files(each.points), seconds), front(frames(each.points), milliseconds))
     told = dict(zip(("seconds", "frames"), each.sentences(), strict=True))
     marks = [{"on_front_of_seconds": point in fronts[0], "on_front_of_frames": point in fronts[1]} for point in each.points]
-    return {"scale": each.scale, "truth": each.truth, "sentences": told, "points": [asdict(p) | m for p, m in zip(each.points, marks, strict=True)]}
+    points = [asdict(point) | mark for point, mark in zip(each.points, marks, strict=True)]
+    return {"scale": each.scale, "truth": each.truth, "sentences": told, "notes": each.notes, "points": points}
 
 
 def write(folder: Path, tradeoffs: Sequence[Tradeoff], *, complete: bool, picture: bool, overwrite: bool) -> None:
@@ -69,7 +70,7 @@ def _flat(point: Point) -> dict[str, Any]:
 
 
 def table(each: Tradeoff) -> str:
-    """The ends of all runs and everything beside them, best first, with what the dB are of and both sentences."""
+    """The ends of all runs and everything beside them, best first, with what the dB are of, both sentences and what is missing."""
     best = front(files(each.points), seconds), front(frames(each.points), milliseconds)
     body = [
         [point.name, point.backend, _text(point.psnr_db, 2), _text(point.adapt_seconds, 2), _text(point.ms_per_frame, 1), f"{point.gaussians:,}",
@@ -77,7 +78,7 @@ def table(each: Tradeoff) -> str:
         for point in sorted(frames(each.points), key=lambda point: -point.psnr_db.median)
     ]  # fmt: skip
     head = ["what", "backend", "dB", "adapt s", "ms/frame", "splats", "front", "ended by"]
-    return "\n".join([f"x{each.scale:g}, {each.truth}", markdown(head, body), *each.sentences()])
+    return "\n".join([f"x{each.scale:g}, {each.truth}", markdown(head, body), *each.sentences(), *each.notes])
 
 
 def _text(spread: Spread | None, digits: int) -> str:

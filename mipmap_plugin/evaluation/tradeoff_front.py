@@ -18,6 +18,7 @@ class Tradeoff:
     scale: float
     truth: str
     points: list[Point]
+    notes: Sequence[str] = ()  # what is not among them
 
     def sentences(self) -> tuple[str, str]:
         """What was found: of adapting, and of frames."""

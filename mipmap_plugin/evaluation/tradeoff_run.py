@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.tradeoff import Plan, measure
+from mipmap_plugin.evaluation.protocols import not_exposed
+from mipmap_plugin.evaluation.tradeoff import Plan, left_out, measure
 from mipmap_plugin.evaluation.tradeoff_files import write
 from mipmap_plugin.evaluation.tradeoff_front import Tradeoff
 from mipmap_plugin.evaluation.tradeoff_truth import base_itself, photographs
@@ -25,7 +26,8 @@ def run(
     if 1 in scales:
         raise SettingsError("at scale 1 the base is right as it is, and nothing is to be traded; give another scale")
     yardsticks = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
-    found = [Tradeoff(scale, yardstick.label, []) for scale, yardstick in zip(scales, yardsticks, strict=True)]
+    notes = left_out(model, plan) + (not_exposed(model.model) if scene else [])
+    found = [Tradeoff(scale, yardstick.label, [], notes) for scale, yardstick in zip(scales, yardsticks, strict=True)]
     try:
         for each, yardstick in zip(found, yardsticks, strict=True):
             for point in measure(model, yardstick, each.scale, plan):

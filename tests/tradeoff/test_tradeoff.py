@@ -17,6 +17,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.evaluation import tradeoff as measuring
 from mipmap_plugin.evaluation.tradeoff import LOOKS, RENDERERS, Plan, measure
 from mipmap_plugin.evaluation.tradeoff_files import facts, table
+from mipmap_plugin.evaluation.tradeoff_front import Tradeoff
 from mipmap_plugin.evaluation.tradeoff_run import run
 from mipmap_plugin.evaluation.tradeoff_truth import base_itself, photographs
 from mipmap_plugin.scenes import load_scene
@@ -90,6 +91,18 @@ def test_everything_that_needs_no_adapting_stands_beside_the_adapted(points):
     assert filters == {"scaled filter", *(f"{name} filter" for name in SCREEN_FILTERS - {"classic"})}
     assert [point.name for point in points if point.kind == "supersampling"] == ["2 x 2 samples"]  # the base, resized, is the truth
     assert all(point.adapt_seconds.high == 0 for point in points if point.kind in ("base", "filter", "supersampling"))
+
+
+def test_a_filter_that_the_backend_lacks_is_named(monkeypatch):
+    few = replace(ReferenceBackend.capabilities, screen_filters=frozenset({"classic", "antialiased", "mip", "analytic"}))
+    monkeypatch.setattr(ReferenceBackend, "capabilities", few)
+    [note] = measuring.left_out(wrapped(), PLAN)
+    assert note.startswith("there is no window filter, since backend 'reference' cannot do this: ") and note.endswith("not window")
+    names = [name for kind, name, *_ in measuring._free_ways(wrapped(), 1 / 4, ()) if kind == "filter"]
+    assert names == ["scaled filter", "analytic filter", "antialiased filter", "mip filter"]
+    one = measuring.Point(1 / 4, "base", "base as it is", "reference", 30, ms_per_frame=measuring.NOTHING)
+    found = Tradeoff(1 / 4, "dB", [one], [note])
+    assert table(found).endswith(note) and facts([found], complete=True)["scales"][0]["notes"] == [note]
 
 
 @pytest.mark.parametrize(("scale", "samples"), [(1 / 4, [2, 4]), (4, [2])])
