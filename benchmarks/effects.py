@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -28,13 +29,14 @@ import moving
 
 from mipmap_plugin import Camera, Effects, Gaussians, load_model, wrap_model
 from mipmap_plugin.adaptation.upsamplers import find_upsampler
-from mipmap_plugin.backends import choose_backend, supersample
+from mipmap_plugin.backends import choose_backend, geometry, supersample
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.files import new_file
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.deformable import DeformNetwork
+from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.hexplane import HexPlane
 from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.models.moving import MovingModel
@@ -55,6 +57,7 @@ class Pair:
     off: Draw
     needed: bool  # by the scene: then the image is another one without it, else the very same
     backward: bool = True
+    change: str = "another image"  # where it is needed
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,23 @@ def pairs(bench: Bench, folder: Path) -> Iterator[Pair]:
     yield Pair("screen filter: analytic", "Analytic-Splatting", bench.draw(full.gaussians, Effects(3, "analytic", 0.0)), classic, True)
     for n in (2, 4):
         yield Pair(f"supersampling, {n} x {n}", "any", bench.draw(full.gaussians, Effects(3, supersampling=n)), classic, True)
+    yield from _asked_for(bench, full)
     yield from _adapting(bench)
+
+
+def _asked_for(bench: Bench, model: VanillaModel) -> Iterator[Pair]:
+    """What a person asks for beside the image, or of its colors."""
+    image, camera = bench.draw(model.gaussians), bench.camera
+
+    def with_(draw: Callable[..., Tensor]) -> Tensor:
+        gaussians = model.gaussians(camera)
+        shown = bench.backend.render(gaussians, camera, Effects(3)).image
+        return torch.cat([shown, draw(bench.backend, gaussians, camera, Effects(3)).reshape(*camera.size, -1)], -1)
+
+    for name, draw in {"depth": geometry.depth, "normals": geometry.normals}.items():
+        yield Pair(name, "any", partial(with_, draw), image, True, change="the same, and more")
+    matrix = torch.tensor([[1.1, 0.0, 0.0, 0.02], [0.0, 0.9, 0.1, 0.0], [0.0, 0.0, 1.2, -0.01]])
+    yield Pair("exposure", "3DGS with train_test_exp", lambda: exposed(image(), matrix), image, True)
 
 
 def _fields(bench: Bench) -> Iterator[Pair]:
@@ -193,7 +212,7 @@ def row(pair: Pair, runs: int) -> list[str]:
     ahead, both, difference = measure(pair, runs)
     costs = [f"{c.on_ms:.1f}" if c else "-" for c in (ahead, both)], [f"{c.off_ms:.1f}" if c else "-" for c in (ahead, both)]
     ratios = [f"{c.on_ms / c.off_ms:.2f}" if c and c.off_ms > 0.1 else "-" for c in (ahead, both)]
-    change = "another image" if pair.needed else f"{difference:.0e}"
+    change = pair.change if pair.needed else f"{difference:.0e}"
     return [pair.effect, pair.scene, costs[0][0], costs[1][0], ratios[0], costs[0][1], costs[1][1], ratios[1], change]
 
 
@@ -219,9 +238,10 @@ def main(output: Path = Path("benchmarks/results/effects.md"), backend: str = "a
 Made by `python benchmarks/effects.py`, backend `{bench.backend.name}`. CPU milliseconds of one thread, medians of {runs} runs, on and off in turn.
 Scene {scene}: {len(bench.model()):,} splats at {bench.camera.width} x {bench.camera.height} px. The ratio is on over off.
 
-Where the scene calls for an effect, leaving it out gives another image, and the ratio is what the effect costs. Where it does not, the
-image is the same but for the difference given, and the ratio is what is saved. (The 2e-03 is one pixel, on which one splat lies at the alpha
-threshold of 1/255. At scale 1, "on" optimises a base that is right as it is.)
+Where the scene calls for an effect, or a person asks for it, leaving it out gives another image, or the same without depth or normals
+beside it, and the ratio is what the effect costs. Where it is not called for, the image is the same but for the difference given, and the
+ratio is what is saved. (The 2e-03 is one pixel, on which one splat lies at the alpha threshold of 1/255. At scale 1, "on" optimises a base
+that is right as it is.)
 
 {markdown(head, body)}
 """
