@@ -125,11 +125,11 @@ def test_images_that_were_exposed_differently_are_not_adapted_to(tmp_path):
 
 
 def test_the_command_asks_for_it(tmp_path, capsys):
-    base(tmp_path / "a", {"view_1": WARM})
+    base(tmp_path / "a", {"view_0": WARM})
     words = ["render", str(tmp_path / "a"), "--output", str(tmp_path / "out"), "--backend", "reference"]
     assert cli.main([*words, "--exposure"]) == 2
-    assert "view 'view_0' has no exposure" in capsys.readouterr().err and not (tmp_path / "out").exists()
-    assert cli.main([*words, "--view", "view_1"]) == 0
-    plain = (tmp_path / "out/train_view_1.png").read_bytes()
-    assert cli.main([*words, "--view", "view_1", "--exposure", "--overwrite"]) == 0
-    assert (tmp_path / "out/train_view_1.png").read_bytes() != plain
+    assert "view 'view_1' has no exposure" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert cli.main([*words, "--view", "view_0"]) == 0
+    plain = (tmp_path / "out/train_view_0.png").read_bytes()
+    assert cli.main([*words, "--view", "view_0", "--exposure", "--overwrite"]) == 0
+    assert (tmp_path / "out/train_view_0.png").read_bytes() != plain

@@ -11,7 +11,8 @@ import tiny
 import torch
 
 from mipmap_plugin import cli
-from mipmap_plugin.backends import get_backend
+from mipmap_plugin.backends import geometry, get_backend
+from mipmap_plugin.backends.conformance.cases import CASES
 from mipmap_plugin.backends.geometry import facing
 from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -75,6 +76,12 @@ def test_the_depth_of_a_plane_is_its_distance_along_the_axis_even_in_the_corners
     torch.testing.assert_close(shown.depth, torch.full_like(shown.depth, distance), rtol=2e-6, atol=0)
 
 
+def test_the_depth_of_what_is_very_near_is_as_exact(backend):
+    camera = replace(view(), viewmat=torch.eye(4))
+    shown = wrapped(sheet(camera, 0.002), backend, near_plane=0.001).render(camera, outputs=["depth"])
+    torch.testing.assert_close(shown.depth, torch.full_like(shown.depth, 0.002), rtol=2e-6, atol=0)
+
+
 def test_behind_a_veil_the_depth_is_the_mean_of_what_is_seen(backend):
     at = torch.linalg.inv(view().viewmat) @ torch.tensor([[0, 0, 2, 1], [0, 0, 5, 1]], dtype=torch.float64).T
     splats = flat(at.T[:, :3], [1.0, 0, 0, 0], 50.0)
@@ -131,6 +138,20 @@ def test_covariances_say_the_same_and_a_broken_one_spoils_no_other():
     covariances[0] = math.nan
     found = facing(replace(splats, covariances=covariances), view())
     torch.testing.assert_close(found[1:], facing(splats, view())[1:], atol=1e-3, rtol=0)
+
+
+# Hard cases
+
+
+@pytest.mark.parametrize("screen_filter", ["classic", "mip"])
+def test_hard_cases_have_depths_and_directions_that_are_finite(backend, screen_filter):
+    able = get_backend(backend)
+    cases = {name: CASES[name]() for name in CASES if name.endswith(f"-{screen_filter}")}
+    assert len(cases) > 40
+    for name, case in cases.items():
+        scene = able, case.gaussians.to(dtype=torch.float32), case.camera, case.effects
+        far, turned = geometry.depth(*scene), geometry.normals(*scene)
+        assert far.isfinite().all() and (far >= 0).all() and turned.isfinite().all(), name
 
 
 # Beside the image
