@@ -79,7 +79,7 @@ class Capabilities:
 
 
 class Backend(Protocol):
-    """What turns Gaussians into an image. One sample per pixel; supersampling is built on top (`supersample.py`)."""
+    """What turns Gaussians into an image. One sample per pixel: supersampling, depth and normals are built on top (`supersample`, `geometry`)."""
 
     name: str
     api_version: int
