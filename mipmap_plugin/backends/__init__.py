@@ -15,6 +15,7 @@ BACKENDS = Registry(
         "cpu": "mipmap_plugin.backends.cpu:CpuBackend",
         "gsplat": "mipmap_plugin.backends.gsplat:GsplatBackend",
         "inria": "mipmap_plugin.backends.inria:InriaBackend",
+        "triton": "mipmap_plugin.backends.triton:TritonBackend",
     },
 )
 

@@ -1,0 +1,92 @@
+"""The gradients of the records, back to means, quaternions, scales or covariances, opacities and harmonics. One splat a lane."""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from mipmap_plugin.backends.triton_kernels import views
+from mipmap_plugin.backends.triton_kernels.harmonics import color, color_back
+from mipmap_plugin.backends.triton_kernels.projection import direction, flat, place
+from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD
+from mipmap_plugin.backends.triton_kernels.shapes import from_axes_back, from_covariance_back, load_quat
+from mipmap_plugin.backends.triton_kernels.vectors import dot, load3, store3
+from mipmap_plugin.backends.triton_kernels.views import frozen, image_axis, in_world, rotation_row
+
+EPS2D, LEAST, FX, FY = views.EPS2D, views.LEAST, views.FX, views.FY
+
+
+@triton.jit
+def filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_strength, COMPENSATES: tl.constexpr):
+    """Gradients of xx, xy, yy, det, without the filter, and of the opacity from those of a record's falloff."""
+    eps2d = tl.load(view + EPS2D)
+    wide_yy = yy + eps2d
+    wide = det + eps2d * (xx + yy) + eps2d * eps2d
+    across = wide / wide_yy
+    d_width = d_across * HALF_LOG2_E / (across * across)
+    d_yy = (d_along * HALF_LOG2_E / wide_yy - d_shear * xy / wide_yy - d_width * across) / wide_yy
+    d_wide, d_xy = d_width / wide_yy, d_shear / wide_yy
+    d_opacity, d_det = d_strength / (opacity * LN_2), tl.zeros_like(det)
+    if COMPENSATES:
+        share = det / wide
+        light = tl.sqrt(tl.maximum(share, tl.load(view + LEAST)))
+        d_share = tl.where(share < tl.load(view + LEAST), 0.0, d_strength / (light * light * (2 * LN_2)))
+        d_det, d_wide = d_share / wide, d_wide - d_share * share / wide
+    return d_wide * eps2d, d_xy, d_yy + d_wide * eps2d, d_det + d_wide, d_opacity
+
+
+@triton.jit
+def place_back(view, eye, safe, u, v, dt, dr, d_x, d_y):
+    """Gradient of the place in the world from those of the image axes and of the center on the image."""
+    right, down, ahead = rotation_row(view, 0), rotation_row(view, 1), rotation_row(view, 2)
+    per_x, per_y = tl.load(view + FX) / safe, tl.load(view + FY) / safe
+    slope_x, slope_y = eye[0] / safe, eye[1] / safe
+    d_u = tl.where(u == slope_x, -per_x * dot(*dt, *ahead), 0.0) + d_x * tl.load(view + FX)
+    d_v = tl.where(v == slope_y, -per_y * dot(*dr, *ahead), 0.0) + d_y * tl.load(view + FY)
+    d_per_x = dot(*dt, right[0] - u * ahead[0], right[1] - u * ahead[1], right[2] - u * ahead[2])
+    d_per_y = dot(*dr, down[0] - v * ahead[0], down[1] - v * ahead[1], down[2] - v * ahead[2])
+    d_depth = -(d_per_x * per_x + d_per_y * per_y + d_u * slope_x + d_v * slope_y) / safe
+    return in_world(view, d_u / safe, d_v / safe, d_depth)
+
+
+@triton.jit
+def project_back_kernel(
+    means, quats, scales, covariances, opacities, sh, view, depths, pulls, d_means, d_quats, d_scales, d_covariances, d_opacities, d_sh, count,
+    GIVEN: tl.constexpr, COMPENSATES: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
+    inside = at < count
+    drawn = inside & (tl.load(depths + at, inside, float("inf")) < float("inf"))
+    pull = pulls + at * RECORD
+    d_x, d_y, d_along = load3(pull, drawn)
+    d_shear, d_across, d_strength = load3(pull + 3, drawn)
+    d_red, d_green, d_blue = load3(pull + 6, drawn)
+    world, eye, safe = place(view, means, at, drawn)
+    dx, dy, dz, per = direction(world)
+    coefficients = sh + at * (3 * BANDS)
+    red, green, blue = color(coefficients, dx, dy, dz, drawn, DEGREE)
+    d_red, d_green, d_blue = tl.where(red < -0.5, 0.0, d_red), tl.where(green < -0.5, 0.0, d_green), tl.where(blue < -0.5, 0.0, d_blue)
+    out = d_sh + at * (3 * BANDS)
+    px, py, pz = color_back(coefficients, out, dx, dy, dz, d_red, d_green, d_blue, drawn, inside, DEGREE)
+    for band in tl.static_range((DEGREE + 1) * (DEGREE + 1), BANDS):
+        store3(out + 3 * band, tl.zeros_like(px), tl.zeros_like(px), tl.zeros_like(px), inside)
+    along = px * dx + py * dy + pz * dz  # a splat that moves along its ray keeps its color
+
+    xx, xy, yy, det = flat(view, eye, safe, quats, scales, covariances, at, drawn, GIVEN)
+    opacity = tl.load(opacities + at, drawn, 1.0)
+    d_xx, d_xy, d_yy, d_det, d_opacity = filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_strength, COMPENSATES)
+    tl.store(d_opacities + at, tl.where(drawn, d_opacity, 0.0), inside)
+    # Rows that are not drawn were read as zeros; what follows from zeros may still be NaN.
+    d_xx, d_xy = tl.where(drawn, d_xx, 0.0), tl.where(drawn, d_xy, 0.0)
+    d_yy, d_det = tl.where(drawn, d_yy, 0.0), tl.where(drawn, d_det, 0.0)
+    u, v = frozen(view, eye[0] / safe, eye[1] / safe)
+    t = image_axis(view, u, tl.load(view + FX) / safe, 0)
+    r = image_axis(view, v, tl.load(view + FY) / safe, 1)
+    if GIVEN:
+        dt, dr = from_covariance_back(covariances + 9 * at, drawn, t, r, d_xx, d_xy, d_yy, d_det, d_covariances + 9 * at, inside)
+    else:
+        quat, scale = load_quat(quats + 4 * at, drawn), load3(scales + 3 * at, drawn)
+        dt, dr = from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quats + 4 * at, d_scales + 3 * at, inside)
+    mx, my, mz = place_back(view, eye, safe, u, v, dt, dr, d_x, d_y)
+    mx, my, mz = mx + per * (px - along * dx), my + per * (py - along * dy), mz + per * (pz - along * dz)
+    store3(d_means + 3 * at, tl.where(drawn, mx, 0.0), tl.where(drawn, my, 0.0), tl.where(drawn, mz, 0.0), inside)

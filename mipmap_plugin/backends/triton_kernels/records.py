@@ -1,0 +1,49 @@
+"""What the tiles need of a splat: nine numbers, whose logarithms spare every pixel a product and a division.
+
+alpha = 2^(along · dy² + across · (dx - shear · dy)² + strength), with along = -log2(e)/2 / yy, across = -log2(e)/2 · yy / det and
+strength = log2 of the opacity; yy, shear and det are those of `filters.Footprint`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import triton
+import triton.language as tl
+
+from mipmap_plugin.backends.triton_kernels import RECORD as WIDTH
+
+RECORD = tl.constexpr(WIDTH)
+HALF_LOG2_E = tl.constexpr(0.5 * math.log2(math.e))
+LN_2 = tl.constexpr(math.log(2))
+
+
+@triton.jit
+def falloff(records, at, mask):
+    """x, y, along, shear, across, strength of the splats `at` [B]."""
+    row = records + at * RECORD
+    x, y = tl.load(row, mask, 0.0), tl.load(row + 1, mask, 0.0)
+    along, shear = tl.load(row + 2, mask, 0.0), tl.load(row + 3, mask, 0.0)
+    across, strength = tl.load(row + 4, mask, 0.0), tl.load(row + 5, mask, 0.0)
+    return x, y, along, shear, across, strength
+
+
+@triton.jit
+def paint(records, at, mask):
+    """Red, green, blue of the splats `at` [B]."""
+    row = records + at * RECORD + 6
+    return tl.load(row, mask, 0.0), tl.load(row + 1, mask, 0.0), tl.load(row + 2, mask, 0.0)
+
+
+@triton.jit
+def store_nine(rows, a, b, c, d, e, f, g, h, i, mask):
+    """Nine numbers [B] side by side at the pointers `rows` [B]."""
+    tl.store(rows, a, mask)
+    tl.store(rows + 1, b, mask)
+    tl.store(rows + 2, c, mask)
+    tl.store(rows + 3, d, mask)
+    tl.store(rows + 4, e, mask)
+    tl.store(rows + 5, f, mask)
+    tl.store(rows + 6, g, mask)
+    tl.store(rows + 7, h, mask)
+    tl.store(rows + 8, i, mask)

@@ -1,0 +1,63 @@
+"""Vectors and rotations of one splat a lane, as tuples of numbers; reads and writes of a few numbers a row."""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+LARGEST = tl.constexpr(3.4e38)
+
+
+@triton.jit
+def finite(a):
+    return tl.abs(a) <= LARGEST  # False for NaN
+
+
+@triton.jit
+def load3(rows, mask):
+    return tl.load(rows, mask, 0.0), tl.load(rows + 1, mask, 0.0), tl.load(rows + 2, mask, 0.0)
+
+
+@triton.jit
+def store3(rows, a, b, c, mask):
+    tl.store(rows, a, mask)
+    tl.store(rows + 1, b, mask)
+    tl.store(rows + 2, c, mask)
+
+
+@triton.jit
+def dot(ax, ay, az, bx, by, bz):
+    return ax * bx + ay * by + az * bz
+
+
+@triton.jit
+def cross(ax, ay, az, bx, by, bz):
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@triton.jit
+def unit(w, x, y, z):
+    """A quaternion over its length, and 1 / length; of a zero quaternion zeros, whose rotation is the identity."""
+    squared = w * w + x * x + y * y + z * z
+    scale = tl.where(squared == 0, 0.0, tl.rsqrt(tl.where(squared == 0, 1.0, squared)))
+    return w * scale, x * scale, y * scale, z * scale, scale
+
+
+@triton.jit
+def columns(w, x, y, z):
+    """The columns of a unit quaternion's rotation matrix."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@triton.jit
+def columns_back(w, x, y, z, a, b, c):
+    """Gradient of w, x, y, z from those of the columns a, b, c of `columns`."""
+    dw = 2 * (x * (b[2] - c[1]) + y * (c[0] - a[2]) + z * (a[1] - b[0]))
+    dx = 2 * (w * (b[2] - c[1]) + y * (a[1] + b[0]) + z * (a[2] + c[0]) - 2 * x * (b[1] + c[2]))
+    dy = 2 * (w * (c[0] - a[2]) + x * (a[1] + b[0]) + z * (b[2] + c[1]) - 2 * y * (a[0] + c[2]))
+    dz = 2 * (w * (a[1] - b[0]) + x * (a[2] + c[0]) + y * (b[2] + c[1]) - 2 * z * (a[0] + b[1]))
+    return dw, dx, dy, dz

@@ -1,0 +1,94 @@
+"""The Triton backend where there is no GPU: its kernels compile, and it says what is missing. What they compute: `test_triton_interpreted.py`."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from samples import camera, gaussians
+
+from mipmap_plugin.backends import BACKENDS, survey
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.conformance import check_backend
+from mipmap_plugin.backends.guests import NO_CUDA
+from mipmap_plugin.backends.triton import NO_TRITON, TritonBackend, interpreted
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import BackendUnavailable
+
+MISSING = importlib.util.find_spec("triton") is None
+pytestmark = pytest.mark.skipif(interpreted(), reason="under the interpreter nothing is compiled, and a processor will do")
+USUAL = Needs("cuda", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+
+FLOAT, INT32, INT64 = "*fp32", "*i32", "*i64"
+TYPES = {"members": INT32, "owners": INT32, "boxes": INT32, "counts": INT32, "tiles": "*i16", "edges": INT64, "places": INT64, "starts": INT64}
+TYPES |= dict.fromkeys(("count", "width", "height", "columns", "rows", "nowhere"), "i32")
+
+
+def compile_for(capability: int, kernel, warps: int = 4, **constants) -> str:
+    """The kernel's assembly for a compute capability, by the very compiler that a GPU's machine has."""
+    import triton
+    from triton.backends.compiler import GPUTarget
+    from triton.compiler import ASTSource
+
+    signature = {name: "constexpr" if name in constants else TYPES.get(name, FLOAT) for name in kernel.arg_names}
+    compiled = triton.compile(ASTSource(kernel, signature, constants), target=GPUTarget("cuda", capability, 32), options={"num_warps": warps})
+    assert compiled.asm["cubin"]
+    return compiled.asm["ptx"]
+
+
+@pytest.mark.skipif(MISSING, reason="triton is not installed")
+@pytest.mark.parametrize("capability", [80, pytest.param(75, marks=pytest.mark.slow), pytest.param(90, marks=pytest.mark.slow)])
+def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeypatch):
+    monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
+    from mipmap_plugin.backends import triton_kernels as sizes
+    from mipmap_plugin.backends.triton_kernels import binning, compositing, compositing_back, projection, projection_back
+
+    splat = {"COMPENSATES": True, "DEGREE": 1, "BANDS": 4, "BLOCK": sizes.SPLATS}
+    for given in (False, True):
+        compile_for(capability, projection.project_kernel, GIVEN=given, TILE=sizes.TILE, **splat)
+        compile_for(capability, projection_back.project_back_kernel, GIVEN=given, **splat)
+    compile_for(capability, binning.emit_kernel, TILE=sizes.TILE, BLOCK=sizes.PAIRS)
+    compile_for(capability, compositing.composite_kernel, sizes.WARPS_OF_MANY, TILE=sizes.TILE, BATCH=sizes.FORWARD_BATCH)
+    for in_order in (False, True):
+        back = {"TILE": sizes.TILE, "BATCH": sizes.BACKWARD_BATCH, "DETERMINISTIC": in_order}
+        ptx = compile_for(capability, compositing_back.composite_back_kernel, sizes.WARPS_OF_FEW, **back)
+        assert ("atom" in ptx or "red.global" in ptx) != in_order
+    compile_for(capability, compositing_back.gather_kernel, 1, ROWS=32)
+
+
+def test_what_is_missing_is_said(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert TritonBackend().lacking(USUAL) == [NO_TRITON if MISSING else NO_CUDA]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert TritonBackend().lacking(USUAL) == []
+    assert TritonBackend().lacking(replace(USUAL, screen_filter="window")) == ["it has the screen filters antialiased, classic, mip, not window"]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert TritonBackend().lacking(USUAL) == [NO_TRITON]
+
+
+def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    reason = NO_TRITON if MISSING else NO_CUDA
+    assert "triton" in BACKENDS.names()
+    assert survey(replace(USUAL, device="cpu"))["triton"] == [reason, "it runs on cuda, not on cpu"]
+    with pytest.raises(BackendUnavailable, match="backend 'triton' cannot do this: it needs"):
+        TritonBackend().render(gaussians(2, dtype=torch.float32), camera(), Effects(1))
+
+
+def test_the_module_loads_no_triton():
+    code = "import sys; import mipmap_plugin.backends.triton; sys.exit('triton' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, check=False).returncode == 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_on_a_gpu_every_hard_case_equals_the_reference():
+    wrong = {outcome.case: outcome.message for outcome in check_backend(TritonBackend(), device="cuda") if not outcome.passed}
+    assert not wrong

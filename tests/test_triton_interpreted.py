@@ -1,0 +1,150 @@
+"""The Triton kernels in Triton's interpreter: tiny images on a processor. Run them with `TRITON_INTERPRET=1 pytest -m interpreter`."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from dataclasses import fields, replace
+
+import pytest
+import torch
+from oracle import brute_force
+from samples import camera, gaussians
+
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.conformance import CASES, check_case
+from mipmap_plugin.backends.conformance.cases import covariances
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.backends.triton import TritonBackend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+
+MISSING = importlib.util.find_spec("triton") is None
+pytestmark = [
+    pytest.mark.interpreter,
+    pytest.mark.skipif(MISSING or os.environ.get("TRITON_INTERPRET") != "1", reason="triton is not installed, or TRITON_INTERPRET is not 1"),
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # numpy's, of infinities that a GPU passes over in silence
+]
+
+# Two by three tiles, the last ones cut; off center, fx != fy.
+WIDE = camera(40, 24, 30.0, 26.0, cx=18.3, cy=13.9)
+
+# Of each kind of hard case one that has broken a rasterizer, here or elsewhere.
+HARD = [
+    "no-splat", "no-splat-in-view", "identical-splats", "1e6-units-from-the-origin", "1e25-units-aside-classic", "in-the-eye-classic",
+    "on-the-near-plane-classic", "center-beyond-the-frustum-body-on-antialiased", "needle-1e12-classic", "scale-0-on-three-axes-mip",
+    "quaternion-0-classic", "opacity-1-classic", "nan-in-scales-classic", "inf-in-sh-antialiased", "nan-in-covariances",
+    "image-1x1-classic", "principal-point-outside-classic", "sh-bands-left-out",
+]  # fmt: skip
+
+
+def draw(backend, g: Gaussians, view, effects: Effects):
+    """Image, alpha and the gradients of a fixed weighting of all pixels, by the name of the tensor."""
+    given = {f.name: getattr(g, f.name) for f in fields(g)}
+    g = Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in given.items()})
+    rendered = backend(g, view, effects)
+    image, alpha = (rendered.image, rendered.alpha) if hasattr(rendered, "image") else rendered
+    weights = torch.randn(*alpha.shape, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).to(image)
+    ((image * weights[..., :3]).sum() + (alpha * weights[..., 3]).sum()).backward()
+    grads = {f.name: getattr(g, f.name).grad for f in fields(g) if getattr(g, f.name) is not None}
+    return image.detach(), alpha.detach(), {name: grad for name, grad in grads.items() if grad is not None}
+
+
+def ours(g: Gaussians, view=WIDE, effects: Effects = Effects(1)):  # noqa: B008
+    return draw(TritonBackend().render, g.to(dtype=torch.float32), view, effects)
+
+
+def assert_equal(actual, expected, relative=2e-5):
+    for what, right in zip(actual[:2], expected[:2], strict=True):
+        torch.testing.assert_close(what.double(), right, atol=5e-6, rtol=0)
+    for name, grad in actual[2].items():
+        assert (grad.double() - expected[2][name]).norm() <= relative * expected[2][name].norm(), name
+
+
+@pytest.mark.parametrize(("screen_filter", "eps2d"), [("classic", 0.3), ("classic", 2.4), ("antialiased", 0.3), ("mip", 0.1)])
+def test_equals_a_sum_over_every_pixel(screen_filter, eps2d):
+    g = gaussians(30, dtype=torch.float32)
+    effects = Effects(1, screen_filter, eps2d, (0.2, 0.5, 0.9))
+    right = draw(lambda *scene: brute_force(*scene[:2], eps2d, effects.background, screen_filter), g.to(dtype=torch.float64), WIDE, effects)
+    result = ours(g, WIDE, effects)
+    assert set(result[2]) == {"means", "quats", "scales", "opacities", "sh"}
+    assert_equal(result, right)
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3, 4])
+def test_every_harmonic_has_its_gradient(degree):
+    g, view, effects = gaussians(12, degree, dtype=torch.float32), camera(16, 16), Effects(degree)
+    assert_equal(ours(g, view, effects), draw(ReferenceBackend().render, g.to(dtype=torch.float64), view, effects))
+
+
+def test_bands_left_out_have_no_gradient():
+    grads = ours(gaussians(12, 3), camera(16, 16))[2]
+    assert grads["sh"][:, :4].any() and not grads["sh"][:, 4:].any()
+
+
+def test_covariances_need_not_be_symmetric_to_have_their_gradient():
+    g = gaussians(12).to(dtype=torch.float32)
+    tilted = covariances(g) + 1e-4 * torch.randn(12, 3, 3, generator=torch.Generator().manual_seed(3))
+    g = replace(g, covariances=tilted)
+    result = ours(g, camera(16, 16))
+    assert set(result[2]) == {"means", "opacities", "sh", "covariances"}
+    assert_equal(result, draw(ReferenceBackend().render, g.to(dtype=torch.float64), camera(16, 16), Effects(1)))
+
+
+def test_pixels_stop_where_they_should():
+    g = gaussians(150, dtype=torch.float32)
+    g = replace(g, opacities=0.9 + 0.1 * g.opacities, scales=3 * g.scales)
+    right = draw(ReferenceBackend().render, g.to(dtype=torch.float64), camera(16, 16), Effects(1))
+    assert (right[1] > 0.999).double().mean() > 0.5
+    assert_equal(ours(g, camera(16, 16)), right, 1e-4)
+
+
+def test_sums_in_one_order_are_the_same_sums():
+    """Torch also fills memory with NaN that nobody has written yet, so that none of it may be read."""
+    g, view = gaussians(12), camera(24, 20)
+    right = ours(g, view)
+    try:
+        torch.use_deterministic_algorithms(True)
+        first, again = ours(g, view), ours(g, view)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert torch.equal(first[0], right[0]) and torch.equal(first[1], right[1])
+    for name, grad in first[2].items():
+        assert torch.equal(grad, again[2][name])
+        torch.testing.assert_close(grad, right[2][name], atol=1e-6 * float(grad.abs().max()), rtol=1e-4)
+
+
+def test_a_tile_lists_what_it_shows_front_to_back_and_little_else():
+    from mipmap_plugin.backends.triton_kernels import drawing
+    from mipmap_plugin.backends.triton_kernels.records import WIDTH
+
+    g, view = gaussians(150, dtype=torch.float32), camera(64, 48)
+    splats = drawing.Splats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None)
+    made = drawing.draw(splats, view, Effects(1))[2]
+    x, y, along, shear, across, strength = made.records[:, :6].T[:, :, None, None]
+    assert made.records.shape[1] == WIDTH
+    ys, xs = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    u = xs - x - shear * (ys - y)
+    alpha = torch.exp2(along * (ys - y) ** 2 + across * u**2 + strength)
+    seen = (alpha >= 1 / 255) & torch.isfinite(made.depths)[:, None, None]
+    needed = seen.unflatten(2, (4, 16)).unflatten(1, (3, 16)).any(4).any(2).flatten(1)  # [N, tiles]
+    listed = torch.zeros_like(needed)
+    for tile in range(12):
+        members = made.bins.members[made.bins.edges[tile] : made.bins.edges[tile + 1]].long()
+        listed[members, tile] = True
+        assert (made.depths[members].diff() >= 0).all()
+    assert not (needed & ~listed).any()
+    boxed = int(made.bins.counts.sum())
+    assert needed.sum() <= listed.sum() < boxed
+    assert listed.sum() - needed.sum() < 0.2 * (boxed - needed.sum())  # what a box lists in vain, an ellipse hardly does
+
+
+@pytest.mark.parametrize("case", HARD)
+def test_hard_cases_equal_the_reference(case):
+    outcome = check_case(TritonBackend(), case, CASES[case])
+    assert outcome.passed and not outcome.skipped, outcome.message
+
+
+def test_under_the_interpreter_it_serves_processors_and_is_nobodys_choice():
+    needs = Needs("cpu", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
+    assert TritonBackend().lacking(needs) == [] and TritonBackend().speed < 0
