@@ -256,12 +256,12 @@ def test_backends_lists_each_with_its_reasons(run, monkeypatch):
     code, out, _ = run("backends")
     assert code == 0 and "| reference " in out and "adapts 3DGS?" in out
     code, out, _ = run("backends", "--json")
-    assert code == 0 and {"name": "reference", "device": "cpu", "reasons": []} in json.loads(out)
+    assert code == 0 and {"name": "reference", "device": "cpu", "reasons": [], "note": ""} in json.loads(out)
 
 
 def test_backends_check_prints_a_table_and_fails_if_a_case_does(run, monkeypatch):
     outcomes = [Outcome("fine", 1e-6, True, True, ""), Outcome("odd", 0.5, True, False, "the image differs")]
-    monkeypatch.setattr(backends_module, "check_backend", lambda backend: outcomes)
+    monkeypatch.setattr(backends_module, "check_backend", lambda backend, device: outcomes)
     code, out, err = run("backends", "--check", "reference")
     assert code == 2 and "FAIL: the image differs" in out and "| fine " in out
     assert err == "mipmap-plugin: backend 'reference' fails 1 of 2 cases: odd\n"

@@ -1,6 +1,7 @@
 """Names in, objects out: strangers' backends are listed with their reasons, and a broken one breaks nothing."""
 
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -11,7 +12,7 @@ from mipmap_plugin.backends import BACKENDS, choose_backend, get_backend, regist
 from mipmap_plugin.backends.base import API_VERSION, Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
-from mipmap_plugin.evaluation.backends import listing, listing_table
+from mipmap_plugin.evaluation.backends import check, listing, listing_table
 from mipmap_plugin.registry import Registry
 
 NEEDS = Needs("cpu", torch.float32, gradients=True, sh_degree=1, screen_filter="classic")
@@ -61,6 +62,23 @@ def test_auto_takes_the_fastest_that_lacks_nothing_and_says_why():
     backend, why = choose_backend("auto", NEEDS)
     assert isinstance(backend, Fast)
     assert why == "fast: the fastest that lacks nothing; fussy not, because it is not in the mood"
+
+
+def test_on_a_gpu_the_users_own_rasterizer_comes_first_and_what_is_untried_is_said(monkeypatch):
+    built_in = {"gsplat": "GsplatBackend", "inria": "InriaBackend", "triton": "TritonBackend"}
+    for name, kind in built_in.items():
+        monkeypatch.setattr(f"mipmap_plugin.backends.{name}.{kind}.lacking", lambda self, needs: [])
+        register_backend(name, f"mipmap_plugin.backends.{name}:{kind}")
+    on_gpu, taken = replace(NEEDS, device="cuda"), []
+    while (backend := choose_backend("auto", on_gpu)[0]).name != "reference":
+        taken.append(backend.name)
+        monkeypatch.setattr(type(backend), "lacking", lambda self, needs: ["it is not built"])
+    assert taken == ["gsplat", "triton", "inria"]
+    monkeypatch.setattr("mipmap_plugin.backends.triton.TritonBackend.lacking", lambda self, needs: [])
+    assert choose_backend("auto", on_gpu)[1] == (
+        "triton: the fastest that lacks nothing (never run on a GPU by this package's author); "
+        "gsplat not, because it is not built; inria not, because it is not built"
+    )
 
 
 def test_asking_by_name():
@@ -118,6 +136,20 @@ def test_the_listing_names_every_backend_and_its_reasons():
     assert "no: it is not in the mood; nor will it be" in table and "yes" in table
 
 
+def test_the_listing_notes_what_never_ran():
+    register_backend("triton", "mipmap_plugin.backends.triton:TritonBackend")
+    notes = {row.name: row.note for row in listing()}
+    assert notes == {"reference": "", "triton": "never run on a GPU by this package's author"}
+    assert notes["triton"] in listing_table(listing())
+
+
+def test_a_backend_that_serves_no_device_here_cannot_be_checked(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    register_backend("gsplat", "mipmap_plugin.backends.gsplat:GsplatBackend")
+    with pytest.raises(BackendUnavailable, match="backend 'gsplat' cannot be checked here: it needs"):
+        check("gsplat")
+
+
 def test_a_name_is_taken_once():
     register_backend("fast", Fast)
     register_backend("fast", Fast)  # the same again is no conflict
@@ -151,4 +183,3 @@ def test_targets_are_imported_only_when_asked_for(tmp_path, monkeypatch):
     assert things.names() == ["lazy"] and "lazy_plugin" not in sys.modules
     assert things.get("lazy") == "made"
     sys.modules.pop("lazy_plugin")
-

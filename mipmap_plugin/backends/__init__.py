@@ -58,11 +58,24 @@ def choose_backend(name: str, needs: Needs) -> tuple[Backend, str]:
         reasons = backend.lacking(needs)
         if reasons:
             raise BackendUnavailable(f"backend {name!r} cannot do this: {'; '.join(reasons)}")
-        return backend, f"{name}: asked for"
+        return backend, f"{name}: asked for{_noted(backend)}"
     reasons_of = survey(needs)
     able = [get_backend(name) for name, reasons in reasons_of.items() if not reasons]
     if not able:
         raise BackendUnavailable("no backend can do this: " + " | ".join(f"{n}: {'; '.join(r)}" for n, r in reasons_of.items()))
     best = max(able, key=lambda backend: backend.speed)
     faster_not = [f"{n} not, because {r[0]}" for n, r in reasons_of.items() if r]
-    return best, f"{best.name}: the fastest that lacks nothing" + "".join(f"; {reason}" for reason in faster_not)
+    return best, f"{best.name}: the fastest that lacks nothing{_noted(best)}" + "".join(f"; {reason}" for reason in faster_not)
+
+
+def note_of(name: str) -> str:
+    """What is to be known of a backend; empty where there is nothing, or no backend."""
+    try:
+        return getattr(get_backend(name), "note", "")
+    except PluginError:
+        return ""
+
+
+def _noted(backend: Backend) -> str:
+    note = getattr(backend, "note", "")
+    return f" ({note})" if note else ""

@@ -26,7 +26,7 @@ from typing import Any
 import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.guests import NO_CUDA, sound, turned
+from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, sound, turned
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -43,6 +43,7 @@ class GsplatBackend:
     name = "gsplat"
     api_version = API_VERSION
     speed = 40
+    note = UNTRIED
     capabilities = Capabilities(
         devices=frozenset({"cuda"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased", "mip"})
     )

@@ -9,6 +9,7 @@ from mipmap_plugin.backends.reference import finite_rows
 from mipmap_plugin.gaussians import Gaussians
 
 NO_CUDA = "it needs a CUDA GPU, and torch sees none here"
+UNTRIED = "never run on a GPU by this package's author"
 
 
 def sound(gaussians: Gaussians) -> Gaussians:

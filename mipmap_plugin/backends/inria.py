@@ -30,7 +30,7 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
 from mipmap_plugin.backends.filters import footprint
-from mipmap_plugin.backends.guests import NO_CUDA, sound, turned
+from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, sound, turned
 from mipmap_plugin.backends.projection import project, rotations
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -56,6 +56,7 @@ class InriaBackend:
     name = "inria"
     api_version = API_VERSION
     speed = 20
+    note = UNTRIED
     capabilities = Capabilities(
         devices=frozenset({"cuda"}),
         dtypes=frozenset({torch.float32}),

@@ -16,7 +16,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.guests import NO_CUDA
+from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
@@ -35,6 +35,7 @@ class TritonBackend:
 
     name = "triton"
     api_version = API_VERSION
+    note = UNTRIED
 
     def __init__(self) -> None:
         self.speed = -1 if interpreted() else 30

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import torch
 
-from mipmap_plugin.backends import get_backend, survey
+from mipmap_plugin.backends import get_backend, note_of, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import Outcome, check_backend
+from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.evaluation.report import markdown
 
 
@@ -20,23 +21,35 @@ class Listed:
     name: str
     device: str
     reasons: tuple[str, ...]
+    note: str = ""  # what is to be known of it besides
 
 
 def listing() -> list[Listed]:
     """Every known backend, asked for what adapting a 3DGS checkpoint needs on the devices that are here."""
-    devices = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
-    needs = [Needs(device, torch.float32, gradients=True, sh_degree=3, screen_filter="classic") for device in devices]
-    return [Listed(name, need.device, tuple(reasons)) for need in needs for name, reasons in survey(need).items()]
+    needs = [Needs(device, torch.float32, gradients=True, sh_degree=3, screen_filter="classic") for device in _devices()]
+    return [Listed(name, need.device, tuple(reasons), note_of(name)) for need in needs for name, reasons in survey(need).items()]
 
 
 def check(name: str) -> list[Outcome]:
-    """The conformance suite's outcome for each hard case. Raises SettingsError for an unknown backend."""
-    return check_backend(get_backend(name))
+    """The conformance suite's outcome for each hard case, on the first device that the backend serves.
+
+    Raises SettingsError for an unknown backend, BackendUnavailable for one that serves none here.
+    """
+    backend = get_backend(name)
+    for device in _devices():
+        outcomes = check_backend(backend, device=device)
+        if not all(outcome.skipped for outcome in outcomes):
+            return outcomes
+    raise BackendUnavailable(f"backend {name!r} cannot be checked here: {outcomes[0].message}")
 
 
 def listing_table(rows: Sequence[Listed]) -> str:
-    body = [[row.name, row.device, f"no: {'; '.join(row.reasons)}" if row.reasons else "yes"] for row in rows]
-    return markdown(["backend", "device", "adapts 3DGS?"], body)
+    body = [[row.name, row.device, f"no: {'; '.join(row.reasons)}" if row.reasons else "yes", row.note] for row in rows]
+    return markdown(["backend", "device", "adapts 3DGS?", "note"], body)
+
+
+def _devices() -> list[str]:
+    return ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
 
 
 def check_table(rows: Sequence[Outcome]) -> str:
