@@ -64,7 +64,10 @@ class Surface(NamedTuple):
 
 def make(name: Name) -> Scene:
     """The scene `name` of SPECS."""
-    spec = SPECS[name]
+    return make_to(SPECS[name])
+
+
+def make_to(spec: Spec) -> Scene:
     rng = np.random.default_rng(SEED + spec.splats)
     camera = _camera(spec.width, spec.height)
     points, normals, areas = _surfaces(rng, spec.splats, 0.5 * spec.width / camera.fx, 0.5 * spec.height / camera.fy)
