@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -169,7 +170,11 @@ def test_gradients_reach_only_what_asks_for_them():
     g = gaussians(20, dtype=torch.float32)
     g = replace(g, means=g.means.requires_grad_())
     BACKEND.render(g, camera(), Effects(1)).alpha.sum().backward()
+    expected = g.means.grad.clone()
     assert g.means.grad.any() and g.sh.grad is None
+    g = leaf(g)
+    BACKEND.render(g, camera(), Effects(1)).alpha.sum().backward()
+    assert torch.equal(g.means.grad, expected)
 
 
 @needs_numba
@@ -177,7 +182,9 @@ def test_power_of_two_in_lanes():
     import numpy as np
 
     from mipmap_plugin.backends.cpu_kernels import kernel
-    from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, exp2, load, store
+    from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
+    from mipmap_plugin.backends.cpu_kernels.memory import load, store
+    from mipmap_plugin.backends.cpu_kernels.powers import exp2
 
     def powers(exponents, out):
         for at in range(0, len(exponents), WIDTH):
@@ -187,6 +194,58 @@ def test_power_of_two_in_lanes():
     out = np.empty_like(exponents)
     kernel(powers)(exponents, out)
     assert np.abs(out / np.exp2(exponents.astype(np.float64)) - 1).max() < 2e-7
+
+
+@needs_numba
+@pytest.mark.parametrize("name", ["log2", "tanh"])
+def test_functions_in_lanes_of_float64(name):
+    import numpy as np
+
+    from mipmap_plugin.backends.cpu_kernels import kernel, powers
+    from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
+    from mipmap_plugin.backends.cpu_kernels.memory import load, store
+
+    function = getattr(powers, name)
+
+    def values(arguments, out):
+        for at in range(0, len(arguments), WIDTH):
+            store(out, at, function(load(arguments, at)))
+
+    arguments = np.exp(np.linspace(-80, 80, 1 << 16))
+    out = np.empty_like(arguments)
+    kernel(values)(arguments, out)
+    tolerance = {"log2": {"atol": 1e-9, "rtol": 0}, "tanh": {"atol": 0, "rtol": 4e-7}}[name]
+    np.testing.assert_allclose(out, getattr(np, name)(arguments), **tolerance)
+
+
+@needs_numba
+def test_a_team_does_all_work_once_however_it_is_shared():
+    import numpy as np
+
+    from mipmap_plugin.backends.cpu_kernels.threads import Team
+
+    done = np.zeros(1000, np.int64)
+
+    def work(start, stop, first):
+        if start == first:
+            time.sleep(0.05)  # so long that the others take the rest of this thread's part
+        done[start:stop] += 1
+
+    for threads in (1, 2, 3):
+        Team(threads).share(work, len(done), 0)
+    assert (done == 3).all()
+
+
+@needs_numba
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
+def test_a_forked_process_draws_with_threads_of_its_own():
+    torch.set_num_threads(2)
+    g = gaussians(200, dtype=torch.float32)
+    expected = BACKEND.render(g, WIDE, Effects(1)).image
+    child = os.fork()
+    if child == 0:
+        os._exit(0 if torch.equal(BACKEND.render(g, WIDE, Effects(1)).image, expected) else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 @needs_numba

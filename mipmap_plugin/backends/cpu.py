@@ -16,6 +16,10 @@ from mipmap_plugin.gaussians import Gaussians
 NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
 
 
+# Which of `_Draw.forward`'s arguments the coefficients are.
+SH = 6
+
+
 class CpuBackend:
     """Renders and differentiates Gaussians fast without a GPU. numba is imported, and the kernels compiled, at the first image."""
 
@@ -65,7 +69,8 @@ class _Draw(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, d_image, d_alpha):
         drawing, tensors = _drawing(), ctx.saved_tensors
-        grads = drawing.draw_back(ctx.drawing, drawing.splats_of(*tensors), d_image.contiguous().numpy(), d_alpha.contiguous().numpy())
-        # Of the two ways to give a shape, the one that was not taken has no gradient, and no rows.
+        d_frame = d_image.contiguous().numpy(), d_alpha.contiguous().numpy()
+        grads = drawing.draw_back(ctx.drawing, drawing.splats_of(*tensors), *d_frame, harmonics=ctx.needs_input_grad[SH])
+        # What nobody asks for, and of the two ways to give a shape the one that was not taken, has no gradient, and no rows.
         pairs = zip(tensors, grads, strict=True)
         return None, None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in pairs)

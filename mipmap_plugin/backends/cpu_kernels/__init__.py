@@ -1,8 +1,8 @@
 """The compiled half of the CPU backend, and the only place that imports numba.
 
 numba counts references of arrays, and of records that hold some; each count is an atomic operation, and a few for every splat cost
-more than all of its geometry. So arrays are taken out of their records where a kernel begins, and inside it numbers travel alone or
-in tuples.
+more than all of its geometry. So a kernel takes arrays out of their records where it begins, and what it calls for every splat is
+given pointers, numbers and tuples of them (`memory`). Such functions are always inlined: numba passes lanes through memory otherwise.
 """
 
 from contextlib import suppress
@@ -15,7 +15,7 @@ import numba
 kernel: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 # What only kernels call: without a way in from Python it compiles faster, and called from there it crashes.
-inner: Any = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # type: ignore[call-overload]
+inner: Any = numba.njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)  # type: ignore[call-overload]
 
 
 def _forget_stale() -> None:

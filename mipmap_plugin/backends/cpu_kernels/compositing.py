@@ -6,35 +6,21 @@ What happens to the pixels themselves is in `planes`.
 # numba gives calls and operators a meaning of its own.
 # mypy: ignore-errors
 
-import numpy as np
+from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, SLACK, TILE_COLUMNS, TILE_ROWS, tile_grid
-from mipmap_plugin.backends.cpu_kernels.lanes import (
-    WIDTH,
-    bits,
-    both,
-    ceil,
-    exp2,
-    floor,
-    fma,
-    load,
-    lowest,
-    maximum,
-    minimum,
-    prefetch,
-    ramp,
-    spread,
-    sqrt,
-    store,
-    total,
-)
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, floor, fma, lowest, maximum, minimum, ramp, spread, sqrt, total
+from mipmap_plugin.backends.cpu_kernels.memory import load, prefetch, row_of, scratch, store
 from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, BEHIND, CREST, END, ENDS, LIGHT, PLANE, RIDGE, STATE, STRIDE, cover, uncover
+from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.effects import MIN_ALPHA
 
 # Splats between two looks at whether the tile is finished.
 PATIENCE = 16
+
+new_state = scratch(STATE, types.float32)
 
 # Splats between asking for a row of the table and using it.
 AHEAD = 4
@@ -49,14 +35,14 @@ def bounds(tile, width, height):
 
 
 @inner
-def trace(table, i, box, state):
-    """Where splat i crosses the rows of a tile: a bit for each row that it lights, and into `state` at row r, from BEGIN on, the
+def trace(splat, box, state):
+    """Where a splat crosses the rows of a tile: a bit for each row that it lights, and into `state` at row r, from BEGIN on, the
     first column, the last column, the column of the ridge, and log2 alpha on the ridge."""
     left, top, columns, rows = box
-    dy = ramp(top + 0.5 - table[i, col.Y])
-    ridge = fma(dy, table[i, col.SHEAR], table[i, col.X] - left - 0.5)
-    peak = fma(dy * dy, -table[i, col.FALL_Y], table[i, col.PEAK])
-    half = sqrt(maximum(peak - LOG_MIN_ALPHA, 0) * table[i, col.SPREAD]) + SLACK
+    dy = ramp(top + 0.5 - splat[col.Y])
+    ridge = fma(dy, splat[col.SHEAR], splat[col.X] - left - 0.5)
+    peak = fma(dy * dy, -splat[col.FALL_Y], splat[col.PEAK])
+    half = sqrt(maximum(peak - LOG_MIN_ALPHA, 0) * splat[col.SPREAD]) + SLACK
     begin, end = maximum(ceil(ridge - half), 0), minimum(floor(ridge + half), columns - 1)
     store(state, BEGIN, begin)
     store(state, END, end)
@@ -71,7 +57,7 @@ def composite(start, stop, integrated, table, lists, frame, image):
     starts, members, _ = lists
     background, through, stops = frame
     height, width = through.shape
-    state = np.empty(STATE, np.float32)
+    state = new_state()
     for tile in range(start, stop):
         box = bounds(tile, width, height)
         length = starts[tile + 1] - starts[tile]
@@ -81,22 +67,29 @@ def composite(start, stop, integrated, table, lists, frame, image):
                 break
             at = starts[tile] + n
             prefetch(table, members[min(at + AHEAD, len(members) - 1)])
+            splat = row_of(table, members[at])
             if integrated:
-                lay_integral(table, members[at], n, box, state)
+                lay_integral(splat, n, box, state)
             else:
-                lay(table, members[at], n, box, state)
+                lay(splat, n, box, state)
         close_tile(box, state, background, image, through, stops)
+
+
+@inner
+def fill(state, first, last, value):
+    for at in range(first, last):
+        state[at] = value
 
 
 @inner
 def open_tile(box, length, state):
     """Begin with an empty tile. Light below 0: a pixel that is finished, as all outside the image are from the start."""
     _, _, columns, rows = box
-    state[:LIGHT] = 0
-    state[LIGHT:ENDS] = -1
-    state[ENDS:BEHIND] = length
+    fill(state, 0, LIGHT, 0)
+    fill(state, LIGHT, ENDS, -1)
+    fill(state, ENDS, BEHIND, length)
     for r in range(rows):
-        state[LIGHT + r * STRIDE : LIGHT + r * STRIDE + columns] = 1
+        fill(state, LIGHT + r * STRIDE, LIGHT + r * STRIDE + columns, 1)
 
 
 @inner
@@ -109,10 +102,10 @@ def finished(state):
 
 
 @inner
-def lay(table, i, n, box, state):
-    """Lay splat i, the n-th of its tile, behind what is there."""
-    fall, color = table[i, col.FALL_X], (table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE])
-    rows = trace(table, i, box, state)
+def lay(splat, n, box, state):
+    """Lay a splat, the n-th of its tile, behind what is there."""
+    fall, color = splat[col.FALL_X], (splat[col.RED], splat[col.GREEN], splat[col.BLUE])
+    rows = trace(splat, box, state)
     while rows != 0:
         r = lowest(rows)
         rows &= rows - 1
@@ -127,18 +120,18 @@ def lay(table, i, n, box, state):
 
 
 @inner
-def lay_integral(table, i, n, box, state):
+def lay_integral(splat, n, box, state):
     """As `lay`, of a splat that is integrated over pixels; what `trace` finds is an ellipse around it."""
-    color = table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]
-    rows = trace(table, i, box, state)
+    color = splat[col.RED], splat[col.GREEN], splat[col.BLUE]
+    rows = trace(splat, box, state)
     while rows != 0:
         r = lowest(rows)
         rows &= rows - 1
         column, end = state[BEGIN + r], state[END + r]
         at = r * STRIDE + int(column)
-        center, dy = table[i, col.X] - box[0] - 0.5, box[1] + r + 0.5 - table[i, col.Y]
+        center, dy = splat[col.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[col.Y]
         while column <= end:
-            alpha = integrals.alpha(table, i, ramp(column - center), dy)
+            alpha = integrals.alpha(splat, ramp(column - center), dy)
             cover(alpha, alpha >= MIN_ALPHA, color, n, at, state)
             column += WIDTH
             at += WIDTH
@@ -168,7 +161,7 @@ def composite_back(start, stop, integrated, table, lists, frame, d_frame, pulls)
     background, through, stops = frame
     d_image, d_alpha = d_frame
     height, width = through.shape
-    state = np.empty(STATE, np.float32)
+    state = new_state()
     for tile in range(start, stop):
         box = bounds(tile, width, height)
         used = reopen_tile(box, background, through, stops, d_image, d_alpha, state)
@@ -178,18 +171,19 @@ def composite_back(start, stop, integrated, table, lists, frame, d_frame, pulls)
         for n in range(used - 1, -1, -1):
             at = starts[tile] + n
             prefetch(table, members[max(at - AHEAD, 0)])
+            splat, pull = row_of(table, members[at]), row_of(pulls, slots[at])
             if integrated:
-                lift_integral(table, members[at], n, box, state, pulls, slots[at])
+                lift_integral(splat, n, box, state, pull)
             else:
-                lift(table, members[at], n, box, state, pulls, slots[at])
+                lift(splat, n, box, state, pull)
 
 
 @inner
 def reopen_tile(box, background, through, stops, d_image, d_alpha, state):
     """Begin with a finished tile; returns how many of its splats were used."""
     left, top, columns, rows = box
-    state[:] = 0
-    state[LIGHT:ENDS] = 1
+    fill(state, 0, STATE, 0)
+    fill(state, LIGHT, ENDS, 1)
     used = 0
     for r in range(rows):
         for c in range(columns):
@@ -204,17 +198,17 @@ def reopen_tile(box, background, through, stops, d_image, d_alpha, state):
 
 
 @inner
-def lift(table, i, n, box, state, pulls, slot):
-    """Take splat i, the n-th of its tile, off again and write its pull."""
-    fall, color = table[i, col.FALL_X], (table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE])
+def lift(splat, n, box, state, pull):
+    """Take a splat, the n-th of its tile, off again and write its pull."""
+    fall, color = splat[col.FALL_X], (splat[col.RED], splat[col.GREEN], splat[col.BLUE])
     sum_1 = sum_u = sum_y = sum_uu = sum_uy = sum_yy = sum_red = sum_green = sum_blue = spread(0)
-    rows = trace(table, i, box, state)
+    rows = trace(splat, box, state)
     while rows != 0:
         r = lowest(rows)
         rows &= rows - 1
         column, end, ridge, peak = state[BEGIN + r], state[END + r], state[RIDGE + r], state[CREST + r]
         at = r * STRIDE + int(column)
-        dy = box[1] + r + 0.5 - table[i, col.Y]
+        dy = box[1] + r + 0.5 - splat[col.Y]
         while column <= end:
             u = ramp(column - ridge)
             power = fma(u * u, -fall, peak)
@@ -225,25 +219,25 @@ def lift(table, i, n, box, state, pulls, slot):
             sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
             column += WIDTH
             at += WIDTH
-    pulls[slot, col.SUM], pulls[slot, col.SUM_U], pulls[slot, col.SUM_Y] = total(sum_1), total(sum_u), total(sum_y)
-    pulls[slot, col.SUM_UU], pulls[slot, col.SUM_UY], pulls[slot, col.SUM_YY] = total(sum_uu), total(sum_uy), total(sum_yy)
-    pulls[slot, col.RED], pulls[slot, col.GREEN], pulls[slot, col.BLUE] = total(sum_red), total(sum_green), total(sum_blue)
+    pull[col.SUM], pull[col.SUM_U], pull[col.SUM_Y] = total(sum_1), total(sum_u), total(sum_y)
+    pull[col.SUM_UU], pull[col.SUM_UY], pull[col.SUM_YY] = total(sum_uu), total(sum_uy), total(sum_yy)
+    pull[col.PULL_RED], pull[col.PULL_GREEN], pull[col.PULL_BLUE] = total(sum_red), total(sum_green), total(sum_blue)
 
 
 @inner
-def lift_integral(table, i, n, box, state, pulls, slot):
+def lift_integral(splat, n, box, state, pull):
     """As `lift`, of a splat that is integrated over pixels."""
-    color = table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]
+    color = splat[col.RED], splat[col.GREEN], splat[col.BLUE]
     sum_1 = sum_long = sum_short = sum_grow_long = sum_grow_short = sum_turn = sum_red = sum_green = sum_blue = spread(0)
-    rows = trace(table, i, box, state)
+    rows = trace(splat, box, state)
     while rows != 0:
         r = lowest(rows)
         rows &= rows - 1
         column, end = state[BEGIN + r], state[END + r]
         at = r * STRIDE + int(column)
-        center, dy = table[i, col.X] - box[0] - 0.5, box[1] + r + 0.5 - table[i, col.Y]
+        center, dy = splat[col.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[col.Y]
         while column <= end:
-            alpha, by_long, by_short, grow_long, grow_short, turn = integrals.slopes(table, i, ramp(column - center), dy)
+            alpha, by_long, by_short, grow_long, grow_short, turn = integrals.slopes(splat, ramp(column - center), dy)
             s, weight, d_red, d_green, d_blue = uncover(alpha, alpha >= MIN_ALPHA, color, n, at, state)
             sum_1, sum_long, sum_short = sum_1 + s, fma(s, by_long, sum_long), fma(s, by_short, sum_short)
             sum_grow_long, sum_grow_short = fma(s, grow_long, sum_grow_long), fma(s, grow_short, sum_grow_short)
@@ -251,6 +245,6 @@ def lift_integral(table, i, n, box, state, pulls, slot):
             sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
             column += WIDTH
             at += WIDTH
-    pulls[slot, col.SUM], pulls[slot, col.BY_LONG], pulls[slot, col.BY_SHORT] = total(sum_1), total(sum_long), total(sum_short)
-    pulls[slot, col.GROW_LONG], pulls[slot, col.GROW_SHORT], pulls[slot, col.TURN] = total(sum_grow_long), total(sum_grow_short), total(sum_turn)
-    pulls[slot, col.RED], pulls[slot, col.GREEN], pulls[slot, col.BLUE] = total(sum_red), total(sum_green), total(sum_blue)
+    pull[col.SUM], pull[col.BY_LONG], pull[col.BY_SHORT] = total(sum_1), total(sum_long), total(sum_short)
+    pull[col.GROW_LONG], pull[col.GROW_SHORT], pull[col.TURN] = total(sum_grow_long), total(sum_grow_short), total(sum_turn)
+    pull[col.PULL_RED], pull[col.PULL_GREEN], pull[col.PULL_BLUE] = total(sum_red), total(sum_green), total(sum_blue)

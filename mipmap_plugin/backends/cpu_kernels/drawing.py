@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import compositing, projection, sorting, window_tiles
+from mipmap_plugin.backends.cpu_kernels import compositing, projection, pulling, sorting, window_tiles
 from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW, Frame, Lists, Splats, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.backends.filters import LEAST_LIGHT
@@ -39,28 +39,33 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
     count, (height, width) = len(splats.means), camera.size
     table, depths, counts = _empty(count, col.COLUMNS), _empty(count), np.empty(count, np.int64)
     image, frame = _empty(height, width, 3), Frame(np.array(effects.background, np.float32), _empty(height, width), _empty(height, width))
-    with team() as threads:
-        threads.share(projection.project, count, view, splats, table, depths, counts)
-        slots = np.concatenate([[0], np.cumsum(counts)])
-        lists = sorting.tile_lists(table, depths, slots, width, height, threads)
-        if view.seen == SEEN_IN_WINDOW:
-            threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, image)
-        else:
-            threads.share(compositing.composite, len(lists.starts) - 1, view.seen == SEEN_IN_PIXEL, table, lists, frame, image)
+    threads = team()
+    threads.share(projection.project, count, view, splats, table, depths, counts)
+    slots = np.concatenate([[0], np.cumsum(counts)])
+    lists = sorting.tile_lists(table, depths, slots, width, height, threads)
+    if view.seen == SEEN_IN_WINDOW:
+        threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, image)
+    else:
+        threads.share(compositing.composite, len(lists.starts) - 1, view.seen == SEEN_IN_PIXEL, table, lists, frame, image)
     return image, Drawing(view, table, slots, lists, frame)
 
 
-def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np.ndarray) -> Splats:
-    """The gradients of the splats from those of the image [H, W, 3] and its alpha [H, W]."""
+def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np.ndarray, *, harmonics: bool = True) -> Splats:
+    """The gradients of the splats from those of the image [H, W, 3] and its alpha [H, W].
+
+    harmonics: whether those of the coefficients are wanted, which are most of all numbers; else they have no rows.
+    """
     view, table, slots, lists, frame = drawing
     pulls, grads = _empty(len(lists.members), col.PULLS), Splats(*(_empty(*array.shape) for array in splats))
-    with team() as threads:
-        if view.seen == SEEN_IN_WINDOW:
-            threads.share(window_tiles.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), pulls)
-        else:
-            integrated = view.seen == SEEN_IN_PIXEL
-            threads.share(compositing.composite_back, len(lists.starts) - 1, integrated, table, lists, frame, (d_image, d_alpha), pulls)
-        threads.share(projection.project_back, len(splats.means), view, splats, table, slots, pulls, grads)
+    if not harmonics:
+        grads = grads._replace(sh=grads.sh[:0])
+    threads = team()
+    if view.seen == SEEN_IN_WINDOW:
+        threads.share(window_tiles.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), pulls)
+    else:
+        integrated = view.seen == SEEN_IN_PIXEL
+        threads.share(compositing.composite_back, len(lists.starts) - 1, integrated, table, lists, frame, (d_image, d_alpha), pulls)
+    threads.share(pulling.project_back, len(splats.means), view, splats, table, slots, pulls, grads)
     return grads
 
 
@@ -68,10 +73,11 @@ def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
     left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
     across, down = FRUSTUM_MARGIN * (left + right) / 2, FRUSTUM_MARGIN * (top + bottom) / 2
+    rotation, translation = camera.viewmat.numpy()[:3, :3], camera.viewmat.numpy()[:3, 3]
     return View(
-        rotation=tuple(tuple(row) for row in camera.viewmat[:3, :3].tolist()),
-        translation=tuple(camera.viewmat[:3, 3].tolist()),
-        eye=tuple(camera.center.tolist()),
+        rotation=tuple(map(tuple, rotation.tolist())),
+        translation=tuple(translation.tolist()),
+        eye=tuple((-np.linalg.solve(rotation, translation)).tolist()),
         fx=float(camera.fx),
         fy=float(camera.fy),
         cx=float(camera.cx),

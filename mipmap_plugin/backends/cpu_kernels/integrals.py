@@ -10,7 +10,9 @@ import math
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner
-from mipmap_plugin.backends.cpu_kernels.lanes import exp2, fma, maximum, minimum, select
+from mipmap_plugin.backends.cpu_kernels.blocks import put
+from mipmap_plugin.backends.cpu_kernels.lanes import fma, maximum, minimum, narrow, select, sqrt
+from mipmap_plugin.backends.cpu_kernels.powers import exp2, log2, tanh
 from mipmap_plugin.backends.pixel_integral import BOUND, CUBIC, LINEAR, MAX_POWER, ROUND
 from mipmap_plugin.effects import MIN_ALPHA
 
@@ -31,10 +33,19 @@ MARGIN = 1.01
 
 @inner
 def axes(flat):
-    """The direction (cos, sin) of a shape's longer axis, and the standard deviations along it and across, px."""
+    """The direction (cos, sin) of a shape's longer axis, and the standard deviations along it and across, px.
+
+    All here that concerns shapes is in lanes of float64, 16 splats; what concerns pixels, in lanes of float32.
+    """
     mean, half, spread = polar(flat)
-    angle = 0.5 * math.atan2(flat[1], half) if spread > 0 else 0.0
-    return math.cos(angle), math.sin(angle), math.sqrt(mean + spread), math.sqrt(flat[3] / (mean + spread))
+    round_ = spread <= 0
+    per_spread = 1 / select(round_, 1.0, spread)
+    cos_2, sin_2 = select(round_, 1.0, half * per_spread), select(round_, 0.0, flat[1] * per_spread)
+    larger = sqrt(0.5 + 0.5 * maximum(cos_2, -cos_2))  # of cos and |sin|; the other from their product, which does not cancel
+    other = 0.5 * sin_2 / larger
+    lying = cos_2 >= 0
+    cos, sin = select(lying, larger, maximum(other, -other)), select(lying, other, select(sin_2 < 0, -larger, larger))
+    return cos, sin, sqrt(mean + spread), sqrt(flat[3] / (mean + spread))
 
 
 @inner
@@ -42,8 +53,8 @@ def polar(flat):
     """The mean of the variances, half the difference of those along x and y, and half that of those along the axes; 0: round."""
     xx, xy, yy, _ = flat
     mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
-    spread = math.sqrt(half * half + xy * xy)
-    return mean, half, spread if spread > ROUND * mean else 0.0
+    spread = sqrt(half * half + xy * xy)
+    return mean, half, select(spread > ROUND * mean, spread, 0.0)
 
 
 @inner
@@ -52,11 +63,11 @@ def pull_axes(flat, d_log_long, d_log_short, d_angle):
     xy, det = flat[1], flat[3]
     mean, half, spread = polar(flat)
     d_mean = 0.5 * (d_log_long - d_log_short) / (mean + spread)
-    d_half = d_xy = 0.0
-    if spread > 0:
-        turn = 0.5 * d_angle / (spread * spread)
-        d_half = d_mean * half / spread - turn * xy
-        d_xy = d_mean * xy / spread + turn * half
+    oblong = spread > 0
+    per_spread = 1 / select(oblong, spread, 1.0)
+    turn = 0.5 * d_angle * per_spread * per_spread
+    d_half = select(oblong, d_mean * half * per_spread - turn * xy, 0.0)
+    d_xy = select(oblong, d_mean * xy * per_spread + turn * half, 0.0)
     return 0.5 * (d_mean + d_half), d_xy, 0.5 * (d_mean - d_half), 0.5 * d_log_short / det
 
 
@@ -64,7 +75,7 @@ def pull_axes(flat, d_log_long, d_log_short, d_angle):
 def brightest(along, opacity):
     """Alpha of a pixel in the middle of a splat with these axes."""
     _, _, long, short = along
-    return opacity * 2 * math.pi * long * math.tanh(0.5 * grown(0.5 / long)) * short * math.tanh(0.5 * grown(0.5 / short))
+    return opacity * 2 * math.pi * long * tanh(0.5 * grown(0.5 / long)) * short * tanh(0.5 * grown(0.5 / short))
 
 
 @inner
@@ -79,10 +90,9 @@ def around(flat, along, opacity, corner):
     The ellipse of reach r and the disc of radius c add up to no more than the one with (1 + k)·Σ + (1 + 1/k)·(c/r)², for any k.
     """
     xx, xy, yy, det = flat
-    bound = max(opacity, MARGIN * MIN_ALPHA)
-    reach = math.sqrt(2 * math.log(bound / MIN_ALPHA))
-    corner /= reach
-    k = min(1.0, corner / along[3])
+    bound = maximum(opacity, MARGIN * MIN_ALPHA)
+    corner = corner / sqrt(2 * math.log(2) * log2(bound / MIN_ALPHA))
+    k = minimum(1.0, corner / along[3])
     a, e = 1 + k, (1 + 1 / k) * corner * corner
     return (a * xx + e, a * xy, a * yy + e, a * a * det + e * a * (xx + yy) + e * e), bound
 
@@ -94,32 +104,35 @@ def mass(along, opacity):
 
 
 @inner
-def fill(along, mass, table, i):
-    """Write what `alpha` needs of a splat."""
+def fill(along, mass, block):
+    """Write what `alpha` needs of 16 splats."""
     cos, sin, long, short = along
-    table[i, col.COS], table[i, col.SIN], table[i, col.PER_LONG], table[i, col.PER_SHORT] = cos, sin, 1 / long, 1 / short
-    table[i, col.MASS] = mass
+    put(block, col.COS, narrow(cos))
+    put(block, col.SIN, narrow(sin))
+    put(block, col.PER_LONG, narrow(1 / long))
+    put(block, col.PER_SHORT, narrow(1 / short))
+    put(block, col.MASS, narrow(mass))
 
 
 @inner
-def alpha(table, i, dx, dy):
+def alpha(splat, dx, dy):
     """Alpha, not clamped, at lanes of pixels dx, dy px from the center."""
-    cos, sin = table[i, col.COS], table[i, col.SIN]
-    along = share(fma(dx, cos, sin * dy), table[i, col.PER_LONG])
-    across = share(fma(dx, 0 - sin, cos * dy), table[i, col.PER_SHORT])
-    return along[0] * table[i, col.MASS] * across[0]
+    cos, sin = splat[col.COS], splat[col.SIN]
+    along = share(fma(dx, cos, sin * dy), splat[col.PER_LONG])
+    across = share(fma(dx, 0 - sin, cos * dy), splat[col.PER_SHORT])
+    return along[0] * splat[col.MASS] * across[0]
 
 
 @inner
-def slopes(table, i, dx, dy):
+def slopes(splat, dx, dy):
     """`alpha`, and of its logarithm: the derivatives by u/long and v/short, by the logarithms of long and short, and by the angle."""
-    cos, sin, per_long, per_short = table[i, col.COS], table[i, col.SIN], table[i, col.PER_LONG], table[i, col.PER_SHORT]
+    cos, sin, per_long, per_short = splat[col.COS], splat[col.SIN], splat[col.PER_LONG], splat[col.PER_SHORT]
     u, v = fma(dx, cos, sin * dy), fma(dx, 0 - sin, cos * dy)
     along, across = share(u, per_long), share(v, per_short)
     by_u, by_long = slope(along)
     by_v, by_short = slope(across)
     turn = by_u * per_long * v - by_v * per_short * u
-    return along[0] * table[i, col.MASS] * across[0], by_u, by_v, by_long, by_short, turn
+    return along[0] * splat[col.MASS] * across[0], by_u, by_v, by_long, by_short, turn
 
 
 @inner

@@ -1,8 +1,8 @@
-"""Lanes: 16 float32 side by side, as a type that numba compiles straight to vector registers.
+"""Lanes: 16 float32 or 16 float64 side by side, as types that numba compiles straight to vector registers.
 
 Plain loops are vectorized only when LLVM sees fit, and a loop that silently is not runs five times slower. With a type of its own
-there is nothing left to see: `a + b` on `Lanes` is one vector addition on every processor. Scalars mix in freely and are spread
-to all lanes. Nothing is reassociated, so that equal inputs give equal bits.
+there is nothing left to see: `a + b` on lanes is one vector addition on every processor. Scalars mix in freely and are spread
+to all lanes; the two types mix only through `wide` and `narrow`. Nothing is reassociated, so that equal inputs give equal bits.
 """
 
 # numba gives calls and operators a meaning of its own.
@@ -16,29 +16,39 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
-from mipmap_plugin.backends.cpu_kernels import inner
-
 WIDTH = 16
 
-_FLOATS = ir.VectorType(ir.FloatType(), WIDTH)
-_INTS = ir.VectorType(ir.IntType(32), WIDTH)
+VECTOR32 = ir.VectorType(ir.FloatType(), WIDTH)
+VECTOR64 = ir.VectorType(ir.DoubleType(), WIDTH)
+INTS32 = ir.VectorType(ir.IntType(32), WIDTH)
+INTS64 = ir.VectorType(ir.IntType(64), WIDTH)
 
 
 class _Lanes(types.Type):
     """WIDTH float32."""
 
 
+class _Doubles(types.Type):
+    """WIDTH float64."""
+
+
 class _Mask(types.Type):
     """WIDTH booleans."""
 
 
-LANES, MASK = _Lanes("lanes"), _Mask("mask")
+LANES, DOUBLES, MASK = _Lanes("lanes"), _Doubles("doubles"), _Mask("mask")
 
 
 @register_model(_Lanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, _FLOATS)
+        super().__init__(manager, kind, VECTOR32)
+
+
+@register_model(_Doubles)
+class _DoublesModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, VECTOR64)
 
 
 @register_model(_Mask)
@@ -47,36 +57,46 @@ class _MaskModel(models.PrimitiveModel):
         super().__init__(manager, kind, ir.VectorType(ir.IntType(1), WIDTH))
 
 
-def _spread(context, builder, value, kind):
-    """`value` as lanes; a scalar goes to every lane."""
-    if kind == LANES:
+def _common(kinds):
+    """The lanes that arguments have in common: float64 where one is."""
+    return DOUBLES if DOUBLES in kinds else LANES
+
+
+def _spread(context, builder, value, kind, lanes):
+    """`value` as `lanes`; a scalar goes to every lane."""
+    if kind == lanes:
         return value
-    scalar = context.cast(builder, value, kind, types.float32)
-    first = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), scalar, ir.IntType(32)(0))
-    return builder.shuffle_vector(first, ir.Constant(_FLOATS, ir.Undefined), ir.Constant(_INTS, [0] * WIDTH))
+    vector, number = (VECTOR64, types.float64) if lanes == DOUBLES else (VECTOR32, types.float32)
+    scalar = context.cast(builder, value, kind, number)
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), scalar, ir.IntType(32)(0))
+    return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), ir.Constant(INTS32, [0] * WIDTH))
 
 
-def _lane_wise(emit, result=LANES):
-    """An intrinsic of `emit(builder, *vectors)` for arguments that are lanes or scalars."""
+def lane_wise(emit, result=None):
+    """An intrinsic of `emit(builder, *vectors)` for arguments that are lanes or scalars; `result`: where it is not of their type."""
 
     def typed(*kinds):
-        def generate(context, builder, signature, values):
-            return emit(builder, *(_spread(context, builder, v, k) for v, k in zip(values, signature.args, strict=True)))
+        lanes = _common(kinds)
 
-        return result(*kinds), generate
+        def generate(context, builder, signature, values):
+            return emit(builder, *(_spread(context, builder, v, k, lanes) for v, k in zip(values, signature.args, strict=True)))
+
+        return (result or lanes)(*kinds), generate
 
     return typed
 
 
 def _call(name, builder, *vectors):
     """LLVM's own function of that name for vectors."""
-    signature = ir.FunctionType(_FLOATS, [_FLOATS] * len(vectors))
-    return builder.call(cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{WIDTH}f32"), vectors)
+    kind = vectors[0].type
+    suffix = "f64" if kind == VECTOR64 else "f32"
+    signature = ir.FunctionType(kind, [kind] * len(vectors))
+    return builder.call(cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{WIDTH}{suffix}"), vectors)
 
 
-def _operator(symbol, emit, result=LANES):
+def _operator(symbol, emit, result=None):
     """Teach numba `symbol` for two operands of which at least one is lanes."""
-    typed = _lane_wise(emit, result)
+    typed = lane_wise(emit, result)
 
     @intrinsic
     def apply(_context, left, right):
@@ -84,7 +104,7 @@ def _operator(symbol, emit, result=LANES):
 
     @overload(symbol)
     def _apply(left, right):
-        if LANES in (left, right):
+        if LANES in (left, right) or DOUBLES in (left, right):
             return lambda left, right: apply(left, right)
         return None
 
@@ -94,7 +114,16 @@ _operator(operator.sub, lambda builder, a, b: builder.fsub(a, b))
 _operator(operator.mul, lambda builder, a, b: builder.fmul(a, b))
 _operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
 _operator(operator.lt, lambda builder, a, b: builder.fcmp_ordered("<", a, b), MASK)
+_operator(operator.gt, lambda builder, a, b: builder.fcmp_ordered(">", a, b), MASK)
 _operator(operator.ge, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), MASK)
+_operator(operator.le, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), MASK)
+
+
+@overload(operator.neg)
+def _negative(lanes):
+    if lanes in (LANES, DOUBLES):
+        return lambda lanes: 0 - lanes
+    return None
 
 
 @intrinsic
@@ -124,101 +153,67 @@ def select(_context, mask, yes, no):
     """`yes` where the mask is set, else `no`. What is not taken may be anything, even NaN."""
 
     def generate(context, builder, signature, values):
-        options = (_spread(context, builder, v, k) for v, k in zip(values[1:], signature.args[1:], strict=True))
+        options = (_spread(context, builder, v, k, lanes) for v, k in zip(values[1:], signature.args[1:], strict=True))
         return builder.select(values[0], *options)
 
-    return LANES(mask, yes, no), generate
+    lanes = _common((yes, no))
+    return lanes(mask, yes, no), generate
 
 
 @intrinsic
 def fma(_context, a, b, c):
     """a·b + c, rounded once where the processor can."""
-    return _lane_wise(partial(_call, "fmuladd"))(a, b, c)
+    return lane_wise(partial(_call, "fmuladd"))(a, b, c)
 
 
 @intrinsic
 def minimum(_context, a, b):
-    return _lane_wise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))(a, b)
+    return lane_wise(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))(a, b)
 
 
 @intrinsic
 def maximum(_context, a, b):
-    return _lane_wise(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))(a, b)
+    return lane_wise(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))(a, b)
 
 
 @intrinsic
 def sqrt(_context, a):
-    return _lane_wise(partial(_call, "sqrt"))(a)
+    return lane_wise(partial(_call, "sqrt"))(a)
 
 
 @intrinsic
 def floor(_context, a):
-    return _lane_wise(partial(_call, "floor"))(a)
+    return lane_wise(partial(_call, "floor"))(a)
 
 
 @intrinsic
 def ceil(_context, a):
-    return _lane_wise(partial(_call, "ceil"))(a)
+    return lane_wise(partial(_call, "ceil"))(a)
 
 
 @intrinsic
 def spread(_context, value):
     """A scalar in every lane."""
-    return _lane_wise(lambda builder, value: value)(value)
+    return lane_wise(lambda builder, value: value)(value)
 
 
 @intrinsic
 def ramp(_context, start):
     """start, start + 1, ..., start + 15."""
-    steps = ir.Constant(_FLOATS, [float(i) for i in range(WIDTH)])
-    return _lane_wise(lambda builder, start: builder.fadd(start, steps))(start)
-
-
-def _pointer(context, builder, kind, array, index):
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _FLOATS.as_pointer())
+    steps = ir.Constant(VECTOR32, [float(i) for i in range(WIDTH)])
+    return lane_wise(lambda builder, start: builder.fadd(start, steps))(start)
 
 
 @intrinsic
-def load(_context, array, index):
-    """array[index : index + 16] of a contiguous float32 array [n]. The caller keeps within bounds."""
-
-    def generate(context, builder, signature, values):
-        index = context.cast(builder, values[1], signature.args[1], types.intp)
-        return builder.load(_pointer(context, builder, signature.args[0], values[0], index), align=4)
-
-    return LANES(array, index), generate
+def wide(_context, lanes):
+    """float32 as float64."""
+    return DOUBLES(lanes), lambda context, builder, signature, values: builder.fpext(values[0], VECTOR64)
 
 
 @intrinsic
-def store(_context, array, index, lanes):
-    """array[index : index + 16] = lanes."""
-
-    def generate(context, builder, signature, values):
-        index = context.cast(builder, values[1], signature.args[1], types.intp)
-        builder.store(values[2], _pointer(context, builder, signature.args[0], values[0], index), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, index, lanes), generate
-
-
-@intrinsic
-def prefetch(_context, array, row):
-    """Ask for array[row] of a contiguous array [n, m], so that it is at hand a little later."""
-
-    def generate(context, builder, signature, values):
-        kind = signature.args[0]
-        record = context.make_array(kind)(context, builder, values[0])
-        columns = builder.extract_value(record.shape, 1)
-        row = context.cast(builder, values[1], signature.args[1], types.intp)
-        place = builder.bitcast(builder.gep(record.data, [builder.mul(row, columns)]), cgutils.voidptr_t)
-        number = ir.IntType(32)
-        signature = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, number, number, number])
-        function = cgutils.get_or_insert_function(builder.module, signature, "llvm.prefetch.p0")
-        builder.call(function, [place, number(0), number(3), number(1)])  # to read, into every cache, as data
-        return context.get_dummy_value()
-
-    return types.void(array, row), generate
+def narrow(_context, doubles):
+    """float64 rounded to float32; infinite where that is too small."""
+    return LANES(doubles), lambda context, builder, signature, values: builder.fptrunc(values[0], VECTOR32)
 
 
 @intrinsic
@@ -234,32 +229,3 @@ def total(_context, lanes):
         return builder.extract_element(value, ir.IntType(32)(0))
 
     return types.float32(lanes), generate
-
-
-@intrinsic
-def _add_to_exponent(_context, lanes, rounded):
-    """lanes · 2^n, for n held in the low bits of `rounded` as `exp2` leaves them."""
-
-    def emit(builder, lanes, rounded):
-        shift = ir.Constant(_INTS, [23] * WIDTH)
-        bits = builder.add(builder.bitcast(lanes, _INTS), builder.shl(builder.bitcast(rounded, _INTS), shift))
-        return builder.bitcast(bits, _FLOATS)
-
-    return _lane_wise(emit)(lanes, rounded)
-
-
-# 1.5 · 2^23: added to a float32 it leaves the nearest integer in the low bits.
-_ROUNDER = 12582912.0
-
-
-@inner
-def exp2(power):
-    """2^power to 1e-7 for -126 < power < 127; outside, anything. numba's own exponentials are scalar."""
-    rounded = power + _ROUNDER
-    rest = power - (rounded - _ROUNDER)  # -0.5 .. 0.5
-    series = fma(rest, 0.00132647272, 0.00967151264)  # minimax in relative error, exactly 1 at 0
-    series = fma(series, rest, 0.0555073374)
-    series = fma(series, rest, 0.240222421)
-    series = fma(series, rest, 0.693146978)
-    series = fma(series, rest, 1.0)
-    return _add_to_exponent(series, rounded)

@@ -9,7 +9,8 @@ Pixels lie in planes of TILE_ROWS rows, each WIDTH longer than the tile, so that
 from mipmap_plugin.backends.compositing import MAX_ALPHA
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.binning import TILE_COLUMNS, TILE_ROWS
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, load, minimum, select, store
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, minimum, select
+from mipmap_plugin.backends.cpu_kernels.memory import load, store
 from mipmap_plugin.effects import MIN_TRANSMITTANCE
 
 STRIDE = TILE_COLUMNS + WIDTH

@@ -4,9 +4,16 @@ Each run of splats counts its tiles; the counts of all runs tell where each puts
 own. As the runs are in order, the outcome is the same for any number of them.
 """
 
+# numba gives calls and operators a meaning of its own.
+# mypy: ignore-errors
+
 import numpy as np
+from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel
+from mipmap_plugin.backends.cpu_kernels import columns as col
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
+from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.records import Lists
 
 # Bits of a depth sorted at a time: most lists hold some hundred splats, and more counters than that would take longest.
@@ -18,6 +25,9 @@ SHORT = 32
 # An entry of a list while it is sorted: the depth's bits above, the slot below. Positive floats sort as their bits do.
 SLOT_BITS = 32
 _SLOT = (1 << SLOT_BITS) - 1
+
+new_block, new_spans = scratch(col.OUTLINE * WIDTH, types.float32), scratch(2 * WIDTH, types.float64)
+new_places = scratch(WIDTH, types.int64)
 
 
 def tile_lists(table, depths, slots, width, height, team):
@@ -43,14 +53,24 @@ def cut(slots, run, runs):
 @kernel
 def cover(start, stop, table, slots, width, height, tiles, splats, counts):
     """Write the tile and the splat of every slot in the runs start..stop, and count how often each tile occurs in each run."""
+    rows, block, spans, at = pointer(table), new_block(), new_spans(), new_places()
     for run in range(start, stop):
         counts[run] = 0
+        tally = pointer(counts[run])
         first, last = cut(slots, run, len(counts))
-        for i in range(first, last):
-            if slots[i] < slots[i + 1]:
-                binning.cover(table, i, slots[i], width, height, tiles, counts, run)
-            for slot in range(slots[i], slots[i + 1]):
-                splats[slot] = i
+        for begin in range(first, last, WIDTH):
+            drawn = 0
+            for lane in range(min(WIDTH, last - begin)):
+                i = begin + lane
+                at[lane] = slots[i]
+                if slots[i] < slots[i + 1]:
+                    drawn |= 1 << lane
+                    for k in range(col.OUTLINE):
+                        block[k * WIDTH + lane] = rows[i * col.COLUMNS + k]
+                for slot in range(slots[i], slots[i + 1]):
+                    splats[slot] = i
+            if drawn != 0:
+                binning.cover(block, spans, drawn, at, width, height, pointer(tiles), tally)
 
 
 @kernel

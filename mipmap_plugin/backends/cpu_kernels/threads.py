@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator
+import os
+from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import torch
@@ -18,42 +20,49 @@ RANGES_PER_THREAD = 16
 
 @dataclass(frozen=True)
 class Team:
-    """Threads that take work as they come free: the caller's, and those of a pool."""
+    """Threads that share work: the caller's, and those of a pool."""
 
     threads: int
-    pool: ThreadPoolExecutor | None
 
     def share(self, kernel: Callable[..., None], count: int, *arguments) -> None:
         """Run `kernel(start, stop, *arguments)` over 0..count."""
-        if self.pool is None:
+        if self.threads == 1:
             kernel(0, count, *arguments)
             return
         step = max(1, -(-count // (self.threads * RANGES_PER_THREAD)))
-        starts = iter(range(0, count, step))
+        ranges = [(start, min(start + step, count)) for start in range(0, count, step)]
+        cuts = [len(ranges) * thread // self.threads for thread in range(self.threads + 1)]
+        parts = [deque(ranges[first:last]) for first, last in pairwise(cuts)]
 
-        def work() -> None:
-            for start in starts:
-                kernel(start, min(start + step, count), *arguments)
+        def work(thread: int) -> None:
+            # Always the same part first, which is still in this processor's cache; of the others' what they come to last.
+            for part in parts[thread:] + parts[:thread]:
+                while part:
+                    try:
+                        start, stop = part.popleft() if part is parts[thread] else part.pop()
+                    except IndexError:  # another thread was quicker
+                        break
+                    kernel(start, stop, *arguments)
 
-        others = [self.pool.submit(work) for _ in range(self.threads - 1)]
-        work()
+        others = [_pool(self.threads - 1, os.getpid()).submit(work, thread) for thread in range(1, self.threads)]
+        work(0)
         for other in others:
-            other.result()
+            if not other.cancel():  # nothing is left for one that has not begun
+                other.result()
 
 
-@contextmanager
-def team() -> Iterator[Team]:
-    """As many threads as torch uses.
-
-    They live as long as one image: an idle pool would not survive a fork, and two callers would get in each other's way.
-    """
+def team() -> Team:
+    """As many threads as torch uses."""
     threads = torch.get_num_threads()
-    if threads == 1:
-        yield Team(1, None)
-        return
-    _dismiss_idle_threads()
-    with ThreadPoolExecutor(threads - 1) as pool:
-        yield Team(threads, pool)
+    if threads > 1:
+        _dismiss_idle_threads()
+    return Team(threads)
+
+
+@cache
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads that wait for work. Each process has its own, for they do not survive a fork."""
+    return ThreadPoolExecutor(threads, f"mipmap_plugin-{process}")
 
 
 def _dismiss_idle_threads() -> None:

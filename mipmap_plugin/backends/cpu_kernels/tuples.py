@@ -44,14 +44,3 @@ def apply(matrix, v):
 def apply_transposed(matrix, v):
     """matrixᵀ · v"""
     return plus(blend(v[0], matrix[0], v[1], matrix[1]), times(v[2], matrix[2]))
-
-
-@inner
-def row(array, i):
-    """array[i] of [N, 3] in float64."""
-    return float(array[i, 0]), float(array[i, 1]), float(array[i, 2])
-
-
-@inner
-def set_row(array, i, v):
-    array[i, 0], array[i, 1], array[i, 2] = v

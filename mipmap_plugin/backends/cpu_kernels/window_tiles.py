@@ -7,18 +7,21 @@ Windows cannot be undone like transmittance. The backward pass walks forward fir
 # mypy: ignore-errors
 
 import numpy as np
+from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner, kernel, windows
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, TILE_COLUMNS, TILE_ROWS
-from mipmap_plugin.backends.cpu_kernels.compositing import AHEAD, PATIENCE, bounds, close_tile, finished, open_tile, reopen_tile, trace
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, load, lowest, prefetch, ramp, select, spread, store, total
+from mipmap_plugin.backends.cpu_kernels.compositing import AHEAD, PATIENCE, bounds, close_tile, fill, finished, open_tile, reopen_tile, trace
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, lowest, ramp, select, spread, total
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, prefetch, row_of, scratch, store
 from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, END, ENDS, LIGHT, PLANE, STATE, STRIDE, cover, uncover
 from mipmap_plugin.effects import MIN_ALPHA
 
 # Where the planes of windows begin in a tile's state: x, y, width, height; in the backward pass their gradients.
 WINDOWS = STATE
 ROOM = STATE + 4 * PLANE
+new_room = scratch(ROOM, types.float32)
 
 # Of one visit to 16 pixels the windows are kept: so many numbers. A splat makes at most MOST visits in a tile.
 KEPT = 4 * WIDTH
@@ -31,7 +34,7 @@ def composite(start, stop, table, lists, frame, image):
     starts, members, _ = lists
     background, through, stops = frame
     height, width = through.shape
-    state, none, nowhere = np.empty(ROOM, np.float32), np.empty(0, np.float32), np.empty(0, np.int64)
+    state, nowhere = new_room(), (pointer(image), pointer(starts), False)
     for tile in range(start, stop):
         box = bounds(tile, width, height)
         length = starts[tile + 1] - starts[tile]
@@ -41,7 +44,8 @@ def composite(start, stop, table, lists, frame, image):
                 break
             at = starts[tile] + n
             prefetch(table, members[min(at + AHEAD, len(members) - 1)])
-            lay(table, members[at], n, box, state, none, nowhere, 0)
+            splat = row_of(table, members[at])
+            lay(splat, n, box, state, nowhere, 0)
         close_tile(box, state, background, image, through, stops)
 
 
@@ -49,8 +53,8 @@ def composite(start, stop, table, lists, frame, image):
 def open_windows(box, length, state):
     """Begin with an empty tile: each window is its pixel."""
     open_tile(box, length, state)
-    state[WINDOWS : WINDOWS + 2 * PLANE] = 0
-    state[WINDOWS + 2 * PLANE : ROOM] = 1
+    fill(state, WINDOWS, WINDOWS + 2 * PLANE, 0)
+    fill(state, WINDOWS + 2 * PLANE, ROOM, 1)
 
 
 @inner
@@ -73,39 +77,43 @@ def choose(mask, yes, no):
 
 
 @inner
-def look(splat, room, dx, dy, unfinished, color, n, at, state, kept, places, visits):
+def look(shape, room, dx, dy, unfinished, color, n, at, state, memory, visits):
     """Lay a splat over the 16 pixels at `at`, as their windows show it. 1 if it is seen at all, else 0."""
     window = load_windows(state, WINDOWS + at, PLANE)
-    if bits(both(unfinished, windows.reached(splat, room, dx, dy, window))) == 0:
+    if bits(both(unfinished, windows.reached(shape, room, dx, dy, window))) == 0:
         return 0
-    alpha, seen = windows.look(splat, dx, dy, window)
+    alpha, seen = windows.look(shape, dx, dy, window)
     bright = both(alpha >= MIN_ALPHA, unfinished)
     if bits(bright) == 0:
         return 0
-    if len(kept) > 0:
+    kept, places, keep = memory
+    if keep:
         store_windows(kept, visits * KEPT, WIDTH, window)
         places[visits] = at
     cover(alpha, bright, color, n, at, state)
-    after = windows.kept(windows.behind(splat, window, alpha, seen)[0])
+    after = windows.kept(windows.behind(shape, window, alpha, seen)[0])
     store_windows(state, WINDOWS + at, PLANE, choose(bright, after, window))
     return 1
 
 
 @inner
-def lay(table, i, n, box, state, kept, places, visits):
-    """Lay splat i, the n-th of its tile, behind what is there. Where there is room in `kept`, keep the windows it was seen through."""
-    color, splat = (table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]), windows.splat_of(table, i)
-    room, rows = table[i, col.PEAK] - LOG_MIN_ALPHA, trace(table, i, box, state)
+def lay(splat, n, box, state, memory, visits):
+    """Lay a splat, the n-th of its tile, behind what is there, and count its visits.
+
+    memory: where the windows that it was seen through are kept, where the places, and whether they are.
+    """
+    color, shape = (splat[col.RED], splat[col.GREEN], splat[col.BLUE]), windows.shape_of(splat)
+    room, rows = splat[col.PEAK] - LOG_MIN_ALPHA, trace(splat, box, state)
     while rows != 0:
         r = lowest(rows)
         rows &= rows - 1
         column, end = state[BEGIN + r], state[END + r]
         at = r * STRIDE + int(column)
-        center, dy = table[i, col.X] - box[0] - 0.5, box[1] + r + 0.5 - table[i, col.Y]
+        center, dy = splat[col.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[col.Y]
         while column <= end:
             unfinished = both(load(state, LIGHT + at) >= 0, end >= ramp(column))
             if bits(unfinished) != 0:
-                visits += look(splat, room, ramp(column - center), dy, unfinished, color, n, at, state, kept, places, visits)
+                visits += look(shape, room, ramp(column - center), dy, unfinished, color, n, at, state, memory, visits)
             column += WIDTH
             at += WIDTH
     return visits
@@ -121,7 +129,7 @@ def composite_back(start, stop, table, lists, frame, d_frame, pulls):
     background, through, stops = frame
     d_image, d_alpha = d_frame
     height, width = through.shape
-    state, kept, places = np.empty(ROOM, np.float32), np.empty(16 * MOST * KEPT, np.float32), np.empty(16 * MOST, np.int64)
+    state, kept, places = new_room(), np.empty(16 * MOST * KEPT, np.float32), np.empty(16 * MOST, np.int64)
     for tile in range(start, stop):
         box = bounds(tile, width, height)
         length = starts[tile + 1] - starts[tile]
@@ -132,41 +140,44 @@ def composite_back(start, stop, table, lists, frame, d_frame, pulls):
                 break
             if visits + MOST > len(places):
                 kept, places = np.append(kept, np.empty_like(kept)), np.append(places, np.empty_like(places))
-            visits = lay(table, members[starts[tile] + n], n, box, state, kept, places, visits)
+            memory = pointer(kept), pointer(places), True
+            visits = lay(row_of(table, members[starts[tile] + n]), n, box, state, memory, visits)
             firsts[n + 1] = visits
 
         used = reopen_tile(box, background, through, stops, d_image, d_alpha, state)
+        fill(state, WINDOWS, ROOM, 0)
         for at in range(starts[tile] + used, starts[tile + 1]):
             for k in range(col.PULLS):
                 pulls[slots[at], k] = 0
         for n in range(used - 1, -1, -1):
             at = starts[tile] + n
             prefetch(table, members[max(at - AHEAD, 0)])
-            lift(table, members[at], n, box, state, (kept, places, firsts), pulls, slots[at])
+            splat, pull = row_of(table, members[at]), row_of(pulls, slots[at])
+            lift(splat, n, box, state, memory, (firsts[n], firsts[n + 1]), pull)
 
 
 @inner
-def lift(table, i, n, box, state, memory, pulls, slot):
-    """Take splat i, the n-th of its tile, off again and write its pull."""
-    kept, places, firsts = memory
-    color, splat = (table[i, col.RED], table[i, col.GREEN], table[i, col.BLUE]), windows.splat_of(table, i)
+def lift(splat, n, box, state, memory, visits, pull):
+    """Take a splat, the n-th of its tile, off again and write its pull."""
+    kept, places, _ = memory
+    color, shape = (splat[col.RED], splat[col.GREEN], splat[col.BLUE]), windows.shape_of(splat)
     sum_1 = sum_u = sum_v = sum_long = sum_short = sum_turn = sum_red = sum_green = sum_blue = spread(0)
-    for visit in range(firsts[n], firsts[n + 1]):
+    for visit in range(visits[0], visits[1]):
         at, window = places[visit], load_windows(kept, visit * KEPT, WIDTH)
         r = at // STRIDE
-        dx, dy = ramp(at - r * STRIDE - (table[i, col.X] - box[0] - 0.5)), box[1] + r + 0.5 - table[i, col.Y]
-        alpha, seen = windows.look(splat, dx, dy, window)
+        dx, dy = ramp(at - r * STRIDE - (splat[col.X] - box[0] - 0.5)), box[1] + r + 0.5 - splat[col.Y]
+        alpha, seen = windows.look(shape, dx, dy, window)
         bright = alpha >= MIN_ALPHA
         shown = both(bright, n < load(state, ENDS + at))
         s, weight, d_red, d_green, d_blue = uncover(alpha, bright, color, n, at, state)
-        after, outcome = windows.behind(splat, window, alpha, seen)
+        after, outcome = windows.behind(shape, window, alpha, seen)
         d_window = load_windows(state, WINDOWS + at, PLANE)
-        d_before, s, slopes = windows.pull_behind(splat, alpha, s, seen, outcome, windows.pull_kept(after, d_window))
+        d_before, s, slopes = windows.pull_behind(shape, alpha, s, seen, outcome, windows.pull_kept(after, d_window))
         store_windows(state, WINDOWS + at, PLANE, choose(shown, d_before, d_window))
         sum_1, sum_u, sum_v = sum_1 + select(shown, s, 0), sum_u + select(shown, slopes[0], 0), sum_v + select(shown, slopes[1], 0)
         sum_long, sum_short = sum_long + select(shown, slopes[2], 0), sum_short + select(shown, slopes[3], 0)
         sum_turn = sum_turn + select(shown, slopes[4], 0)
         sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
-    pulls[slot, col.SUM], pulls[slot, col.BY_LONG], pulls[slot, col.BY_SHORT] = total(sum_1), total(sum_u) / splat[3], total(sum_v) / splat[4]
-    pulls[slot, col.GROW_LONG], pulls[slot, col.GROW_SHORT], pulls[slot, col.TURN] = total(sum_long), total(sum_short), total(sum_turn)
-    pulls[slot, col.RED], pulls[slot, col.GREEN], pulls[slot, col.BLUE] = total(sum_red), total(sum_green), total(sum_blue)
+    pull[col.SUM], pull[col.BY_LONG], pull[col.BY_SHORT] = total(sum_1), total(sum_u) / shape[3], total(sum_v) / shape[4]
+    pull[col.GROW_LONG], pull[col.GROW_SHORT], pull[col.TURN] = total(sum_long), total(sum_short), total(sum_turn)
+    pull[col.PULL_RED], pull[col.PULL_GREEN], pull[col.PULL_BLUE] = total(sum_red), total(sum_green), total(sum_blue)

@@ -8,7 +8,8 @@ import math
 from mipmap_plugin.backends.compositing import MAX_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, exp2, fma, maximum, minimum, select, sqrt
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, maximum, minimum, select, sqrt
+from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.window import FARTHEST, LEAST_VARIANCE, POINTS, WEIGHTS, WIDE
 
 HALF_LOG2E = 0.5 / math.log(2)
@@ -26,10 +27,11 @@ ROUNDING = 1e-3
 
 
 @inner
-def splat_of(table, i):
-    """The direction of a splat's longer axis, whether that is nearer to y, 1 / standard deviation along it and across, and the opacity."""
-    cos, sin = table[i, col.COS], table[i, col.SIN]
-    return cos, sin, abs(cos) < abs(sin), table[i, col.PER_LONG], table[i, col.PER_SHORT], table[i, col.OPACITY]
+def shape_of(splat):
+    """Of a row of the table: the direction of the longer axis, whether that is nearer to y, 1 / standard deviation along it and across,
+    and the opacity."""
+    cos, sin = splat[col.COS], splat[col.SIN]
+    return cos, sin, abs(cos) < abs(sin), splat[col.PER_LONG], splat[col.PER_SHORT], splat[col.OPACITY]
 
 
 @inner
