@@ -18,19 +18,13 @@ import tyro
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.config import Recipe
-from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row, evaluate
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
+from mipmap_plugin.evaluation.evaluate import Row, evaluate
 from mipmap_plugin.evaluation.report import records, table
 from mipmap_plugin.files import write_json
-from mipmap_plugin.scenes import Scene
-from mipmap_plugin.wrap import Wrapped
 
 # The scales that each base was trained for the study of; see its own page.
 SCALES = {"lego_200": (1, 1 / 2, 1 / 4, 1 / 8), "chair_400": (1, 1 / 2, 1 / 4, 1 / 8), "lego_100": (1, 2, 4, 8), "chair_100": (1, 2, 4, 8)}
 RECIPES: tuple[Recipe, ...] = ("instant", "paper", "default")
-
-# What a zoom-out gains by patience: more steps than the default's 400, towards more views.
-LONG = dict(steps=1500, extra_views=1000, patience=None, check_every=250)
 
 
 def main(
@@ -38,7 +32,6 @@ def main(
     output: Path = Path("benchmarks/results"),
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     recipe: tyro.conf.UseAppendAction[tuple[Recipe, ...]] = (),
-    long: bool = False,
     backend: str = "auto",
 ) -> None:
     """Measure, and write the tables.
@@ -47,16 +40,14 @@ def main(
         data: The folder with checkpoints/ and images/.
         output: Where the results go; rows of bases that were measured before are replaced.
         only: Which bases; all by default.
-        recipe: Which recipes; all by default.
-        long: Also the default recipe with 1500 steps, for zoom-out.
+        recipe: Which recipes; all by default, at zoom-out `thorough` among them.
         backend: A backend's name.
     """
-    recipes = recipe or RECIPES
     for base in only or SCALES:
+        recipes = recipe or (RECIPES if max(SCALES[base]) > 1 else (*RECIPES, "thorough"))
         wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
         scene = load_scene(data / "images" / base.split("_")[0])
-        rows = kept(output / f"{base}.json", recipes, long) + evaluate(wrapped, scene, SCALES[base], recipes, "P3")
-        rows += long_rows(wrapped, scene, [scale for scale in SCALES[base] if scale < 1]) if long else []
+        rows = kept(output / f"{base}.json", recipes) + evaluate(wrapped, scene, SCALES[base], recipes, "P3")
         rows.sort(key=lambda row: (abs(math.log2(row.scale)), "," in row.name))
         write_json(output / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)
@@ -66,22 +57,10 @@ def main(
     (output / "real_bases.md").write_text(intro + "\n".join(parts))
 
 
-def kept(file: Path, measured: Sequence[Recipe], long: bool) -> list[Row]:
+def kept(file: Path, measured: Sequence[Recipe]) -> list[Row]:
     """The rows of an earlier run that are not measured again."""
     rows = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    again = (*measured, *(["long"] if long else []))
-    return [row for row in rows if "," in row.name and not row.name.startswith(again)]
-
-
-def long_rows(wrapped: Wrapped, scene: Scene, scales: Sequence[float]) -> list[Row]:
-    scene = wrapped.place(scene)
-    judge = Judge(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
-    scored = dict(views="given", cameras=[view.camera for view in judge.views])
-    rows = []
-    for scale in scales:
-        rows.append(adapted_row("long, held out", wrapped.adapt(scale, **LONG), judge))
-        rows.append(adapted_row("long, scored", wrapped.adapt(scale, **{**LONG, **scored}), judge))
-    return rows
+    return [row for row in rows if "," in row.name and not row.name.startswith(tuple(measured))]
 
 
 if __name__ == "__main__":

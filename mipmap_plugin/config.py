@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -10,7 +10,8 @@ from mipmap_plugin.errors import SettingsError
 
 ResizeFilter = Literal["box", "area", "bilinear", "pil-bicubic", "lanczos"]
 ViewPolicy = Literal["given", "train", "test", "orbit", "jittered"]
-Recipe = Literal["default", "paper", "instant"]
+Recipe = Literal["default", "thorough", "paper", "instant"]
+Momentum = Annotated[float, Field(ge=0, lt=1)]
 
 
 class LearningRates(BaseModel):
@@ -58,7 +59,8 @@ class AdaptConfig(BaseModel):
     merge_to: float = Field(1.0, gt=0, le=1, description="Share of the splats that is left when like ones that share pixels are merged.")
     rates: LearningRates = LearningRates()
     loss: Literal["l2", "l1"] = Field("l2", description="Of an image against the truth: mean square or mean absolute difference.")
-    decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling exponentially.")
+    decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling along half a cosine.")
+    betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's: how long it remembers gradients and their squares.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
     prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")
@@ -77,11 +79,16 @@ _PAPER = dict(
 _INSTANT = dict(steps=0)
 
 # A classic file dilates by more than an image filter does, so sharpness has to come from colors that depend on the view: bands
-# above 0 move as fast as the base color, towards hundreds of views, or held-out views gain nothing by it.
+# above 0 move as fast as the base color, towards hundreds of views, or held-out views gain nothing by it. Rates are so bold that
+# most is gained while they fall; a memory for the last twenty squares instead of a thousand lets so short a run follow. There is no
+# knee to stop at before they have fallen.
 _DEFAULT_OUT = dict(
-    steps=400, patience=2, decay=0.1, truth_oversampling=4, views_per_step=4, extra_views=200,
-    rates=LearningRates(means=0.1, scales=0.02, quats=0.004, opacities=0.1, sh0=0.03, shN=0.04, networks=5e-4),
+    steps=400, decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=4, extra_views=200,
+    rates=LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, networks=5e-4),
 )  # fmt: skip
+
+# What more time buys at zoom-out: twice the steps, twice the views in each, five times the views. At zoom-in there is nothing to buy.
+_THOROUGH_OUT = dict(_DEFAULT_OUT, steps=800, views_per_step=8, extra_views=1000)
 
 # Of a zoom-out's splats, times the scale: at x1/8 a tenth is left.
 MERGE_TO = 0.8
@@ -106,9 +113,10 @@ KERNELS = frozenset({"bicubic", "lanczos"})
 
 def recipe(name: Recipe, scale: float, **overrides: Any) -> AdaptConfig:
     """The settings of a recipe at `scale`, with `overrides`. Raises SettingsError for an unknown name or a value out of range."""
-    zoom_out = _DEFAULT_OUT | {"merge_to": min(1.0, MERGE_TO * scale)}
-    default = zoom_out if scale < 1 else _DEFAULT_IN if overrides.get("upsampler", "bicubic") in KERNELS else _DEFAULT_UPSAMPLED
-    known: dict[str, dict[str, Any]] = {"default": default, "paper": _PAPER, "instant": _INSTANT}
+    zoom_in = _DEFAULT_IN if overrides.get("upsampler", "bicubic") in KERNELS else _DEFAULT_UPSAMPLED
+    merging = {"merge_to": min(1.0, MERGE_TO * scale)}
+    default, thorough = (_DEFAULT_OUT | merging, _THOROUGH_OUT | merging) if scale < 1 else (zoom_in, zoom_in)
+    known: dict[str, dict[str, Any]] = {"default": default, "thorough": thorough, "paper": _PAPER, "instant": _INSTANT}
     if name not in known:
         raise SettingsError(f"there is no recipe {name!r}; known are {', '.join(known)}")
     try:

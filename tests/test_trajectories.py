@@ -172,9 +172,19 @@ def test_cameras_that_look_apart_are_not_mixed():
     assert forwards(views)[:, 2].abs().min() > 1 - 1e-12
 
 
-def test_every_camera_is_used_in_turn():
-    cameras = [replace(camera, fx=camera.fx + i) for i, camera in enumerate(ring(5))]
-    assert {view.fx for view in jittered(cameras, 5, seeded())} == {camera.fx for camera in cameras}
+def test_the_widest_gap_between_cameras_is_filled_first():
+    cameras = []
+    for x in (0.0, 0.1, 0.2, 0.3, 0.4, 5.0):
+        cameras.append(Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4, dtype=torch.float64)))
+        cameras[-1].viewmat[0, 3] = -x
+    views = jittered(cameras, 4, seeded(), amount=0.0)
+    assert sum(1.0 < view.center[0] < 4.5 for view in views) >= 2
+
+
+def test_views_are_spread_over_the_times_of_the_cameras_too():
+    cameras = [replace(camera, time=float(n % 2)) for n, camera in enumerate(ring(12))]
+    times = [view.time for view in jittered(cameras, 40, seeded())]
+    assert 8 <= sum(times) <= 32
 
 
 def test_jittered_repeats_with_the_seed_and_only_then():

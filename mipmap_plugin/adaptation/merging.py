@@ -17,7 +17,7 @@ from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.gaussians import Gaussians
 
 # Target pixels: the side of the largest cell whose splats may become one. Beyond it a picture loses more than steps bring back.
-LARGEST_CELL = 4.0
+LARGEST_CELL = 8.0
 
 # A cell is tried at most this often smaller or larger; each halves what is left to know of its size.
 TRIES = 12

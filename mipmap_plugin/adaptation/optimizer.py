@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -21,12 +22,12 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torc
     groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]
     if shared := list(model.shared_parameters().values()):
         groups.append({"params": shared, "lr": rates["networks"], "base_lr": rates["networks"], "name": "networks"})
-    return torch.optim.Adam(groups, eps=ADAM_EPS, fused=True)
+    return torch.optim.Adam(groups, betas=config.betas, eps=ADAM_EPS, fused=True)
 
 
 def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float) -> None:
-    """Each rate at `progress` (0..1) of its exponential decay."""
-    share = config.decay**progress
+    """Each rate at `progress` (0..1) of its fall, which is half a cosine (Loshchilov and Hutter 2017, SGDR, equation 5)."""
+    share = config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2
     for group in optimizer.param_groups:
         group["lr"] = group["base_lr"] * share
 

@@ -145,7 +145,7 @@ def evaluate(
 def _views(name: Recipe, on: str, judged: Sequence[TestView]) -> dict[str, Any]:
     if on == "scored":
         return {"views": "given", "cameras": [view.camera for view in judged]}
-    return {} if name == "default" else {"views": "train"}
+    return {} if name in ("default", "thorough") else {"views": "train"}
 
 
 def means(rows: Sequence[Row]) -> list[Row]:
