@@ -39,6 +39,14 @@ def one_thread():
     torch.set_num_threads(threads)
 
 
+@pytest.fixture
+def threads_for_little(monkeypatch):
+    """As many threads as torch has, even where one is done sooner."""
+    from mipmap_plugin.backends.cpu_kernels import threads
+
+    monkeypatch.setattr(threads, "LEAST_WORK", 0)
+
+
 def leaf(g: Gaussians) -> Gaussians:
     given = {f.name: getattr(g, f.name) for f in fields(g)}
     return Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in given.items()})
@@ -119,7 +127,7 @@ def test_covariances_need_not_be_symmetric_to_have_their_gradient():
 
 @needs_numba
 @pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic", "window"])
-def test_the_number_of_threads_changes_no_bit(screen_filter):
+def test_the_number_of_threads_changes_no_bit(screen_filter, threads_for_little):
     g = gaussians(2000)
     results = []
     for threads in (1, 2, 5):
@@ -219,6 +227,14 @@ def test_functions_in_lanes_of_float64(name):
 
 
 @needs_numba
+def test_little_work_wakes_no_second_thread():
+    from mipmap_plugin.backends.cpu_kernels.threads import LEAST_WORK, team
+
+    torch.set_num_threads(2)
+    assert (team(LEAST_WORK - 1).threads, team(LEAST_WORK).threads) == (1, 2)
+
+
+@needs_numba
 def test_a_team_does_all_work_once_however_it_is_shared():
     import numpy as np
 
@@ -238,7 +254,7 @@ def test_a_team_does_all_work_once_however_it_is_shared():
 
 @needs_numba
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-def test_a_forked_process_draws_with_threads_of_its_own():
+def test_a_forked_process_draws_with_threads_of_its_own(threads_for_little):
     torch.set_num_threads(2)
     g = gaussians(200, dtype=torch.float32)
     expected = BACKEND.render(g, WIDE, Effects(1)).image
@@ -266,7 +282,7 @@ def test_depths_sort_as_floats_with_ties_in_order(length):
 
 
 @needs_numba
-def test_torch_works_on_after_its_idle_threads_were_dismissed():
+def test_torch_works_on_after_its_idle_threads_were_dismissed(threads_for_little):
     torch.set_num_threads(2)
     values = torch.rand(100_000)
     expected = values.exp().sum()

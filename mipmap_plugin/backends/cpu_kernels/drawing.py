@@ -39,7 +39,7 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
     count, (height, width) = len(splats.means), camera.size
     table, depths, counts = _empty(count, col.COLUMNS), _empty(count), np.empty(count, np.int64)
     image, frame = _empty(height, width, 3), Frame(np.array(effects.background, np.float32), _empty(height, width), _empty(height, width))
-    threads = team()
+    threads = team(count + width * height)
     threads.share(projection.project, count, view, splats, table, depths, counts)
     slots = np.concatenate([[0], np.cumsum(counts)])
     lists = sorting.tile_lists(table, depths, slots, width, height, threads)
@@ -59,7 +59,7 @@ def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np
     pulls, grads = _empty(len(lists.members), col.PULLS), Splats(*(_empty(*array.shape) for array in splats))
     if not harmonics:
         grads = grads._replace(sh=grads.sh[:0])
-    threads = team()
+    threads = team(len(splats.means) + view.width * view.height)
     if view.seen == SEEN_IN_WINDOW:
         threads.share(window_tiles.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), pulls)
     else:

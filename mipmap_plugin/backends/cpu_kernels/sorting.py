@@ -16,6 +16,9 @@ from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.records import Lists
 
+# More than one for each thread, so that none waits long for the last; but all count every tile.
+RUNS_PER_THREAD = 8
+
 # Bits of a depth sorted at a time: most lists hold some hundred splats, and more counters than that would take longest.
 DIGIT = 8
 
@@ -34,11 +37,12 @@ def tile_lists(table, depths, slots, width, height, team):
     """Each tile's splats and their slots, front to back; of equal depths, the splat with the lower index is in front."""
     columns, rows = binning.tile_grid(width, height)
     pairs = int(slots[-1])
-    tiles, splats, counts = np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty((team.threads, columns * rows), np.int64)
-    team.share(cover, team.threads, table, slots, width, height, tiles, splats, counts)
+    runs = 1 if team.threads == 1 else RUNS_PER_THREAD * team.threads
+    tiles, splats, counts = np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty((runs, columns * rows), np.int64)
+    team.share(cover, runs, table, slots, width, height, tiles, splats, counts)
     starts = np.append(begin(counts), pairs)
     entries, members = np.empty(pairs, np.int64), np.empty(pairs, np.int32)
-    team.share(fill, team.threads, depths.view(np.int32), slots, tiles, counts, entries)
+    team.share(fill, runs, depths.view(np.int32), slots, tiles, counts, entries)
     team.share(sort, columns * rows, starts, entries, splats, members)
     return Lists(starts, members, entries)
 

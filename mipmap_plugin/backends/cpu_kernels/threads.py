@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -14,8 +14,12 @@ from pathlib import Path
 
 import torch
 
-# Work is cut finer than there are threads: crowded tiles take longer than others. Much finer, and handing it out would take time.
-RANGES_PER_THREAD = 16
+# Crowded tiles take longer than others. So a thread's part is cut finer and finer, each time by this share of what is left, for others
+# take from its end; but not finer than this share of all, or handing it out would take time.
+CUT, LEAST_CUT = 1 / 4, 1 / 512
+
+# Splats and pixels for which a second thread is worth waking: all that is done with them takes some 3 ms.
+LEAST_WORK = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -29,10 +33,8 @@ class Team:
         if self.threads == 1:
             kernel(0, count, *arguments)
             return
-        step = max(1, -(-count // (self.threads * RANGES_PER_THREAD)))
-        ranges = [(start, min(start + step, count)) for start in range(0, count, step)]
-        cuts = [len(ranges) * thread // self.threads for thread in range(self.threads + 1)]
-        parts = [deque(ranges[first:last]) for first, last in pairwise(cuts)]
+        ends = [count * thread // self.threads for thread in range(self.threads + 1)]
+        parts = [deque(cut(first, last, max(1, int(count * LEAST_CUT)))) for first, last in pairwise(ends)]
 
         def work(thread: int) -> None:
             # Always the same part first, which is still in this processor's cache; of the others' what they come to last.
@@ -51,9 +53,17 @@ class Team:
                 other.result()
 
 
-def team() -> Team:
-    """As many threads as torch uses."""
-    threads = torch.get_num_threads()
+def cut(first: int, last: int, least: int) -> Iterator[tuple[int, int]]:
+    """Ranges of first..last, ever smaller ones."""
+    while first < last:
+        stop = min(last, first + max(least, int((last - first) * CUT)))
+        yield first, stop
+        first = stop
+
+
+def team(work: int) -> Team:
+    """As many threads as torch uses, if there is enough work, in splats and pixels."""
+    threads = torch.get_num_threads() if work >= LEAST_WORK else 1
     if threads > 1:
         _dismiss_idle_threads()
     return Team(threads)
