@@ -1,0 +1,108 @@
+"""A device that is none: tensors that say that they lie elsewhere, and lie in the processor's memory all the same.
+
+Operations on them compute what a processor does, so that results can be compared to the last bit; one that mixes them with tensors of the
+processor fails as on a GPU, and one for whose answer the host would have to wait for a GPU is noted, with the line that asks.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+# Torch knows the device "meta" without anything being installed, and computes nothing there by itself.
+DEVICE = "meta"
+
+aten = torch.ops.aten
+MOVES = {aten._to_copy.default, aten.copy_.default}
+TAKES_INDICES = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default, aten._index_put_impl_.default}  # from either device
+# Their answers, or the sizes of them, follow from the numbers in a tensor.
+WAITS = {
+    aten._local_scalar_dense.default, aten.nonzero.default, aten.equal.default, aten.masked_select.default, aten._unique2.default,
+    aten.unique_consecutive.default, aten.repeat_interleave.Tensor, aten.bincount.default,
+}  # fmt: skip
+
+
+class Pretended(torch.Tensor):
+    """`inner`, a tensor of the processor, under the name of the other device."""
+
+    @staticmethod
+    def __new__(cls, inner: torch.Tensor):
+        facts = dict(strides=inner.stride(), storage_offset=inner.storage_offset(), dtype=inner.dtype, requires_grad=inner.requires_grad)
+        return torch.Tensor._make_wrapper_subclass(cls, inner.shape, device=torch.device(DEVICE), **facts)
+
+    def __init__(self, inner: torch.Tensor):
+        self.inner = inner
+
+    @classmethod
+    def __torch_dispatch__(cls, func, types, args=(), kwargs=None):
+        raise RuntimeError(f"{func}: a tensor outlived the device that it pretends to be on")
+
+
+class Device(TorchDispatchMode):
+    """What computes, refuses and takes notes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: Counter[str] = Counter()  # by the line of the package that asks
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        kwargs = dict(kwargs or {})
+        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        there = any(isinstance(tensor, Pretended) for tensor in tensors)
+        target = kwargs.get("device")
+        goes_there = there if target is None else torch.device(target).type == DEVICE
+        if not there and not goes_there:
+            return func(*args, **kwargs)
+        if there and func not in MOVES | TAKES_INDICES and any(not isinstance(tensor, Pretended) and tensor.dim() for tensor in tensors):
+            raise RuntimeError(f"{func}: tensors on two devices")
+        goes_there = isinstance(args[0], Pretended) if func is aten.copy_.default else goes_there
+        if self._waits(func, args, there and not goes_there):
+            self.waits[_asker()] += 1
+        if target is not None:
+            kwargs["device"] = torch.device("cpu")
+        made = func(*tree_map(_inner, args), **tree_map(_inner, kwargs))
+        return _wrapped(made, tensors) if goes_there else made
+
+    @staticmethod
+    def _waits(func, args, comes_back: bool) -> bool:
+        masked = func in TAKES_INDICES and any(index is not None and index.dtype == torch.bool for index in args[1])
+        return func in WAITS or masked or (func in MOVES and comes_back)
+
+
+class Factories(TorchFunctionMode):
+    """Tensors from numbers, which torch makes in one go where no mode looks."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        kwargs = kwargs or {}
+        if func is torch.Tensor.new_tensor and isinstance(args[0], Pretended):
+            return torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype)).to(DEVICE)
+        return func(*args, **kwargs)
+
+
+@contextmanager
+def pretending() -> Iterator[Device]:
+    """Inside, `.to(DEVICE)` takes tensors to the device and `.cpu()` back."""
+    with Device() as device, Factories():
+        yield device
+
+
+def _inner(value):
+    return value.inner if isinstance(value, Pretended) else value
+
+
+def _wrapped(made, tensors):
+    """What was written in place stays the tensor that it was."""
+    known = {id(tensor.inner): tensor for tensor in tensors if isinstance(tensor, Pretended)}
+    return tree_map(lambda part: (known[id(part)] if id(part) in known else Pretended(part)) if isinstance(part, torch.Tensor) else part, made)
+
+
+def _asker() -> str:
+    frames = [frame for frame in traceback.extract_stack() if "/mipmap_plugin/" in frame.filename]
+    return f"{frames[-1].filename.split('/mipmap_plugin/')[-1]}: {frames[-1].line}" if frames else "a test"

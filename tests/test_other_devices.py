@@ -1,0 +1,101 @@
+"""Models, adapting and saving on another device than the processor, which is pretended: nothing mixes the two, and results are the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import anchor_checkpoints
+import mip_checkpoints
+import moving
+import pretended
+import pytest
+import tiny
+import torch
+import torch_checkpoints
+
+from mipmap_plugin import load_model, load_scene, wrap_model
+from mipmap_plugin.adaptation import optimizer
+from mipmap_plugin.backends import gsplat, inria
+from mipmap_plugin.backends.conformance.cases import covariances
+from mipmap_plugin.backends.filters import USUAL_EPS2D
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.evaluation.evaluate import evaluate
+from mipmap_plugin.scenes.images import write_image
+
+
+@pytest.fixture(autouse=True)
+def plain_adam(monkeypatch):
+    """Torch fuses Adam on devices that it knows to be real."""
+    real = torch.optim.Adam
+    monkeypatch.setattr(optimizer.torch.optim, "Adam", lambda *args, fused, **named: real(*args, **named, foreach=False))
+
+
+FAMILIES = {
+    "3dgs": lambda path: tiny.folder(path, tiny.cameras()),
+    "mip": lambda path: mip_checkpoints.folder(path, "mip"),
+    "scaffold": lambda path: anchor_checkpoints.write(path),
+    "octree": lambda path: anchor_checkpoints.write(path, anchor_checkpoints.Layout("octree", level=True)),
+    "deformable": moving.write_deformable,
+    "gsplat": lambda path: torch_checkpoints.gsplat_folder(path, torch_checkpoints.splats()),
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("scale", [1 / 2, 2])
+def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
+    model = load_model(FAMILIES[family](tmp_path / "base"))
+    settings = dict(steps=2, extra_views=2, prune_every=1, check_every=1)
+    here = wrap_model(model, cameras=tiny.cameras(), backend="reference").adapt(scale, **settings)
+    with pretended.pretending():
+        there = wrap_model(model.to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference").adapt(scale, **settings)
+        there.save(tmp_path / "there")
+        write_image(tmp_path / "there.png", there.render(tiny.cameras()[0]).image)
+        found = {name: tensor.cpu() for name, tensor in there.model.parameters().items()}
+    assert [point.psnr_db for point in there.report.curve] == pytest.approx([point.psnr_db for point in here.report.curve], abs=1e-3)
+    if family == "3dgs":  # networks' products of matrices are taken apart in another way there
+        assert all(torch.equal(tensor, found[name]) for name, tensor in here.model.parameters().items())
+
+
+@pytest.mark.parametrize("screen_filter", USUAL_EPS2D)
+def test_the_reference_draws_there(screen_filter):
+    views, model = tiny.cameras(), tiny.model()
+    with pretended.pretending():
+        image = wrap_model(model.to(pretended.DEVICE), cameras=views, backend="reference").render(views[0], 1 / 2, screen_filter, 2).image.cpu()
+    assert torch.equal(image, wrap_model(model, cameras=views, backend="reference").render(views[0], 1 / 2, screen_filter, 2).image)
+
+
+def test_cloning_and_splitting_there():
+    settings = dict(recipe="paper", steps=4, prune_every=2, densify_gradient=1e-9)
+    with pretended.pretending():
+        adapted = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference").adapt(1 / 2, **settings)
+    assert adapted.report.gaussians_after > adapted.report.gaussians_before
+
+
+def test_photographs_and_judging_there(tmp_path):
+    scene = load_scene(tiny.scene(tmp_path / "scene", train=tiny.cameras(3)))
+    with pretended.pretending():
+        wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference")
+        wrapped.adapt(2, steps=2, images=scene)
+        rows = evaluate(wrapped, scene, (1 / 2,), ("default",), "P3", steps=2, extra_views=2)
+    assert all(row.psnr_db > 10 for row in rows)
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_what_other_rasterizers_are_handed_lies_there(given):
+    splats, view, effects = tiny.gaussians(20), tiny.cameras()[0], Effects(1, "mip", 0.1)
+    if given:
+        splats = replace(splats, covariances=covariances(splats))
+    with pretended.pretending():
+        there = splats.to(pretended.DEVICE)
+        asked = gsplat.arguments(there, view, effects)
+        asked |= inria.splats_of(inria.filtered(inria.sized(there, view, 2.0), inria.at_the_origin(view), effects))
+    assert {value.device.type for value in asked.values() if isinstance(value, torch.Tensor)} == {pretended.DEVICE}
+
+
+def test_the_pretence_holds():
+    with pretended.pretending() as device:
+        there = torch.ones(3, requires_grad=True).to(pretended.DEVICE)
+        assert there.device.type == pretended.DEVICE and not device.waits
+        with pytest.raises(RuntimeError, match="tensors on two devices"):
+            there + torch.ones(3)
+        assert float((2 * there.detach()).sum()) == 6 and device.waits
