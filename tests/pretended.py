@@ -56,6 +56,8 @@ class Device(TorchDispatchMode):
         kwargs = dict(kwargs or {})
         tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
         there = any(isinstance(tensor, Pretended) for tensor in tensors)
+        if any(tensor.is_meta and not isinstance(tensor, Pretended) for tensor in tensors):
+            raise RuntimeError(f"{func}: a tensor was made where nobody looked, and holds nothing")
         target = kwargs.get("device")
         goes_there = there if target is None else torch.device(target).type == DEVICE
         if not there and not goes_there:
@@ -77,12 +79,15 @@ class Device(TorchDispatchMode):
 
 
 class Factories(TorchFunctionMode):
-    """Tensors from numbers, which torch makes in one go where no mode looks."""
+    """Tensors from numbers, and indices from lists, which torch makes in one go where no mode looks."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
         if func is torch.Tensor.new_tensor and isinstance(args[0], Pretended):
             return torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype)).to(DEVICE)
+        if func in (torch.Tensor.__getitem__, torch.Tensor.__setitem__) and isinstance(args[1], tuple):
+            index = tuple(torch.tensor(part) if isinstance(part, list) else part for part in args[1])
+            args = (args[0], index, *args[2:])
         return func(*args, **kwargs)
 
 

@@ -40,8 +40,7 @@ FAMILIES = {
 }
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize("scale", [1 / 2, 2])
+@pytest.mark.parametrize(("family", "scale"), [*((family, 1 / 2) for family in FAMILIES), ("3dgs", 2)])
 def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
     model = load_model(FAMILIES[family](tmp_path / "base"))
     settings = dict(steps=2, extra_views=2, prune_every=1, check_every=1)
