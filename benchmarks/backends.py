@@ -7,6 +7,7 @@ Prints Markdown tables and writes everything as JSON. What is measured, and how,
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 from dataclasses import asdict
@@ -18,6 +19,7 @@ from typing import Any
 import torch
 import tyro
 from measure import YARDSTICK, fresh, measure_scaling, measure_speed
+from pydantic import TypeAdapter
 from scenes import SPECS, Name
 from tables import GROWTH, Row, Rows, growth_table, sizes_table, speed_table
 from tqdm import tqdm
@@ -42,6 +44,7 @@ def main(
     backend: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     output: Path = Path("benchmarks/results/backends.json"),
     runs: int = 5,
+    keep: bool = False,
 ) -> None:
     """Measure, print the tables and write the JSON, which replaces an older one.
 
@@ -51,6 +54,7 @@ def main(
         backend: A backend's name. May be repeated; by default all that can do it, and gsplat's torch twins.
         output: Where the JSON goes.
         runs: How many of each; the median counts.
+        keep: Add to what an older JSON holds, so that a long measurement can be made in pieces; what is measured again is replaced.
     """
     by_default = [] if checkpoint else [name for name in SPECS if name != WARM_UP]
     sources: list[Name | Path] = [*(scene or by_default), *checkpoint]
@@ -59,6 +63,8 @@ def main(
         rows, sizes, failed = measure_all(able, sources, Path(folder), runs)
     if not rows:
         raise BackendUnavailable("nothing was measured: " + " | ".join(f"{what}: {reason}" for what, reason in {**reasons, **failed}.items()))
+    if keep and output.exists():
+        rows, sizes = joined(output, rows, sizes)
     compared = Rows(rows)
     print("\n\n".join(filter(None, [sizes_table(sizes), speed_table(compared), growth_table(compared)])))
     for what, reason in {**reasons, **failed}.items():
@@ -94,6 +100,17 @@ def measure_all(backends: list[str], sources: list[Name | Path], folder: Path, r
         if speed:
             rows.append(Row(name, size, speed, scaling))
     return rows, sizes, failed
+
+
+def joined(output: Path, rows: list[Row], sizes: list[Size]) -> tuple[list[Row], list[Size]]:
+    """What an older JSON holds, with these rows and sizes in place of its own of the same names; scene by scene."""
+    older = json.loads(output.read_text(encoding="utf-8"))
+    known = {size["name"]: Size(**size) for size in older["scenes"]} | {size.name: size for size in sizes}
+    read = TypeAdapter(Row)
+    before = [read.validate_python(record | {"size": known[record["size"]]}) for record in older["rows"]]
+    latest = {(row.size.name, row.backend): row for row in [*before, *rows]}
+    order = [*(name for name in SPECS if name in known), *(name for name in known if name not in SPECS)]
+    return sorted(latest.values(), key=lambda row: order.index(row.size.name)), [known[name] for name in order]
 
 
 def facts(rows: Rows, sizes: list[Size], reasons: dict[str, str]) -> dict[str, Any]:

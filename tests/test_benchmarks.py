@@ -13,12 +13,16 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
 
 from ablations import ABLATIONS  # noqa: E402
+from backends import facts, joined  # noqa: E402
+from measure import Scaling, Speed, Spread, Timing  # noqa: E402
 from scenes import make  # noqa: E402
-from workloads import activated, count_pairs, effects_of, from_scene  # noqa: E402
+from tables import Row, Rows  # noqa: E402
+from workloads import Size, activated, count_pairs, effects_of, from_scene  # noqa: E402
 
 from mipmap_plugin.backends import get_backend  # noqa: E402
 from mipmap_plugin.backends.projection import project  # noqa: E402
 from mipmap_plugin.config import recipe as make_config  # noqa: E402
+from mipmap_plugin.files import write_json  # noqa: E402
 
 
 def brute_force_pairs(gaussians, camera):
@@ -78,3 +82,16 @@ def test_an_ablation_varies_one_thing_of_its_recipe(name):
     recipe, variants = ABLATIONS[name]
     made = [make_config(recipe, 1 / 4, **settings) for settings in variants.values()]
     assert len({config.model_dump_json() for config in made}) == len(made)
+
+
+def test_a_measurement_in_pieces_keeps_the_others(tmp_path):
+    def row(backend: str, scene: str, ms: float) -> Row:
+        timing = Timing(Spread.of([ms]), Spread.of([ms]), 1)
+        return Row(backend, Size(scene, 10, 8, 8, 100), Speed(timing, timing, 1.0), Scaling(timing, timing, Spread.of([2.0])))
+
+    older = [row("cpu", "A", 1.0), row("reference", "A", 30.0), row("cpu", "lego", 2.0)]
+    write_json(tmp_path / "facts.json", facts(Rows(older), [older[0].size, older[2].size], {}), overwrite=True)
+    fresh = [row("cpu", "A", 1.5), row("cpu", "B", 3.0)]
+    rows, sizes = joined(tmp_path / "facts.json", fresh, [one.size for one in fresh])
+    assert rows == [fresh[0], older[1], fresh[1], older[2]]
+    assert [size.name for size in sizes] == ["A", "B", "lego"]
