@@ -6,7 +6,7 @@ draws otherwise than the reference was measured so (`tests/test_gsplat_backend.p
 - the largest alpha is 0.999 in 1.5 and 0.99, the reference's, in 1.6: an opaque splat's center is up to 0.009 brighter;
 - "antialiased" leaves a flat or needle-shaped splat no least share of its light in 1.5, and 0.005, the reference's, in 1.6. "mip", whose
   least share nobody sees, is exact in 1.5 and at most 0.005 of alpha too bright in 1.6;
-- needles and discs with axes 10⁶ times apart lose digits, for the determinant of their covariance is a difference;
+- needles with axes 10⁶ times apart lose their digits, for the determinant of their covariance is a difference;
 - a pixel ends where it would keep at most 1e-4, here less than 1e-4: no image shows it;
 - 3.33 standard deviations, where gsplat ends a splat, is where an opaque one falls below 1/255: nothing is cut that the reference draws.
 
@@ -26,11 +26,10 @@ from typing import Any
 import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, sound, turned
+from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, Asked, sound, turned
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 
 NO_GSPLAT = "it needs gsplat: pip install 'mipmap-plugin[gsplat]'"
@@ -48,6 +47,9 @@ class GsplatBackend:
         devices=frozenset({"cuda"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased", "mip"})
     )
 
+    def __init__(self) -> None:
+        self._asked = Asked(self)
+
     def lacking(self, needs: Needs) -> list[str]:
         return missing() + self.capabilities.lacking(needs)
 
@@ -56,9 +58,7 @@ class GsplatBackend:
 
         The host waits for the GPU twice: here for whether any row is broken, in gsplat for the number of (splat, tile) pairs.
         """
-        reasons = self.lacking(Needs.of(gaussians, effects, gradients=True))
-        if reasons:
-            raise BackendUnavailable(f"backend 'gsplat' cannot do this: {'; '.join(reasons)}")
+        self._asked.refuse(Needs.of(gaussians, effects, gradients=True))
         gaussians = sound(gaussians)
         if len(gaussians) == 0:
             return ReferenceBackend().render(gaussians, camera, effects)

@@ -30,12 +30,11 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
 from mipmap_plugin.backends.filters import footprint
-from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, sound, turned
+from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, Asked, sound, turned
 from mipmap_plugin.backends.projection import project, rotations
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, Effects
-from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 
 PACKAGE = "diff_gaussian_rasterization"
@@ -64,14 +63,15 @@ class InriaBackend:
         max_sh_degree=3,
     )
 
+    def __init__(self) -> None:
+        self._asked = Asked(self)
+
     def lacking(self, needs: Needs) -> list[str]:
         return missing() + self.capabilities.lacking(needs)
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, where the request is not for this backend."""
-        reasons = self.lacking(Needs.of(gaussians, effects, gradients=True))
-        if reasons:
-            raise BackendUnavailable(f"backend 'inria' cannot do this: {'; '.join(reasons)}")
+        self._asked.refuse(Needs.of(gaussians, effects, gradients=True))
         gaussians = sound(gaussians)
         if len(gaussians) == 0:
             return ReferenceBackend().render(gaussians, camera, effects)

@@ -16,10 +16,9 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED
+from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, Asked
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 
 NO_TRITON = "it needs triton, which comes with torch's CUDA wheels: pip install triton"
@@ -38,6 +37,7 @@ class TritonBackend:
     note = UNTRIED
 
     def __init__(self) -> None:
+        self._asked = Asked(self)
         self.speed = -1 if interpreted() else 30
         self.capabilities = Capabilities(
             devices=frozenset({"cpu" if interpreted() else "cuda"}),
@@ -53,9 +53,7 @@ class TritonBackend:
 
         The host waits for the GPU once, for the number of (splat, tile) pairs; on the way back it does not wait.
         """
-        reasons = self.lacking(Needs.of(gaussians, effects, gradients=True))
-        if reasons:
-            raise BackendUnavailable(f"backend 'triton' cannot do this: {'; '.join(reasons)}")
+        self._asked.refuse(Needs.of(gaussians, effects, gradients=True))
         g = gaussians
         image, alpha = _Draw.apply(camera, effects, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)
         return Rendered(image, alpha)
