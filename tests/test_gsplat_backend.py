@@ -131,6 +131,14 @@ def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
         GsplatBackend().render(gaussians(2, dtype=torch.float32), WIDE, Effects(1))
 
 
+def test_what_is_missing_is_looked_for_once(stand_in, monkeypatch):
+    backend, looked = OnProcessor(), []
+    monkeypatch.setattr(OnProcessor, "lacking", lambda self, needs: looked.append(needs) or [])
+    for filters in ("classic", "classic", "mip"):
+        backend.render(gaussians(2, dtype=torch.float32), WIDE, Effects(1, filters))
+    assert [needs.screen_filter for needs in looked] == ["classic", "mip"]
+
+
 def test_the_module_loads_no_gsplat():
     code = "import sys; import mipmap_plugin.backends.gsplat; sys.exit('gsplat' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}

@@ -96,9 +96,10 @@ def test_alpha_is_drawn_when_it_is_asked_for(package):
     assert replace(rendered, effects=()).alpha is rendered.alpha
 
 
-@pytest.mark.parametrize("near", [0.01, 0.2, 1.5])
+@pytest.mark.parametrize("near", [0.0, 0.01, 0.2, 1.5])
 def test_the_near_plane_is_the_one_asked_for(package, near):
     splats = gaussians(40, dtype=torch.float32)
+    splats.means[:4] = 0  # behind the camera or in the very eye
     effects = Effects(1, near_plane=near)
     torch.testing.assert_close(
         OnProcessor().render(splats, WIDE, effects).image, ReferenceBackend().render(splats, WIDE, effects).image, atol=1e-4, rtol=0

@@ -77,6 +77,16 @@ def test_every_harmonic_has_its_gradient(degree):
     assert_equal(ours(g, view, effects), draw(ReferenceBackend().render, g.to(dtype=torch.float64), view, effects))
 
 
+def test_a_near_plane_of_0_divides_by_nothing():
+    g, effects = gaussians(12, dtype=torch.float32), Effects(1, near_plane=0.0)
+    g.means[0] = camera(16, 16).center.float()
+    g.means[1, 2] = -5.0
+    image, alpha, grads = ours(g, camera(16, 16), effects)
+    seen = draw(ReferenceBackend().render, g[torch.arange(12) > 1].to(dtype=torch.float64), camera(16, 16), effects)
+    assert_equal((image, alpha, {name: grad[2:] for name, grad in grads.items()}), seen)
+    assert not any(grad[:2].any() for grad in grads.values())
+
+
 def test_bands_left_out_have_no_gradient():
     grads = ours(gaussians(12, 3), camera(16, 16))[2]
     assert grads["sh"][:, :4].any() and not grads["sh"][:, 4:].any()

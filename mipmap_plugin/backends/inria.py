@@ -42,6 +42,7 @@ NO_PACKAGE = f"it needs {PACKAGE}, which is built from INRIA's sources (for non-
 
 # The rasterizer's own numbers.
 NEAR = 0.2  # world units
+NEAREST = 1e-4  # world units: a near plane closer than this is taken to be there, for the world grows as it comes closer
 AXIS_MARGIN = 0.3  # of half the image: how far from the optical axis, beyond half the image's width, its Jacobian is exact
 
 OLDER = ("image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix", "sh_degree", "campos",
@@ -78,7 +79,7 @@ class InriaBackend:
         package = importlib.import_module(PACKAGE)
         frame = Frame.around(camera)
         camera = at_the_origin(frame.camera)
-        gaussians = sized(gaussians, frame.camera, NEAR / effects.near_plane)
+        gaussians = sized(gaussians, frame.camera, NEAR / max(effects.near_plane, NEAREST))
         native = is_native(effects, package.GaussianRasterizationSettings._fields)
         splats = splats_of(gaussians if native else filtered(gaussians, camera, effects))
         colors = {"shs": gaussians.sh}

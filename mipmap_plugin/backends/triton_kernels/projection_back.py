@@ -62,6 +62,7 @@ def project_back_kernel(
     d_shear, d_across, d_strength = load3(pull + 3, drawn)
     d_red, d_green, d_blue = load3(pull + 6, drawn)
     world, eye, safe = place(view, means, at, drawn)
+    safe = tl.where(drawn, safe, 1.0)  # with a near plane of 0 a row that was not drawn may have no depth to divide by
     dx, dy, dz, per = direction(world)
     coefficients = sh + at * (3 * BANDS)
     red, green, blue = color(coefficients, dx, dy, dz, drawn, DEGREE)
