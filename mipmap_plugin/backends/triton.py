@@ -71,7 +71,8 @@ class _Draw(torch.autograd.Function):
     def forward(ctx, camera, effects, *tensors):
         from mipmap_plugin.backends.triton_kernels import drawing
 
-        image, through, ctx.drawing = drawing.draw(drawing.Splats.of(*tensors), camera, effects)
+        with torch.cuda.device_of(tensors[0]):  # kernels are launched on the current GPU, which may be another
+            image, through, ctx.drawing = drawing.draw(drawing.Splats.of(*tensors), camera, effects)
         ctx.save_for_backward(*tensors, image, through)
         return image, 1 - through
 
@@ -82,5 +83,6 @@ class _Draw(torch.autograd.Function):
 
         *tensors, image, through = ctx.saved_tensors
         in_order = torch.are_deterministic_algorithms_enabled()
-        grads = drawing.draw_back(ctx.drawing, drawing.Splats.of(*tensors), image, through, d_image, d_alpha, deterministic=in_order)
+        with torch.cuda.device_of(image):
+            grads = drawing.draw_back(ctx.drawing, drawing.Splats.of(*tensors), image, through, d_image, d_alpha, deterministic=in_order)
         return None, None, *grads
