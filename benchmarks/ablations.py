@@ -38,7 +38,8 @@ ABLATIONS: dict[str, tuple[str, dict[str, dict[str, Any]]]] = {
     "opacity": ("paper", {f"pruned below {least:g}": dict(min_opacity=least, steps=500, views="train") for least in (0, 0.005, 0.05, 0.2)}),
     "merging": ("default", {f"{share:.0%} of the splats": dict(merge_to=share) for share in (1.0, 0.4, 0.2, 0.1)}),
     "rates": ("default", {"as it is": {}, "view-dependent color 0.001": rates(shN=0.001), "view-dependent color 0.01": rates(shN=0.01),
-                          "centers stay": rates(means=0.0), "only colors": rates(means=0.0, scales=0.0, quats=0.0, opacities=0.0)}),
+                          "centers stay": rates(means=0.0), "only colors": rates(means=0.0, scales=0.0, quats=0.0, opacities=0.0),
+                          "Adam's usual betas": dict(betas=(0.9, 0.999)), "fall to a tenth": dict(decay=0.1)}),
     "batch": ("default", {f"{views} views a step": dict(views_per_step=views, steps=1600 // views, check_every=200 // views)
                           for views in (1, 2, 4, 8)}),
 }  # fmt: skip

@@ -84,7 +84,7 @@ _INSTANT = dict(steps=0)
 # knee to stop at before they have fallen.
 _DEFAULT_OUT = dict(
     steps=400, decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=4, extra_views=200,
-    rates=LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, networks=5e-4),
+    rates=LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4),
 )  # fmt: skip
 
 # What more time buys at zoom-out: twice the steps, twice the views in each, five times the views. At zoom-in there is nothing to buy.

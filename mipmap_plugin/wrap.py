@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import Adapted, Base, Observer, Session, shown
 from mipmap_plugin.adaptation.views import choose_views
-from mipmap_plugin.backends import choose_backend
+from mipmap_plugin.backends import choose_backend, device_for
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.backends.filters import INTEGRALS, USUAL_EPS2D
 from mipmap_plugin.camera import Camera
@@ -165,12 +165,14 @@ def wrap_model(
 ) -> Wrapped:
     """Wrap a loaded model, the checkpoint at a path, or another project's live model, which is copied (`models.live.adopt`).
 
+    A checkpoint is taken to the GPU where a backend serves it there (`backends.device_for`); a model stays where it is.
+
     `cameras`: views of the scale it was trained at, or the scene that it was trained on; by default those beside the
     checkpoint. `background`: linear RGB; by default what the checkpoint says, else black. `screen_filter`: what it was trained
     with, where its files do not say ("classic", "antialiased", "mip", "analytic"). Raises CheckpointError, SceneError, and
     SettingsError for an unknown filter or an object that is no model.
     """
-    model = load_model(model) if isinstance(model, (str, Path)) else adopt(model)
+    model = _loaded(model, backend) if isinstance(model, (str, Path)) else adopt(model)
     trained = replace(model.trained, background=background or model.trained.background)
     if screen_filter is not None:
         if screen_filter not in USUAL_EPS2D:
@@ -179,6 +181,11 @@ def wrap_model(
     if isinstance(cameras, Scene):
         cameras = placed(model, cameras).cameras
     return Wrapped(model, own_cameras(model) if cameras is None else cameras, backend, trained)
+
+
+def _loaded(path: str | Path, backend: str) -> SplatModel:
+    model, device = load_model(path), device_for(backend)
+    return model if device == "cpu" else model.to(device)
 
 
 def placed(model: SplatModel, scene: Scene) -> Scene:

@@ -89,7 +89,8 @@ def test_adapting_gains_and_leaves_the_base_and_what_is_frozen(tmp_path, scale, 
     after = state_of(adapted)
     assert gained > least
     assert is_same(before, state_of(model))
-    assert {name for name in before if not torch.equal(before[name], after[name])} == {"features", "scales", *model.shared_parameters()}
+    moved = {"features", "scales", *model.shared_parameters(), *(["offsets"] if scale < 1 else [])}
+    assert {name for name in before if not torch.equal(before[name], after[name])} == moved
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

@@ -91,6 +91,18 @@ def test_what_other_rasterizers_are_handed_lies_there(given):
     assert {value.device.type for value in asked.values() if isinstance(value, torch.Tensor)} == {pretended.DEVICE}
 
 
+@pytest.mark.parametrize("scale", [1 / 2, 2])
+def test_no_step_waits_for_the_device(scale):
+    """Whatever the host asks for before the first step and after the last, more steps ask for no more; backends aside."""
+    counts = []
+    for steps in (3, 6):
+        with pretended.pretending() as device:
+            wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference")
+            wrapped.adapt(scale, steps=steps, extra_views=2, check_every=100, prune_every=100)
+        counts.append({line: count for line, count in device.waits.items() if not line.startswith("backends/")})
+    assert counts[0] == counts[1]
+
+
 def test_the_pretence_holds():
     with pretended.pretending() as device:
         there = torch.ones(3, requires_grad=True).to(pretended.DEVICE)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mipmap_plugin import registry
-from mipmap_plugin.backends import BACKENDS, choose_backend, get_backend, register_backend, survey
+from mipmap_plugin.backends import BACKENDS, choose_backend, device_for, get_backend, register_backend, survey
 from mipmap_plugin.backends.base import API_VERSION, Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
@@ -29,6 +29,13 @@ class Fussy(ReferenceBackend):
 
     def lacking(self, needs):
         return ["it is not in the mood", "nor will it be"]
+
+
+class OnGpu(ReferenceBackend):
+    name = "gpu"
+
+    def lacking(self, needs):
+        return [] if needs.device == "cuda" else ["it runs on cuda"]
 
 
 class Ancient(ReferenceBackend):
@@ -79,6 +86,15 @@ def test_on_a_gpu_the_users_own_rasterizer_comes_first_and_what_is_untried_is_sa
         "triton: the fastest that lacks nothing (never run on a GPU by this package's author); "
         "gsplat not, because it is not built; inria not, because it is not built"
     )
+
+
+def test_checkpoints_go_to_a_gpu_that_something_faster_serves(monkeypatch):
+    register_backend("gpu", OnGpu)
+    assert device_for("auto") == "cpu"
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert (device_for("auto"), device_for("gpu"), device_for("reference")) == ("cuda", "cuda", "cpu")
+    monkeypatch.setattr(OnGpu, "lacking", lambda self, needs: ["it is not built"])
+    assert (device_for("auto"), device_for("gpu")) == ("cpu", "cpu")
 
 
 def test_asking_by_name():

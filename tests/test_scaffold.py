@@ -147,7 +147,8 @@ def test_adapting_gains_and_leaves_the_base_and_what_is_frozen(folder, scale, le
     after = state_of(adapted)
     assert gained > least
     assert is_same(before, state_of(model))
-    assert {name for name in before if not torch.equal(before[name], after[name])} == {"features", "scales", *model.shared_parameters()}
+    moved = {"features", "scales", *model.shared_parameters(), *(["offsets"] if scale < 1 else [])}
+    assert {name for name in before if not torch.equal(before[name], after[name])} == moved
 
 
 def test_networks_that_move_gain_more_than_those_that_a_rate_of_0_keeps(folder):

@@ -23,9 +23,12 @@ class CurvePoint(BaseModel):
 
 
 class Stopwatch:
-    """Seconds spent inside `with`, so that measuring quality is not billed as adapting. Devices finish their work first."""
+    """Seconds spent inside `with`, so that measuring quality is not billed as adapting.
 
-    def __init__(self, device: torch.device, seconds: float = 0.0) -> None:
+    With a `device` its work is waited for at both ends; without, whoever uses the watch waits where it is right to.
+    """
+
+    def __init__(self, device: torch.device | None = None, seconds: float = 0.0) -> None:
         self.seconds, self._device = seconds, device
 
     def __enter__(self) -> Stopwatch:
@@ -36,7 +39,7 @@ class Stopwatch:
         self.seconds += self._now() - self._start
 
     def _now(self) -> float:
-        if self._device.type == "cuda":
+        if self._device is not None and self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
         return time.perf_counter()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -47,31 +47,31 @@ class Run:
     gradients: density.ScreenGradients | None  # None: nothing is cloned or split, so nobody asks for them
     step: int = 0
     curve: list[CurvePoint] = field(default_factory=list)
-    square_error: float = 0.0  # summed over the views since the last point of the curve
+    square_error: Tensor | float = 0.0  # summed over the views since the last point of the curve, where the images are: no step waits for it
     rows_changed: bool = False  # splats were added or removed
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
         means = student.parameters()["means"]
         optimizer = make_optimizer(student, config, task.pixel(means))
-        return cls(student, optimizer, Stopwatch(means.device), density.ScreenGradients.of(means, config))
+        return cls(student, optimizer, Stopwatch(), density.ScreenGradients.of(means, config))
 
 
-def adapt(
-    run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], None] = lambda run: None
-) -> str:
+def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], None] = lambda run: None) -> str:
     """Optimise `run.student` in place until its steps, its budget, its target or its patience end; return which of them did.
 
     `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise. `observe` is called before the first
     step and after each, while the clock stands.
     """
-    rounds = Rounds(task.views, config.seed)
+    rounds, cameras = Rounds(task.views, config.seed), {view: view.zoomed(task.scale) for view in task.views}
     bar = tqdm(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step")
     with bar, interruptible() as interrupted:
         observe(run)
         while run.step < config.steps:
             with run.watch:
-                _step(run, task, config, [rounds(run.step * config.views_per_step + nth) for nth in range(config.views_per_step)])
+                _step(run, task, config, [rounds(run.step * config.views_per_step + nth) for nth in range(config.views_per_step)], cameras)
+                if run.step % config.check_every == 0 or run.step == config.steps:
+                    run.square_error = float(run.square_error)  # here a GPU is waited for, so that the clock counts its work
             bar.update()
             if run.step % config.check_every == 0:
                 _mark(run, config)
@@ -84,14 +84,14 @@ def adapt(
     return f"{config.steps} steps"
 
 
-def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) -> None:
+def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
     set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config))
     means = run.student.parameters()["means"]
     before: Tensor | float = 0.0  # the gradient of the means from the views before this one
     for view in views:
-        camera = view.zoomed(task.scale)
+        camera = cameras[view]
         target = task.truth(view)  # r(x̂): the frozen base, resized
         image = task.render(run.student, camera)  # x: the student at the new scale
         # Where the truth is the base itself, it is compared with at the base's scale.
@@ -99,7 +99,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera]) ->
         difference = shrunk - target
         loss = difference.square().mean() if config.loss == "l2" else difference.abs().mean()
         (loss if task.detail is None else loss + task.detail(view, image)).backward()
-        run.square_error += float(difference.detach().square().mean()) / len(views)
+        run.square_error = run.square_error + difference.detach().square().mean().double() / len(views)
         if run.gradients is not None and means.grad is not None:
             run.gradients.add(means, means.grad - before, camera)
             before = means.grad.clone()
@@ -125,6 +125,6 @@ def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
 
 def _mark(run: Run, config: AdaptConfig) -> None:
     """A new point of the curve, from the losses of the steps since the last one."""
-    mean = run.square_error / config.check_every
+    mean = float(run.square_error) / config.check_every
     run.curve.append(CurvePoint(step=run.step, seconds=run.watch.seconds, psnr_db=decibel(mean), gaussians=len(run.student.parameters()["means"])))
     run.square_error = 0.0

@@ -19,6 +19,9 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 
+# The share of a GPU's memory that images of the truth leave to the rest.
+LEFT_FREE = 0.5
+
 
 class PseudoTruth:
     """The base model's view of a camera, resized to the wanted scale, [H, W, 3] float, cached by camera.
@@ -48,8 +51,8 @@ class PseudoTruth:
     def __call__(self, view: Camera) -> Tensor:
         """The pseudo truth of a camera of the base scale."""
         if view not in self._made:
-            self._made[view] = self._make(view)
-        return self._made[view]
+            self._made[view] = _parked(self._make(view))
+        return self._made[view].to(self._base.parameters()["means"].device, non_blocking=True)
 
     @cached_property
     def _enlarge(self) -> Upsampler:
@@ -88,3 +91,11 @@ class PseudoTruth:
         if self._activated is None or not hasattr(self._base, "rebuild"):
             self._activated = self._base.gaussians(camera)
         return self._activated
+
+
+def _parked(target: Tensor) -> Tensor:
+    """`target`, or, where half of its GPU's memory is taken, a copy in the host's that the GPU can fetch without waiting for the host."""
+    if target.device.type != "cuda":
+        return target
+    free, total = torch.cuda.mem_get_info(target.device)
+    return target if free > LEFT_FREE * total else target.cpu().pin_memory()

@@ -63,7 +63,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "fingerprint": fingerprint,
         "step": run.step,
         "seconds": run.watch.seconds,
-        "square_error": run.square_error,
+        "square_error": float(run.square_error),
         "rows_changed": run.rows_changed,
         "curve": [point.model_dump() for point in run.curve],
         "parameters": {name: tensor.detach() for name, tensor in run.student.parameters().items()},
@@ -95,7 +95,7 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
     if gradients is not None:
         gradients.total, gradients.seen = (tensor.to(device) for tensor in state["gradients"])
     curve = [CurvePoint(**point) for point in state["curve"]]
-    return Run(student, optimizer, Stopwatch(device, state["seconds"]), gradients, state["step"], curve, state["square_error"], state["rows_changed"])
+    return Run(student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, state["step"], curve, state["square_error"], state["rows_changed"])
 
 
 def _read(path: Path) -> Any:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
+
+import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend, Needs
 from mipmap_plugin.errors import BackendUnavailable, PluginError
@@ -46,6 +49,18 @@ def survey(needs: Needs) -> dict[str, list[str]]:
         except PluginError as error:
             reasons[name] = [str(error)]
     return reasons
+
+
+def device_for(name: str) -> str:
+    """Where a model that comes from a file should lie: on the GPU where there is one and the backend `name`, or for `"auto"` any but the
+    reference, serves it there; else on the processor. Raises SettingsError for an unknown name."""
+    if not torch.cuda.is_available():
+        return "cpu"
+    usual = Needs("cuda", torch.float32, gradients=True, sh_degree=0, screen_filter="classic")
+    if name == "auto":
+        return "cuda" if any(not reasons for other, reasons in survey(usual).items() if other != "reference") else "cpu"
+    backend = get_backend(name)
+    return "cuda" if backend.lacking(replace(usual, device="cpu")) and not backend.lacking(usual) else "cpu"
 
 
 def choose_backend(name: str, needs: Needs) -> tuple[Backend, str]:
