@@ -269,6 +269,7 @@ def test_a_forked_process_draws_with_threads_of_its_own(threads_for_little):
 def test_depths_sort_as_floats_with_ties_in_order(length):
     import numpy as np
 
+    from mipmap_plugin.backends.cpu_kernels.records import Lists
     from mipmap_plugin.backends.cpu_kernels.sorting import SLOT_BITS, sort
 
     rng = np.random.default_rng(length)
@@ -276,7 +277,7 @@ def test_depths_sort_as_floats_with_ties_in_order(length):
     splats = rng.permutation(length).astype(np.int32)
     entries = depths.view(np.int32).astype(np.int64) << SLOT_BITS | np.arange(length)
     members = np.empty_like(splats)
-    sort(0, 1, np.array([0, length]), entries, splats, members)
+    sort(0, 1, Lists(np.array([0, length]), members, entries, splats))
     right = np.argsort(depths, kind="stable")
     assert np.array_equal(entries, right) and np.array_equal(members, splats[right])
 

@@ -61,16 +61,16 @@ class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(ctx, camera, effects, *tensors):
         drawing = _drawing()
-        image, ctx.drawing = drawing.draw(drawing.splats_of(*tensors), camera, effects)
+        image, alpha, ctx.drawing = drawing.draw(drawing.splats_of(*tensors), camera, effects)
         ctx.save_for_backward(*tensors)
-        return torch.from_numpy(image), 1 - torch.from_numpy(ctx.drawing.frame.through)
+        return torch.from_numpy(image), torch.from_numpy(alpha)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, d_image, d_alpha):
-        drawing, tensors = _drawing(), ctx.saved_tensors
+        tensors = ctx.saved_tensors  # asked for: that is where torch notices one that was changed since
         d_frame = d_image.contiguous().numpy(), d_alpha.contiguous().numpy()
-        grads = drawing.draw_back(ctx.drawing, drawing.splats_of(*tensors), *d_frame, harmonics=ctx.needs_input_grad[SH])
+        grads = _drawing().draw_back(ctx.drawing, *d_frame, harmonics=ctx.needs_input_grad[SH])
         # What nobody asks for, and of the two ways to give a shape the one that was not taken, has no gradient, and no rows.
         pairs = zip(tensors, grads, strict=True)
         return None, None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in pairs)

@@ -15,6 +15,7 @@ from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, fl
 from mipmap_plugin.backends.cpu_kernels.memory import load, prefetch, row_of, scratch, store
 from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, BEHIND, CREST, END, ENDS, LIGHT, PLANE, RIDGE, STATE, STRIDE, cover, uncover
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
+from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MIN_ALPHA
 
 # Splats between two looks at whether the tile is finished.
@@ -52,10 +53,14 @@ def trace(splat, box, state):
 
 
 @kernel
-def composite(start, stop, integrated, table, lists, frame, image):
-    """Render the tiles start..stop: fill the frame and the image [H, W, 3]. `integrated`: splats are, over each pixel's square."""
-    starts, members, _ = lists
-    background, through, stops = frame
+def composite(start, stop, integrated, table, lists, frame, shown):
+    """Render the tiles start..stop: fill the frame, and the image [H, W, 3] and alpha [H, W] that are shown.
+
+    integrated: splats are, over each pixel's square.
+    """
+    sort(start, stop, lists)
+    starts, members, _, _ = lists
+    _, through, _ = frame
     height, width = through.shape
     state = new_state()
     for tile in range(start, stop):
@@ -66,13 +71,13 @@ def composite(start, stop, integrated, table, lists, frame, image):
             if n % PATIENCE == 0 and finished(state):
                 break
             at = starts[tile] + n
-            prefetch(table, members[min(at + AHEAD, len(members) - 1)])
+            prefetch(table, members[min(at + AHEAD, starts[stop] - 1)])
             splat = row_of(table, members[at])
             if integrated:
                 lay_integral(splat, n, box, state)
             else:
                 lay(splat, n, box, state)
-        close_tile(box, state, background, image, through, stops)
+        close_tile(box, state, frame, shown)
 
 
 @inner
@@ -138,16 +143,18 @@ def lay_integral(splat, n, box, state):
 
 
 @inner
-def close_tile(box, state, background, image, through, stops):
+def close_tile(box, state, frame, shown):
     """Write a tile's pixels."""
     left, top, columns, rows = box
+    background, through, stops = frame
+    image, alpha = shown
     for r in range(rows):
         for c in range(columns):
             at, y, x = r * STRIDE + c, top + r, left + c
             rest = abs(state[LIGHT + at])
             for k in range(3):
                 image[y, x, k] = state[k * PLANE + at] + rest * background[k]
-            through[y, x] = rest
+            through[y, x], alpha[y, x] = rest, 1 - rest
             stops[y, x] = state[ENDS + at]
 
 
@@ -157,7 +164,7 @@ def composite_back(start, stop, integrated, table, lists, frame, d_frame, pulls)
 
     d_frame: the gradients of the image [H, W, 3] and of its alpha [H, W].
     """
-    starts, members, slots = lists
+    starts, members, slots, _ = lists
     background, through, stops = frame
     d_image, d_alpha = d_frame
     height, width = through.shape

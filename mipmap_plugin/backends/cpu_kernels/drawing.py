@@ -27,35 +27,37 @@ class Drawing(NamedTuple):
     """What the backward pass needs to know of a forward pass."""
 
     view: View
+    splats: Splats
     table: np.ndarray  # [N, COLUMNS]
     slots: np.ndarray  # [N + 1] where each splat's tiles begin
     lists: Lists
     frame: Frame
 
 
-def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, Drawing]:
-    """The image [H, W, 3] and what to remember of it."""
+def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, np.ndarray, Drawing]:
+    """The image [H, W, 3], alpha [H, W] and what to remember of them."""
     view = view_of(camera, effects, splats)
     count, (height, width) = len(splats.means), camera.size
-    table, depths, counts = _empty(count, col.COLUMNS), _empty(count), np.empty(count, np.int64)
-    image, frame = _empty(height, width, 3), Frame(np.array(effects.background, np.float32), _empty(height, width), _empty(height, width))
+    table, depths, counts, slots = _empty(count, col.COLUMNS), _empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
+    shown = _empty(height, width, 3), _empty(height, width)
+    frame = Frame(np.array(effects.background, np.float32), _empty(height, width), _empty(height, width))
     threads = team(count + width * height)
     threads.share(projection.project, count, view, splats, table, depths, counts)
-    slots = np.concatenate([[0], np.cumsum(counts)])
+    np.cumsum(counts, out=slots[1:])
     lists = sorting.tile_lists(table, depths, slots, width, height, threads)
     if view.seen == SEEN_IN_WINDOW:
-        threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, image)
+        threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, shown)
     else:
-        threads.share(compositing.composite, len(lists.starts) - 1, view.seen == SEEN_IN_PIXEL, table, lists, frame, image)
-    return image, Drawing(view, table, slots, lists, frame)
+        threads.share(compositing.composite, len(lists.starts) - 1, view.seen == SEEN_IN_PIXEL, table, lists, frame, shown)
+    return *shown, Drawing(view, splats, table, slots, lists, frame)
 
 
-def draw_back(drawing: Drawing, splats: Splats, d_image: np.ndarray, d_alpha: np.ndarray, *, harmonics: bool = True) -> Splats:
+def draw_back(drawing: Drawing, d_image: np.ndarray, d_alpha: np.ndarray, *, harmonics: bool = True) -> Splats:
     """The gradients of the splats from those of the image [H, W, 3] and its alpha [H, W].
 
     harmonics: whether those of the coefficients are wanted, which are most of all numbers; else they have no rows.
     """
-    view, table, slots, lists, frame = drawing
+    view, splats, table, slots, lists, frame = drawing
     pulls, grads = _empty(len(lists.members), col.PULLS), Splats(*(_empty(*array.shape) for array in splats))
     if not harmonics:
         grads = grads._replace(sh=grads.sh[:0])
@@ -109,5 +111,5 @@ def _empty(*shape: int) -> np.ndarray:
     """float32, not set. Aligned to cache lines, which numpy's memory is not; large ones in huge pages, which torch's is not."""
     count = math.prod(shape)
     room = np.empty(count + LINE, np.float32)
-    start = -room.ctypes.data // room.itemsize % LINE
+    start = -room.__array_interface__["data"][0] // room.itemsize % LINE
     return room[start : start + count].reshape(shape)

@@ -45,11 +45,12 @@ class Splats(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """Which splats each tile shows, front to back."""
+    """Which splats each tile shows; front to back once `sorting.sort` was there, which the compositing calls."""
 
     starts: np.ndarray  # [tiles + 1] where each tile's members begin
     members: np.ndarray  # [pairs] splats
     slots: np.ndarray  # [pairs] where each keeps what it has to do with this tile, splat after splat
+    splats: np.ndarray  # [pairs] whose slot each is
 
 
 class Frame(NamedTuple):

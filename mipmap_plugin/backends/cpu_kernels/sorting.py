@@ -1,4 +1,4 @@
-"""Each tile's list of splats, front to back: sorted by tile while they are cut into runs, then by depth, tile by tile.
+"""Each tile's list of splats, front to back: sorted by tile while they are cut into runs, then by depth as tiles are composited.
 
 Each run of splats counts its tiles; the counts of all runs tell where each puts its first splat of each tile; then each writes its
 own. As the runs are in order, the outcome is the same for any number of them.
@@ -34,17 +34,16 @@ new_places = scratch(WIDTH, types.int64)
 
 
 def tile_lists(table, depths, slots, width, height, team):
-    """Each tile's splats and their slots, front to back; of equal depths, the splat with the lower index is in front."""
+    """Each tile's splats and their slots, not yet sorted by depth."""
     columns, rows = binning.tile_grid(width, height)
     pairs = int(slots[-1])
     runs = 1 if team.threads == 1 else RUNS_PER_THREAD * team.threads
     tiles, splats, counts = np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty((runs, columns * rows), np.int64)
     team.share(cover, runs, table, slots, width, height, tiles, splats, counts)
     starts = np.append(begin(counts), pairs)
-    entries, members = np.empty(pairs, np.int64), np.empty(pairs, np.int32)
+    entries = np.empty(pairs, np.int64)
     team.share(fill, runs, depths.view(np.int32), slots, tiles, counts, entries)
-    team.share(sort, columns * rows, starts, entries, splats, members)
-    return Lists(starts, members, entries)
+    return Lists(starts, np.empty(pairs, np.int32), entries, splats)
 
 
 @inner
@@ -103,8 +102,12 @@ def fill(start, stop, depths, slots, tiles, begins, entries):
 
 
 @kernel
-def sort(start, stop, starts, entries, splats, members):
-    """Sort the lists of the tiles start..stop, and leave of each entry its slot and its splat."""
+def sort(start, stop, lists):
+    """Sort the lists of the tiles start..stop front to back, and leave of each entry its slot and its splat.
+
+    Of equal depths, the splat with the lower index is in front.
+    """
+    starts, members, entries, splats = lists
     longest = 0
     for tile in range(start, stop):
         longest = max(longest, starts[tile + 1] - starts[tile])

@@ -16,6 +16,7 @@ from mipmap_plugin.backends.cpu_kernels.compositing import AHEAD, PATIENCE, boun
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, lowest, ramp, select, spread, total
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, prefetch, row_of, scratch, store
 from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, END, ENDS, LIGHT, PLANE, STATE, STRIDE, cover, uncover
+from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MIN_ALPHA
 
 # Where the planes of windows begin in a tile's state: x, y, width, height; in the backward pass their gradients.
@@ -29,12 +30,13 @@ MOST = TILE_ROWS * (TILE_COLUMNS // WIDTH + 1)
 
 
 @kernel
-def composite(start, stop, table, lists, frame, image):
-    """Render the tiles start..stop: fill the frame and the image [H, W, 3]."""
-    starts, members, _ = lists
-    background, through, stops = frame
+def composite(start, stop, table, lists, frame, shown):
+    """Render the tiles start..stop: fill the frame, and the image [H, W, 3] and alpha [H, W] that are shown."""
+    sort(start, stop, lists)
+    starts, members, _, _ = lists
+    _, through, _ = frame
     height, width = through.shape
-    state, nowhere = new_room(), (pointer(image), pointer(starts), False)
+    state, nowhere = new_room(), (pointer(table), pointer(starts), False)
     for tile in range(start, stop):
         box = bounds(tile, width, height)
         length = starts[tile + 1] - starts[tile]
@@ -43,10 +45,10 @@ def composite(start, stop, table, lists, frame, image):
             if n % PATIENCE == 0 and finished(state):
                 break
             at = starts[tile] + n
-            prefetch(table, members[min(at + AHEAD, len(members) - 1)])
+            prefetch(table, members[min(at + AHEAD, starts[stop] - 1)])
             splat = row_of(table, members[at])
             lay(splat, n, box, state, nowhere, 0)
-        close_tile(box, state, background, image, through, stops)
+        close_tile(box, state, frame, shown)
 
 
 @inner
@@ -125,7 +127,7 @@ def composite_back(start, stop, table, lists, frame, d_frame, pulls):
 
     d_frame: the gradients of the image [H, W, 3] and of its alpha [H, W].
     """
-    starts, members, slots = lists
+    starts, members, slots, _ = lists
     background, through, stops = frame
     d_image, d_alpha = d_frame
     height, width = through.shape
