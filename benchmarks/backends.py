@@ -45,6 +45,7 @@ def main(
     output: Path = Path("benchmarks/results/backends.json"),
     runs: int = 5,
     keep: bool = False,
+    scaling: bool = True,
 ) -> None:
     """Measure, print the tables and write the JSON, which replaces an older one.
 
@@ -55,12 +56,13 @@ def main(
         output: Where the JSON goes.
         runs: How many of each; the median counts.
         keep: Add to what an older JSON holds, so that a long measurement can be made in pieces; what is measured again is replaced.
+        scaling: Compare two threads with one, which tells nothing on a busy machine and takes half of the time.
     """
     by_default = [] if checkpoint else [name for name in SPECS if name != WARM_UP]
     sources: list[Name | Path] = [*(scene or by_default), *checkpoint]
     able, reasons = installed(backend)
     with TemporaryDirectory() as folder:
-        rows, sizes, failed = measure_all(able, sources, Path(folder), runs)
+        rows, sizes, failed = measure_all(able, sources, Path(folder), runs, scaling=scaling)
     if not rows:
         raise BackendUnavailable("nothing was measured: " + " | ".join(f"{what}: {reason}" for what, reason in {**reasons, **failed}.items()))
     if keep and output.exists():
@@ -83,7 +85,9 @@ def installed(wanted: tuple[str, ...]) -> tuple[list[str], dict[str, str]]:
     return [name for name, lacks in asked.items() if not lacks], {name: "; ".join(lacks) for name, lacks in asked.items() if lacks}
 
 
-def measure_all(backends: list[str], sources: list[Name | Path], folder: Path, runs: int) -> tuple[list[Row], list[Size], dict[str, str]]:
+def measure_all(
+    backends: list[str], sources: list[Name | Path], folder: Path, runs: int, *, scaling: bool
+) -> tuple[list[Row], list[Size], dict[str, str]]:
     """Every backend on every source: rows, sizes of the workloads, and what failed with its reason."""
     warm_up, rows, failed = folder / "warm_up", list[Row](), dict[str, str]()
     fresh(prepare, WARM_UP, warm_up)
@@ -95,10 +99,10 @@ def measure_all(backends: list[str], sources: list[Name | Path], folder: Path, r
     for (file, size), name in tqdm([*product(zip(files, sizes, strict=True), sound)], disable=None, leave=False):
         what = f"{name} on {size.name}"
         speed = _try(failed, what, measure_speed, name, file, warm_up, runs)
-        twice = speed and size.name not in GROWING and (os.cpu_count() or 1) > 1
-        scaling = _try(failed, f"{what}, two threads", measure_scaling, name, file, runs) if twice else None
+        twice = scaling and speed and size.name not in GROWING and (os.cpu_count() or 1) > 1
+        threads = _try(failed, f"{what}, two threads", measure_scaling, name, file, runs) if twice else None
         if speed:
-            rows.append(Row(name, size, speed, scaling))
+            rows.append(Row(name, size, speed, threads))
     return rows, sizes, failed
 
 
