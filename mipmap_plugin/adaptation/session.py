@@ -133,6 +133,7 @@ class Session:
 
     @torch.no_grad()
     def _merge(self, student: SplatModel) -> None:
+        """Fewer splats; only a family that offers `rebuild` is asked for it (`Wrapped.adapt`)."""
 
         def fewer(gaussians: Gaussians) -> Gaussians:
             return merge(gaussians, pixel_size(gaussians.means, self.views) / self.scale, self.config.merge_to)
