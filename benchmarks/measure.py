@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TypeVar
@@ -109,36 +110,36 @@ def measure_speed(backend: str, file: Path, warm_up: Path, runs: int) -> Speed:
     job.forward_backward()
     extra = round(_peak_mib() - before, 1)
     job.forward()
-    forward, both = _in_turn([job.forward, job.forward_backward], runs)
+    forward, both = _in_turn([partial(_timed, job.forward), partial(_timed, job.forward_backward)], runs)
     return Speed(Timing.of(forward), Timing.of(both), extra)
 
 
 def measure_scaling(backend: str, file: Path, runs: int) -> Scaling:
     job = Job(backend, file)
 
-    def on(threads: int) -> None:
+    def on(threads: int) -> tuple[float, float]:
         torch.set_num_threads(threads)
-        job.forward_backward()
+        job.forward_backward()  # not timed: it finds caches as another number of threads left them
+        return _timed(job.forward_backward)
 
-    for threads in (1, 2):  # warm-up
-        on(threads)
-    one, two = _in_turn([lambda: on(1), lambda: on(2)], runs)
+    one, two = _in_turn([partial(on, 1), partial(on, 2)], runs)
     return Scaling(Timing.of(one), Timing.of(two), Spread.of([a[1] / b[1] for a, b in zip(one, two, strict=True)]))
 
 
-def _in_turn(calls: list[Callable[[], None]], runs: int) -> list[list[tuple[float, float]]]:
-    """Milliseconds of CPU and wall of each run of each call. In turn, so that a busy spell of the machine meets all alike."""
-    times: list[list[tuple[float, float]]] = [[] for _ in calls]
+def _in_turn(timed: list[Callable[[], tuple[float, float]]], runs: int) -> list[list[tuple[float, float]]]:
+    """What each timed call took, run by run. In turn, so that a busy spell of the machine meets all alike."""
+    times: list[list[tuple[float, float]]] = [[] for _ in timed]
     began = time.perf_counter()
     for done in range(runs):
         if done >= FEWEST_RUNS and time.perf_counter() - began > BUDGET_S:
             break
-        for call, spent in zip(calls, times, strict=True):
-            spent.append(_timed(call))
+        for call, spent in zip(timed, times, strict=True):
+            spent.append(call())
     return times
 
 
 def _timed(call: Callable[[], None]) -> tuple[float, float]:
+    """Milliseconds of CPU and wall."""
     cpu, wall = time.process_time(), time.perf_counter()
     call()
     return 1000 * (time.process_time() - cpu), 1000 * (time.perf_counter() - wall)

@@ -16,7 +16,7 @@ import torch
 
 # Crowded tiles take longer than others. So a thread's part is cut finer and finer, each time by this share of what is left, for others
 # take from its end; but not finer than this share of all, or handing it out would take time.
-CUT, LEAST_CUT = 1 / 4, 1 / 512
+CUT, LEAST_CUT = 1 / 2, 1 / 128
 
 # Splats and pixels for which a second thread is worth waking: all that is done with them takes some 3 ms.
 LEAST_WORK = 1 << 14
