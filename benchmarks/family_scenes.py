@@ -155,7 +155,7 @@ def trained(world: SplatModel, train: Sequence[Camera], pictures: Pictures) -> S
         seen = student.gaussians(train[0])
     effects = Effects(seen.sh_degree, filtered.screen_filter, filtered.eps2d, filtered.background or (0.0, 0.0, 0.0))
     backend = choose_backend("auto", Needs.of(seen, effects, gradients=True))[0]
-    task = Task(train, 1.0, pictures, lambda model, camera: backend.render(model.gaussians(camera), camera, effects).image, False)
+    task = Task(train, 1.0, pictures, lambda gaussians, camera: backend.render(gaussians, camera, effects).image, False)
     run = Run.start(student, task, TRAINING)
     adapt(run, task, TRAINING, lambda run: sys.exit(130))
     return run.student

@@ -62,6 +62,7 @@ class AdaptConfig(BaseModel):
     decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's: how long it remembers gradients and their squares.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
+    gathering: float = Field(0.0, ge=0, le=1, description="Share of the steps over which new views come in: each costs a render of the base.")
     prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")
     densify_gradient: float | None = Field(None, gt=0, description="Screen gradient, NDC units, above which a splat is cloned or split; None: never.")
@@ -83,7 +84,7 @@ _INSTANT = dict(steps=0)
 # most is gained while they fall; a memory for the last twenty squares instead of a thousand lets so short a run follow. There is no
 # knee to stop at before they have fallen.
 _DEFAULT_OUT = dict(
-    steps=400, decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=4, extra_views=200,
+    steps=400, decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=4, gathering=0.5, extra_views=200,
     rates=LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4),
 )  # fmt: skip
 

@@ -197,9 +197,9 @@ def test_two_views_in_one_step_count_as_two_views_each_with_its_own_gradient():
     pull = {view: torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(i)) for i, view in enumerate(views)}
     student = tiny.model(COUNT).copy()
 
-    def render(model, camera):
+    def render(gaussians, camera):
         here = next(view for view in views if view.name == camera.name)
-        return (model.parameters()["means"] * pull[here]).sum().sqrt().expand(1, 1, 1)
+        return (gaussians.means * pull[here]).sum().sqrt().expand(1, 1, 1)
 
     with torch.no_grad():
         student.parameters()["means"].fill_(1.0)

@@ -10,7 +10,7 @@ from mipmap_plugin.adaptation import views as views_module
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
-from mipmap_plugin.adaptation.views import Rounds, choose_views, extent
+from mipmap_plugin.adaptation.views import Order, Rounds, choose_views, extent
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import AdaptConfig, recipe
 from mipmap_plugin.effects import Effects
@@ -165,6 +165,31 @@ def test_rounds_show_every_view_once_and_start_anywhere():
     assert drawn[:5] != drawn[5:10]
     assert [Rounds(views, seed=2)(draw) for draw in range(15)] == drawn
     assert [Rounds(views, seed=3)(draw) for draw in range(15)] != drawn
+
+
+def test_views_are_gathered_evenly_and_then_come_in_rounds():
+    views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=20, views_per_step=3, gathering=0.5)
+    order, known, growth = Order(views, config), set(), []
+    for step in range(10):
+        taken = order(step)
+        assert len(taken) == len(set(taken)) == 3
+        growth.append(len(set(taken) - known))
+        known |= set(taken)
+    assert growth[0] == 3 and max(growth[1:]) <= 2 and known == set(views)
+    later = [view for step in range(10, 18) for view in order(step)]
+    assert set(later[:12]) == set(later[12:]) == set(views)
+    assert [Order(views, config)(step) for step in range(20)] == [order(step) for step in range(20)]
+
+
+def test_no_more_views_come_in_than_steps_take():
+    config = recipe("default", 1 / 4, steps=4, views_per_step=2, gathering=0.5)
+    order = Order(tiny.cameras(9), config)
+    assert [len(set(order(0))), len(set(order(0) + order(1)))] == [2, 4]
+
+
+def test_fewer_views_than_a_step_takes_are_taken_once_while_they_are_gathered():
+    order = Order(tiny.cameras(2), recipe("default", 1 / 4, steps=4, views_per_step=3, gathering=1))
+    assert [len(order(step)) for step in range(4)] == [2, 2, 2, 2]
 
 
 def test_the_extent_is_inrias_and_one_for_a_single_place():

@@ -10,14 +10,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mipmap_plugin.adaptation import density
+from mipmap_plugin.adaptation.activation import Activation
 from mipmap_plugin.adaptation.closed_form import pixel_size
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress, reason_to_stop
 from mipmap_plugin.adaptation.interrupt import interruptible
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
 from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.views import Rounds, extent
+from mipmap_plugin.adaptation.views import Order, extent
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 
 
@@ -28,7 +30,7 @@ class Task:
     views: Sequence[Camera]  # at the base scale
     scale: float
     truth: Callable[[Camera], Tensor]  # a view of the base scale -> [h, w, 3] at the new scale
-    render: Callable[[SplatModel, Camera], Tensor]  # a model and a camera of the new scale -> [h, w, 3]
+    render: Callable[[Gaussians, Camera], Tensor]  # what a camera of the new scale sees, and it -> [h, w, 3]
     white_background: bool
     detail: Callable[[Camera, Tensor], Tensor] | None = None  # what a view's image adds to the loss besides
 
@@ -63,13 +65,13 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise. `observe` is called before the first
     step and after each, while the clock stands.
     """
-    rounds, cameras = Rounds(task.views, config.seed), {view: view.zoomed(task.scale) for view in task.views}
+    order, cameras = Order(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
     bar = tqdm(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step")
     with bar, interruptible() as interrupted:
         observe(run)
         while run.step < config.steps:
             with run.watch:
-                _step(run, task, config, [rounds(run.step * config.views_per_step + nth) for nth in range(config.views_per_step)], cameras)
+                _step(run, task, config, order(run.step), cameras)
                 if run.step % config.check_every == 0 or run.step == config.steps:
                     run.square_error = float(run.square_error)  # here a GPU is waited for, so that the clock counts its work
             bar.update()
@@ -88,12 +90,13 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
     set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config))
+    splats = Activation(run.student, share=len(views) > 1 and run.gradients is None)
     means = run.student.parameters()["means"]
     before: Tensor | float = 0.0  # the gradient of the means from the views before this one
     for view in views:
         camera = cameras[view]
         target = task.truth(view)  # r(x̂): the frozen base, resized
-        image = task.render(run.student, camera)  # x: the student at the new scale
+        image = task.render(splats(camera), camera)  # x: the student at the new scale
         # Where the truth is the base itself, it is compared with at the base's scale.
         shrunk = image if image.shape == target.shape else resize(image, (target.shape[0], target.shape[1]), config.resize)
         difference = shrunk - target
@@ -103,6 +106,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         if run.gradients is not None and means.grad is not None:
             run.gradients.add(means, means.grad - before, camera)
             before = means.grad.clone()
+    splats.backward()
     run.optimizer.step()
     run.optimizer.zero_grad()
     run.step += 1

@@ -124,7 +124,7 @@ class Session:
         def look(run: Run) -> None:
             keeper.now_and_then(run)
             if observe is not None:
-                observe(run.step, before + run.watch.seconds, lambda camera: self._render(run.student, camera))
+                observe(run.step, before + run.watch.seconds, lambda camera: self._render(run.student.gaussians(camera), camera))
 
         ended_by = adapt(run, task, self.config, keeper.stop, look)
         self.seconds["optimization"] = run.watch.seconds
@@ -148,8 +148,8 @@ class Session:
         student.reshape(lambda gaussians: closed_form(gaussians, self.views, self.scale, self.trained, self.effects), self.views)
         self.seconds["closed form"] = time.perf_counter() - began
 
-    def _render(self, model: SplatModel, camera: Camera) -> Tensor:
-        return self.backend.render(model.gaussians(camera), camera, self.effects).image
+    def _render(self, gaussians: Gaussians, camera: Camera) -> Tensor:
+        return self.backend.render(gaussians, camera, self.effects).image
 
     @property
     def _white(self) -> bool:
@@ -182,9 +182,7 @@ class Session:
 
 
 @torch.no_grad()
-def shown(
-    model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None
-) -> Rendered:
+def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None) -> Rendered:
     """What the model, its splats changed by `form`, shows to a camera, and the effects that it called for. Raises SettingsError."""
     matrix = exposures_of(model).of(camera) if effects.exposure else None
     gaussians = model.gaussians(camera) if form is None else form(model.gaussians(camera))

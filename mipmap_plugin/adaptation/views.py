@@ -20,6 +20,28 @@ ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
 
 
+class Order:
+    """Which views each step takes. Follows from the settings and the step alone, so that a run can be resumed at any."""
+
+    def __init__(self, views: Sequence[Camera], config: AdaptConfig) -> None:
+        self._rounds, self._each, self._seed = Rounds(views, config.seed), config.views_per_step, config.seed
+        self._gathering = math.ceil(config.gathering * config.steps)
+
+    def __call__(self, step: int) -> list[Camera]:
+        """The views of a step: while they are gathered its new ones and some of those before, then rounds through all."""
+        if step >= self._gathering:
+            return [self._rounds((step - self._gathering) * self._each + nth) for nth in range(self._each)]
+        before, known = self._known(step - 1), self._known(step)
+        generator = torch.Generator().manual_seed(self._seed * 1_000_003 + step)
+        again = torch.randperm(before, generator=generator)[: self._each - (known - before)].tolist()
+        return [self._rounds(place) for place in (*range(before, known), *again)]
+
+    def _known(self, step: int) -> int:
+        """How many views have come in with a step: evenly over the steps of gathering, and no more in a step than it takes."""
+        come = max(self._each, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
+        return min(come, self._each * (step + 1), len(self._rounds.views))
+
+
 class Rounds:
     """Every view once per round, in an order that follows from (seed, round) alone, so that any step can be resumed."""
 

@@ -82,6 +82,11 @@ class SplatModel(Protocol):
         """Write the model in the format it came in, atomically; return the file written. Raises OutputExists."""
 
 
+def same_for_all_views(model: SplatModel) -> bool:
+    """Whether every camera sees the same splats."""
+    return hasattr(model, "rebuild")
+
+
 def effects_of(model: SplatModel) -> list[Effect]:
     """What a model does for a camera before any splat is drawn, as its method `effects` says: of `effects.OF_OTHER_MODELS`, those that
     it has. A family that has none needs no such method."""
