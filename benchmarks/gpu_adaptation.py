@@ -27,6 +27,7 @@ class Adaptation:
     seconds: float
     steps: int
     ended_by: str
+    peak_mib: float | None  # of tensors on the GPU
     psnr_db: float  # on real test images that nothing was adapted to
     processor_db: float | None  # the same on a processor; None: not measured
 
@@ -50,7 +51,8 @@ def _of_base(data: Path, base: str, backend: str, device: str, settings: dict) -
         adapted = wrapped.adapt(scale, **settings)
         report, psnr_db = adapted.report, adapted_row("", adapted, judge).psnr_db
         steps = report.curve[-1].step if report.curve else 0
-        rows.append(Adaptation(base, scale, backend, report.seconds["total"], steps, report.ended_by, psnr_db, on_processor(base, scale)))
+        took = dict(seconds=report.seconds["total"], steps=steps, ended_by=report.ended_by, peak_mib=report.peak_memory_mib)
+        rows.append(Adaptation(base, scale, backend, psnr_db=psnr_db, processor_db=on_processor(base, scale), **took))
     return rows
 
 

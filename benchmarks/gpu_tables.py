@@ -65,10 +65,11 @@ def conformance_table(checked: Mapping[str, Sequence[Outcome]]) -> str:
 
 def adaptation_table(rows: Sequence[Adaptation]) -> str:
     """Empty where nothing was adapted."""
-    head = ["base", "zoom", "backend", "seconds", "steps", "dB", "on a processor", "ended by"]
+    head = ["base", "zoom", "backend", "seconds", "steps", "dB", "on a processor", "peak, MiB", "ended by"]
     body = [
         [row.base, f"x{row.scale:g}", row.backend, f"{row.seconds:.1f}", str(row.steps), f"{row.psnr_db:.2f}",
-         "-" if row.processor_db is None else f"{row.processor_db:.2f}", row.ended_by]
+         "-" if row.processor_db is None else f"{row.processor_db:.2f}",
+         "-" if row.peak_mib is None else f"{row.peak_mib:.0f}", row.ended_by]
         for row in rows
     ]  # fmt: skip
     return f"{markdown(head, body)}\n\n{PAPER}" if body else ""

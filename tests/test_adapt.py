@@ -12,6 +12,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.interrupt import interruptible
+from mipmap_plugin.adaptation.report import Peak
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
@@ -472,3 +473,14 @@ def test_the_loss_is_what_was_asked_for_and_the_curve_is_in_decibel_all_the_same
     squares, absolutes = (wrapped().adapt(1 / 4, **{**BRIEF, "loss": loss, "steps": 2}) for loss in ("l2", "l1"))
     assert not torch.equal(shown(squares), shown(absolutes))
     assert absolutes.report.curve[0].psnr_db == pytest.approx(squares.report.curve[0].psnr_db, abs=3)
+
+
+def test_memory_is_counted_on_a_gpu_and_from_its_beginning(monkeypatch):
+    device, most = torch.device("cuda"), {"bytes": 5 << 30}
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda which: most.update(bytes=0 if which == device else None))
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda which: most["bytes"])
+    peak = Peak(device)
+    most["bytes"] += 3 << 20
+    assert peak.mib() == 3
+    assert Peak(torch.device("cpu")).mib() is None
+    assert wrapped().adapt(1 / 4, recipe="instant").report.peak_memory_mib is None

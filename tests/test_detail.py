@@ -3,9 +3,11 @@
 import pytest
 import tiny
 import torch
+from skimage.metrics import structural_similarity
 
 from mipmap_plugin.adaptation.detail import Detail, evenly
 from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.structure import similarity
 from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
 from mipmap_plugin.config import AdaptConfig, recipe
 from mipmap_plugin.evaluation.metrics import psnr
@@ -61,11 +63,38 @@ def test_views_that_deny_what_one_claims_outvote_it(upsampler):
     """The gradient of a difference is the same however large it is: the minimum over views is their median."""
     upsampler(lambda image, size: resize(image, size, "pil-bicubic"))
     base = torch.full((24, 32, 3), 0.5)
-    loss = detail(base, detail_weight=1.0)
+    loss = detail(base, detail_weight=1.0, detail_structure=0.0)
     near, far = (torch.full((*SIZE, 3), value, requires_grad=True) for value in (0.6, 0.9))
     for image in (near, far):
         loss(VIEW, image).backward()
     torch.testing.assert_close(near.grad, far.grad)
+
+
+@pytest.mark.parametrize("structure", [0.0, 0.3, 1.0])
+def test_the_loss_mixes_differences_and_structure_where_the_target_is_believed(upsampler, structure):
+    upsampler(lambda image, size: (resize(image, size, "pil-bicubic") + 0.2 * (torch.arange(64) > 40)[None, :, None]).clamp(0, 1))
+    part, image = detail(picture(24, 32), detail_structure=structure), picture(*SIZE, seed=1)
+    target, confidence = part._of(VIEW)
+    mixed = (1 - structure) * (image - target).abs() + structure * (1 - similarity(image, target))
+    torch.testing.assert_close(part(VIEW, image), (confidence * mixed).mean())
+    assert confidence.std() > 0.1
+
+
+def test_structural_similarity_is_scikit_images_away_from_the_border():
+    image, truth = (picture(*SIZE, seed=seed).double() for seed in (1, 2))
+    settings = dict(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2, full=True)
+    expected = torch.from_numpy(structural_similarity(truth.numpy(), image.numpy(), **settings)[1])
+    inside = slice(5, -5), slice(5, -5)
+    torch.testing.assert_close(similarity(image, truth)[inside], expected[inside])
+
+
+def test_structural_similarity_has_a_gradient_everywhere_also_on_flat_and_dark_images():
+    for truth in (torch.zeros(12, 9, 3), torch.full((12, 9, 3), 0.5), picture(12, 9)):
+        image = torch.zeros(12, 9, 3, dtype=torch.float64, requires_grad=True)
+        similarity(image, truth.double()).sum().backward()
+        assert image.grad.isfinite().all()
+    image = picture(6, 5).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda image: similarity(image, picture(6, 5, seed=3).double()), image)
 
 
 def test_each_view_is_enlarged_once_and_beforehand(upsampler):

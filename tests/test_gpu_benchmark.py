@@ -83,10 +83,10 @@ def test_bases_are_adapted_and_judged(tmp_path, monkeypatch):
 
 
 def test_adaptations_stand_beside_the_processors_and_the_papers():
-    table = adaptation_table([Adaptation("lego_200", 0.25, "triton", 2.94, 400, "400 steps", 33.87, 33.9)])
-    assert cells(table, 0) == ["lego_200", "x0.25", "triton", "2.9", "400", "33.87", "33.90", "400 steps"]
+    table = adaptation_table([Adaptation("lego_200", 0.25, "triton", 2.94, 400, "400 steps", 612.0, 33.87, 33.9)])
+    assert cells(table, 0) == ["lego_200", "x0.25", "triton", "2.9", "400", "33.87", "33.90", "612", "400 steps"]
     assert "40 s for a zoom-out and 75 s for a zoom-in" in table and table in report({"device": "x"}, 1e12, [], [], [
-        Adaptation("lego_200", 0.25, "triton", 2.94, 400, "400 steps", 33.87, 33.9)], "")  # fmt: skip
+        Adaptation("lego_200", 0.25, "triton", 2.94, 400, "400 steps", 612.0, 33.87, 33.9)], "")  # fmt: skip
 
 
 def test_the_processors_own_results_are_read():

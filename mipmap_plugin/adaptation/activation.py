@@ -34,6 +34,11 @@ class Activation:
             self._leaves = replace(self._splats, **{name: tensor.detach().requires_grad_(tensor.requires_grad) for name, tensor in held.items()})
         return self._leaves
 
+    @property
+    def means(self) -> Tensor:
+        """Where the gradients of the means [N, 3] gather, view by view."""
+        return self._model.parameters()["means"] if self._leaves is None else self._leaves.means
+
     def backward(self) -> None:
         """Hand the gathered gradients on, once all views have left theirs."""
         if self._splats is None or self._leaves is None:

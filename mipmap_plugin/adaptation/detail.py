@@ -3,7 +3,8 @@
 Three things keep a zoom-in from an upsampler's faults. By frequency: up to what the base itself samples, the target is the base, by
 back-projection (Irani and Peleg 1991), so that only finer detail is the upsampler's. By pixel: where the enlarged image, shrunk, was
 not the base's, little of it counts. Between views: differences count by their size and not by their square, so that what one view
-claims and others deny is outvoted.
+claims and others deny is outvoted. Part of the difference is one of structure (SSIM): views that disagree by less than a pixel blur
+what is learnt from differences alone.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.structure import similarity
 from mipmap_plugin.adaptation.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -22,7 +24,7 @@ from mipmap_plugin.config import AdaptConfig
 # Rounds of back-projection: the first gains a GAN's image 1.4 dB (lego at x2), two more another 0.2.
 ROUNDS = 3
 
-# Of 0..1: where the shrunk image is this far from the base's, half of it is believed.
+# Of 0..1: where the shrunk image is this far from the base's, a quarter of it is believed, and of what is far worse next to nothing.
 TRUST = 0.05
 
 
@@ -43,7 +45,11 @@ class Detail:
     def __call__(self, view: Camera, image: Tensor) -> Tensor:
         """The loss of `image` [H, W, 3], what the view of the base scale shows at the new one."""
         target, confidence = self._of(view)
-        return self._config.detail_weight * (confidence * (image - target).abs()).mean()
+        structure = self._config.detail_structure
+        difference = (1 - structure) * (image - target).abs()
+        if structure:
+            difference = difference + structure * (1 - similarity(image, target))
+        return self._config.detail_weight * (confidence * difference).mean()
 
     def _of(self, view: Camera) -> tuple[Tensor, Tensor]:
         if view not in self._made:
@@ -56,7 +62,7 @@ class Detail:
         base, size = self._truth(view), view.zoomed(self._scale).size
         enlarged = self._enlarge(base, size)
         lacking = self._lacking(enlarged, base)
-        confidence = 1 / (1 + lacking.square().mean(-1, keepdim=True) / TRUST**2)
+        confidence = 1 / (1 + lacking.square().mean(-1, keepdim=True) / TRUST**2) ** 2
         for _ in range(ROUNDS):
             enlarged = enlarged + resize(self._lacking(enlarged, base), size, "pil-bicubic")
         return enlarged.clamp(0, 1), resize(confidence, size, "bilinear")

@@ -90,8 +90,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
     set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config))
-    splats = Activation(run.student, share=len(views) > 1 and run.gradients is None)
-    means = run.student.parameters()["means"]
+    splats = Activation(run.student, share=len(views) > 1)
     before: Tensor | float = 0.0  # the gradient of the means from the views before this one
     for view in views:
         camera = cameras[view]
@@ -103,9 +102,9 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         loss = difference.square().mean() if config.loss == "l2" else difference.abs().mean()
         (loss if task.detail is None else loss + task.detail(view, image)).backward()
         run.square_error = run.square_error + difference.detach().square().mean().double() / len(views)
-        if run.gradients is not None and means.grad is not None:
-            run.gradients.add(means, means.grad - before, camera)
-            before = means.grad.clone()
+        if run.gradients is not None and splats.means.grad is not None:
+            run.gradients.add(splats.means, splats.means.grad - before, camera)
+            before = splats.means.grad.clone()
     splats.backward()
     run.optimizer.step()
     run.optimizer.zero_grad()

@@ -29,12 +29,25 @@ class Report(BaseModel):
     gaussians_after: int
     seconds: dict[str, float]  # "closed form", "optimization" (pseudo truth included), "total"
     ended_by: str
+    peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without one
     curve: list[CurvePoint]
     versions: dict[str, str]
 
     def provenance(self) -> dict[str, Any]:
         """What fits into a file's header: base, scale, settings, versions. Nothing in it depends on the clock."""
         return {"scale": self.scale, "base": self.base, "settings": self.settings.model_dump(), "versions": self.versions}
+
+
+class Peak:
+    """The most memory that torch's tensors took on a GPU since this was made, MiB; None on another device."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+        if device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(device)
+
+    def mib(self) -> float | None:
+        return torch.cuda.max_memory_allocated(self._device) / 2**20 if self._device.type == "cuda" else None
 
 
 def filters(scale: float, config: AdaptConfig, base: Effects, file: Effects) -> str:

@@ -19,7 +19,7 @@ from mipmap_plugin.adaptation.loop import Run, Task, adapt
 from mipmap_plugin.adaptation.merging import merge
 from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.report import Report, filters, versions
+from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
 from mipmap_plugin.adaptation.resume import Keeper
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.backends import supersample
@@ -90,7 +90,7 @@ class Session:
         self.seconds = {"optimization": 0.0}
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
-        began = time.perf_counter()
+        began, self.peak = time.perf_counter(), Peak(self.base.parameters()["means"].device)
         student = self.base.copy()
         student.trained = replace(student.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
         nothing_to_do = self.scale == 1 and self.effects == self.trained
@@ -176,6 +176,7 @@ class Session:
             gaussians_after=len(student.gaussians(self.views[0])),
             seconds=self.seconds,
             ended_by=ended_by,
+            peak_memory_mib=self.peak.mib(),
             curve=curve,
             versions=versions(),
         )

@@ -79,4 +79,6 @@ def adapt(
 def _print(saved: Path, report: Report) -> None:
     print(f"x{report.scale:g}: {saved}")
     print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
+    if report.peak_memory_mib is not None:
+        print(f"  at most {report.peak_memory_mib:,.0f} MiB on the GPU")
     print(f"  {report.views}; {report.filters}; backend {report.backend}")
