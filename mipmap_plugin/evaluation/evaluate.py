@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +26,9 @@ from mipmap_plugin.wrap import Adapted, Wrapped
 
 # Screen filters that need no training, for the rows beside the base as it is.
 FILTERS = ("scaled", "window", "antialiased")
+
+# A window sees through splats in front of it rightly as long as a pixel is at most so many of the base's: with more it needs samples.
+WINDOW_REACH = 2
 
 
 @dataclass(frozen=True)
@@ -85,14 +89,17 @@ def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: st
     """
     count = len(model.model.gaussians(model.any_camera()))
 
-    def filtered(screen_filter: str | None) -> Callable[[Camera], Tensor]:
-        return lambda camera: model.render(camera.zoomed(scale), scale, screen_filter).image
+    def filtered(screen_filter: str | None, samples: int = 1) -> Callable[[Camera], Tensor]:
+        return lambda camera: model.render(camera.zoomed(scale), scale, screen_filter, supersampling=samples).image
 
     def resized(by: str) -> Callable[[Camera], Tensor]:
         return lambda camera: resized_base(model.render(camera).image.clamp(0, 1), camera.zoomed(scale).size, by)
 
     served = [name for name in FILTERS if name not in without and not model.lacks(name)]
     shows = {"naive": filtered(None), **{name: filtered(name) for name in served}, "resized base": resized("bicubic")}
+    samples = math.ceil(1 / (WINDOW_REACH * scale))
+    if "window" in served and samples > 1:
+        shows[f"window, {samples} x {samples} samples"] = filtered("window", samples)
     if scale > 1 and upsampler != "bicubic":
         shows[f"base upsampled by {Path(upsampler).name}"] = resized(upsampler)
     if scale == 1:
