@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from workloads import Workload, activated, effects_of
 
 from mipmap_plugin import register_backend
 from mipmap_plugin.backends import get_backend
+from mipmap_plugin.evaluation.tradeoff import Spread
 
 YARDSTICK = "gsplat-twins"
 register_backend(YARDSTICK, "gsplat_twins:GsplatTwins")
@@ -29,19 +29,6 @@ BUDGET_S = 60.0
 FEWEST_RUNS = 3
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class Spread:
-    """Several runs of one thing."""
-
-    median: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, values: list[float]) -> Spread:
-        return cls(*(round(value, 3) for value in (statistics.median(values), min(values), max(values))))
 
 
 @dataclass(frozen=True)
@@ -123,7 +110,7 @@ def measure_scaling(backend: str, file: Path, runs: int) -> Scaling:
         return _timed(job.forward_backward)
 
     one, two = _in_turn([partial(on, 1), partial(on, 2)], runs)
-    return Scaling(Timing.of(one), Timing.of(two), Spread.of([a[1] / b[1] for a, b in zip(one, two, strict=True)]))
+    return Scaling(Timing.of(one), Timing.of(two), Spread.of([round(a[1] / b[1], 3) for a, b in zip(one, two, strict=True)]))
 
 
 def _in_turn(timed: list[Callable[[], tuple[float, float]]], runs: int) -> list[list[tuple[float, float]]]:
@@ -142,7 +129,7 @@ def _timed(call: Callable[[], None]) -> tuple[float, float]:
     """Milliseconds of CPU and wall."""
     cpu, wall = time.process_time(), time.perf_counter()
     call()
-    return 1000 * (time.process_time() - cpu), 1000 * (time.perf_counter() - wall)
+    return round(1000 * (time.process_time() - cpu), 3), round(1000 * (time.perf_counter() - wall), 3)
 
 
 def _peak_mib() -> float:

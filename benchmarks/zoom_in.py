@@ -26,7 +26,7 @@ INTRO = """# Zoom-in with super-resolution networks
 
 Made by `python benchmarks/zoom_in.py DATA`. Protocol P3, mean of the test views, nothing adapted to any of them. X2.pt and X4.pt are DCTLSA
 transformers, realesr-animevideov3.pth is a GAN that is worse in dB than bicubic. *Enlarged by* is the network's image of the base's,
-no splat touched. Seconds on one thread of a shared machine, those to enlarge the views among them (about 2 s a view with a transformer,
+no splat touched. Seconds on one thread of a shared machine, those to enlarge the views among them (about 1 s a view with a transformer,
 and an empty cache). The ms of the first row hold the compilation of the backend.
 
 With a network splats are cloned and split to the end, which is what LPIPS asks for: at x2 on lego 23 thousand reach .070, 98 thousand

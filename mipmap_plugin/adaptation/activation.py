@@ -16,7 +16,7 @@ class Activation:
     """A model's splats for the views of a step, and the way of their gradients back to its parameters.
 
     Shared, the views' gradients are gathered at the splats: the graph of a view is gone before the next is drawn, and activations,
-    which take about a third of a small image's step, are computed and differentiated once.
+    about a tenth of the time of small images, are computed and differentiated once.
     """
 
     def __init__(self, model: SplatModel, *, share: bool) -> None:
