@@ -63,10 +63,11 @@ class AdaptConfig(BaseModel):
     decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's: how long it remembers gradients and their squares.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
-    gathering: float = Field(0.0, ge=0, le=1, description="Share of the steps over which new views come in: each costs a render of the base.")
+    gathering: float = Field(0.0, ge=0, le=1, description="Share of the run over which new views come in: each costs a render of the base.")
     prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")
     densify_gradient: float | None = Field(None, gt=0, description="Screen gradient, NDC units, above which a splat is cloned or split; None: never.")
+    most_growth: float | None = Field(None, ge=1, description="How many times its splats densifying may leave at most; None: no end.")
     reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
 
 
@@ -108,7 +109,7 @@ _DEFAULT_IN = dict(
 # little, for what a network makes up differs from view to view.
 _DEFAULT_UPSAMPLED = dict(
     steps=400, compare_at="both", resize="pil-bicubic", views="train", views_per_step=4,
-    densify_gradient=1e-4, prune_every=50, decay=0.02, betas=(0.8, 0.95),
+    densify_gradient=1e-4, most_growth=8, prune_every=50, decay=0.02, betas=(0.8, 0.95),
     rates=LearningRates(means=0.2, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.002, networks=5e-4),
 )  # fmt: skip
 

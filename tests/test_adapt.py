@@ -193,12 +193,14 @@ def test_a_resumed_default_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth
 
 
 @pytest.mark.parametrize("nth", [2, 5])  # before and after splats were cloned
-def test_a_resumed_paper_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth):
-    whole = wrapped(background=WHITE).adapt(1 / 4, recipe="paper", **BRIEF_PAPER).model
+@pytest.mark.parametrize("views", [1, 2])  # two share an activation
+def test_a_resumed_paper_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth, views):
+    settings = {**BRIEF_PAPER, "views_per_step": views}
+    whole = wrapped(background=WHITE).adapt(1 / 4, recipe="paper", **settings).model
     ctrl_c(nth)
     with pytest.raises(Interrupted):
-        wrapped(background=WHITE).adapt(1 / 4, recipe="paper", resume=tmp_path / "state", **BRIEF_PAPER)
-    resumed = wrapped(background=WHITE).adapt(1 / 4, recipe="paper", resume=tmp_path / "state", **BRIEF_PAPER).model
+        wrapped(background=WHITE).adapt(1 / 4, recipe="paper", resume=tmp_path / "state", **settings)
+    resumed = wrapped(background=WHITE).adapt(1 / 4, recipe="paper", resume=tmp_path / "state", **settings).model
     files = [model.save(tmp_path / f"{i}.ply", provenance={}).read_bytes() for i, model in enumerate((whole, resumed))]
     assert files[0] == files[1]
 

@@ -6,7 +6,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.density import SPLIT_SHRINK, ScreenGradients, densify, prune, reset_opacities
+from mipmap_plugin.adaptation.density import SPLIT_SHRINK, ScreenGradients, densify, prune, reset_opacities, strongest
 from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.loop import adapt as optimise
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
@@ -189,6 +189,13 @@ def test_screen_gradients_are_averaged_over_the_views_that_gave_any():
     one.add(means, torch.tensor([[0.0, 0, 0], [3.0, 0, 0]]), camera)
     torch.testing.assert_close(three, one.mean())
     assert three[0] == 0 < three[1]
+
+
+def test_the_strongest_gradients_grow_first():
+    gradients = torch.tensor([3.0, 0.1, 5.0, 4.0])
+    assert strongest(gradients, 1.0, 3).tolist() == strongest(gradients, 1.0, 9).tolist() == [True, False, True, True]
+    assert strongest(gradients, 1.0, 2).tolist() == [False, False, True, True]
+    assert not strongest(gradients, 1.0, 0).any() and not strongest(gradients, 1.0, -4).any()
 
 
 def test_two_views_in_one_step_count_as_two_views_each_with_its_own_gradient():

@@ -169,6 +169,7 @@ def test_rows_for_every_scale_and_recipe(model, scene):
     assert {zoomed[name].adapted_on for name in ("default, scored", "paper, scored")} == {"the 2 given views"}
     assert all(row.ssim is None for row in zoomed.values())
     assert zoomed["resized base"].psnr_db > 45  # the photographs are the base's own, and P1 is a box
+    assert zoomed["window, 2 x 2 samples"].psnr_db > zoomed["window"].psnr_db
     assert zoomed["naive"].psnr_db < min(zoomed[name].psnr_db for name in ("resized base", "default, held out"))
 
 

@@ -171,25 +171,32 @@ def test_views_are_gathered_evenly_and_then_come_in_rounds():
     views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=20, views_per_step=3, gathering=0.5)
     order, known, growth = Order(views, config), set(), []
     for step in range(10):
-        taken = order(step)
+        taken = order(step, step / 20)
         assert len(taken) == len(set(taken)) == 3
         growth.append(len(set(taken) - known))
         known |= set(taken)
     assert growth[0] == 3 and max(growth[1:]) <= 2 and known == set(views)
-    later = [view for step in range(10, 18) for view in order(step)]
+    later = [view for step in range(12, 20) for view in order(step, step / 20)]
     assert set(later[:12]) == set(later[12:]) == set(views)
-    assert [Order(views, config)(step) for step in range(20)] == [order(step) for step in range(20)]
+    assert [Order(views, config)(step, step / 20) for step in range(20)] == [order(step, step / 20) for step in range(20)]
+
+
+def test_where_time_is_short_views_come_in_faster():
+    views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=400, views_per_step=3, time_budget_s=1.0)
+    order = Order(views, config)
+    seen = [{view for step in range(12) for view in order(step, step / 400 + share)} for share in (0.0, 0.25, 0.6)]
+    assert len(seen[0]) == len(seen[2]) == 12  # one at least comes in with a step
+    assert len(set(order(0, 0.25)) | set(order(1, 0.25)) | set(order(2, 0.25))) > 5
 
 
 def test_no_more_views_come_in_than_steps_take():
-    config = recipe("default", 1 / 4, steps=4, views_per_step=2, gathering=0.5)
-    order = Order(tiny.cameras(9), config)
-    assert [len(set(order(0))), len(set(order(0) + order(1)))] == [2, 4]
+    order = Order(tiny.cameras(9), recipe("default", 1 / 4, steps=4, views_per_step=2, gathering=0.5))
+    assert [len(set(order(0, 0))), len(set(order(0, 0) + order(1, 0.25)))] == [2, 4]
 
 
-def test_fewer_views_than_a_step_takes_are_taken_once_while_they_are_gathered():
-    order = Order(tiny.cameras(2), recipe("default", 1 / 4, steps=4, views_per_step=3, gathering=1))
-    assert [len(order(step)) for step in range(4)] == [2, 2, 2, 2]
+def test_a_step_takes_no_view_twice_where_there_are_few():
+    order = Order(tiny.cameras(2), recipe("default", 1 / 4, steps=4, views_per_step=3, gathering=0.5))
+    assert [len(set(order(step, step / 4))) for step in range(4)] == [len(order(step, step / 4)) for step in range(4)] == [2, 2, 2, 2]
 
 
 def test_the_extent_is_inrias_and_one_for_a_single_place():

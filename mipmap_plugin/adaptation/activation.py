@@ -44,6 +44,7 @@ class Activation:
         if self._splats is None or self._leaves is None:
             return
         leaves, splats = _tensors(self._leaves), _tensors(self._splats)
+        self._leaves = self._splats = None  # the optimizer and density control need the room
         moved = [name for name, leaf in leaves.items() if leaf.grad is not None]
         torch.autograd.backward([splats[name] for name in moved], [leaves[name].grad for name in moved])
 

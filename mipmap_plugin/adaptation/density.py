@@ -61,6 +61,14 @@ def prune(model: SplatModel, optimizer: torch.optim.Adam, keep: Tensor) -> None:
     change_rows(model, optimizer, lambda _, old: old[keep], lambda old: old[keep])
 
 
+def strongest(gradients: Tensor, least: float, most: int) -> Tensor:
+    """[N] bool: rows of `gradients` [N] of at least `least`; where they are more than `most`, the largest of them."""
+    grown = gradients >= least
+    if int(grown.sum()) <= most:
+        return grown
+    return torch.zeros_like(grown).index_fill(0, gradients.topk(max(0, most)).indices, True)
+
+
 def densify(model: SplatModel, optimizer: torch.optim.Adam, grown: Tensor, extent: float, shown: Gaussians, generator: torch.Generator) -> None:
     """Clone the small and split the large among the rows where `grown` [N] is True. `shown`: the model's activated splats.
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from mipmap_plugin.adaptation.pseudo_truth import parked
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.structure import similarity
 from mipmap_plugin.adaptation.upsamplers import find_upsampler
@@ -44,7 +45,8 @@ class Detail:
 
     def __call__(self, view: Camera, image: Tensor) -> Tensor:
         """The loss of `image` [H, W, 3], what the view of the base scale shows at the new one."""
-        target, confidence = self._of(view)
+        target, confidence = (tensor.to(image) for tensor in self._of(view))
+        confidence = resize(confidence, view.zoomed(self._scale).size, "bilinear")
         structure = self._config.detail_structure
         difference = (1 - structure) * (image - target).abs()
         if structure:
@@ -53,19 +55,20 @@ class Detail:
 
     def _of(self, view: Camera) -> tuple[Tensor, Tensor]:
         if view not in self._made:
-            self._made[view] = self._make(view)
+            target, confidence = self._make(view)
+            self._made[view] = parked(target.half()), parked(confidence)  # a hundred views of a photograph's size are gigabytes
         return self._made[view]
 
     @torch.no_grad()
     def _make(self, view: Camera) -> tuple[Tensor, Tensor]:
-        """The fused target [H, W, 3] and how far it is believed, [H, W, 1] in 0..1."""
+        """The fused target [H, W, 3] and how far it is believed, [h, w, 1] in 0..1."""
         base, size = self._truth(view), view.zoomed(self._scale).size
         enlarged = self._enlarge(base, size)
         lacking = self._lacking(enlarged, base)
         confidence = 1 / (1 + lacking.square().mean(-1, keepdim=True) / TRUST**2) ** 2
         for _ in range(ROUNDS):
             enlarged = enlarged + resize(self._lacking(enlarged, base), size, "pil-bicubic")
-        return enlarged.clamp(0, 1), resize(confidence, size, "bilinear")
+        return enlarged.clamp(0, 1), confidence
 
     def _lacking(self, enlarged: Tensor, base: Tensor) -> Tensor:
         """What the enlarged image, shrunk, is short of the base's image [h, w, 3]."""

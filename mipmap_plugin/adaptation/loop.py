@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -33,6 +34,7 @@ class Task:
     render: Callable[[Gaussians, Camera], Tensor]  # what a camera of the new scale sees, and it -> [h, w, 3]
     white_background: bool
     detail: Callable[[Camera, Tensor], Tensor] | None = None  # what a view's image adds to the loss besides
+    most_splats: int = sys.maxsize  # where growing ends
 
     def pixel(self, means: Tensor) -> float:
         """World units: the size of a target pixel at the median of `means` [N, 3]."""
@@ -71,7 +73,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
         observe(run)
         while run.step < config.steps:
             with run.watch:
-                _step(run, task, config, order(run.step), cameras)
+                _step(run, task, config, order(run.step, progress(run.step, run.watch.seconds, config)), cameras)
                 if run.step % config.check_every == 0 or run.step == config.steps:
                     run.square_error = float(run.square_error)  # here a GPU is waited for, so that the clock counts its work
             bar.update()
@@ -118,8 +120,10 @@ def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     before = run.student.parameters()["means"]
     if run.gradients is not None and config.densify_gradient is not None:
         shown = run.student.gaussians(task.views[0]).detach()
+        room = task.most_splats - len(before)
+        grown = density.strongest(run.gradients.mean(), config.densify_gradient, room)
         generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
-        density.densify(run.student, run.optimizer, run.gradients.mean() >= config.densify_gradient, extent(task.views), shown, generator)
+        density.densify(run.student, run.optimizer, grown, extent(task.views), shown, generator)
     density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
     means = run.student.parameters()["means"]
     run.gradients = density.ScreenGradients.of(means, config)

@@ -51,7 +51,7 @@ class PseudoTruth:
     def __call__(self, view: Camera) -> Tensor:
         """The pseudo truth of a camera of the base scale."""
         if view not in self._made:
-            self._made[view] = _parked(self._make(view))
+            self._made[view] = parked(self._make(view))
         return self._made[view].to(self._base.parameters()["means"].device, non_blocking=True)
 
     @cached_property
@@ -93,7 +93,7 @@ class PseudoTruth:
         return self._activated
 
 
-def _parked(target: Tensor) -> Tensor:
+def parked(target: Tensor) -> Tensor:
     """`target`, or, where half of its GPU's memory is taken, a copy in the host's that the GPU can fetch without waiting for the host."""
     if target.device.type != "cuda":
         return target

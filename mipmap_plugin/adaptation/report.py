@@ -39,7 +39,10 @@ class Report(BaseModel):
 
 
 class Peak:
-    """The most memory that torch's tensors took on a GPU since this was made, MiB; None on another device."""
+    """The most memory that the process's tensors took on a GPU since this was made, MiB; None on another device.
+
+    Torch counts once for all: whoever else asks it for a peak is told one that begins here too.
+    """
 
     def __init__(self, device: torch.device) -> None:
         self._device = device

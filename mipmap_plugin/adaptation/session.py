@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -88,9 +89,10 @@ class Session:
             self.views = evenly(self.views, config.upsampled_views)
             self.which += f", {len(self.views)} of them upsampled"
         self.seconds = {"optimization": 0.0}
+        self.peak = Peak(self.base.parameters()["means"].device)
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
-        began, self.peak = time.perf_counter(), Peak(self.base.parameters()["means"].device)
+        began = time.perf_counter()
         student = self.base.copy()
         student.trained = replace(student.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
         nothing_to_do = self.scale == 1 and self.effects == self.trained
@@ -109,7 +111,8 @@ class Session:
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[list[CurvePoint], str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""
-        task = Task(self.views, self.scale, self.truth, self._render, self._white, self.detail)
+        most = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * len(student.parameters()["means"]))
+        task = Task(self.views, self.scale, self.truth, self._render, self._white, self.detail, most)
         keeper = Keeper(resume, self._fingerprint())
         run = keeper.begin(student, task, self.config)
         if self.effects.sh_degree == 0 and (unused := student.parameters().get("shN")) is not None:

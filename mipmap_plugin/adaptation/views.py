@@ -1,4 +1,4 @@
-"""Which views are adapted to, and in which order: a shuffled round through all of them, then another, from one seed."""
+"""Which views are adapted to, and in which order: gathered in a shuffled order, then in rounds through all of them, from one seed."""
 
 from __future__ import annotations
 
@@ -21,24 +21,29 @@ ORBIT_VIEWS = 50
 
 
 class Order:
-    """Which views each step takes. Follows from the settings and the step alone, so that a run can be resumed at any."""
+    """Which views each step takes. Remembers nothing, so that a run can be resumed at any."""
 
     def __init__(self, views: Sequence[Camera], config: AdaptConfig) -> None:
-        self._rounds, self._each, self._seed = Rounds(views, config.seed), config.views_per_step, config.seed
+        self._rounds, self._each = Rounds(views, config.seed), min(config.views_per_step, len(views))
+        self._seed, self._steps = config.seed, config.steps
         self._gathering = math.ceil(config.gathering * config.steps)
 
-    def __call__(self, step: int) -> list[Camera]:
-        """The views of a step: while they are gathered its new ones and some of those before, then rounds through all."""
-        if step >= self._gathering:
-            return [self._rounds((step - self._gathering) * self._each + nth) for nth in range(self._each)]
-        before, known = self._known(step - 1), self._known(step)
+    def __call__(self, step: int, progress: float) -> list[Camera]:
+        """The views of a step: while they are gathered its new ones and some of those before, then rounds through all.
+
+        progress: 0..1, how much of the run is over; more than the steps tell where time is short.
+        """
+        pace = max(step, int(progress * self._steps))
+        if pace >= self._gathering:
+            return [self._rounds(step * self._each + nth) for nth in range(self._each)]
+        before, known = self._known(pace - 1), self._known(pace)
         generator = torch.Generator().manual_seed(self._seed * 1_000_003 + step)
         again = torch.randperm(before, generator=generator)[: self._each - (known - before)].tolist()
         return [self._rounds(place) for place in (*range(before, known), *again)]
 
     def _known(self, step: int) -> int:
-        """How many views have come in with a step: evenly over the steps of gathering, and no more in a step than it takes."""
-        come = max(self._each, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
+        """How many views have come in with a step: evenly over the steps of gathering, at least one and no more in a step than it takes."""
+        come = max(self._each, step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
         return min(come, self._each * (step + 1), len(self._rounds.views))
 
 

@@ -83,7 +83,7 @@ class SplatModel(Protocol):
 
 
 def same_for_all_views(model: SplatModel) -> bool:
-    """Whether every camera sees the same splats."""
+    """Whether the model says that every camera sees the same splats, by offering `rebuild`."""
     return hasattr(model, "rebuild")
 
 
