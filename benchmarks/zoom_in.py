@@ -29,7 +29,8 @@ transformers, realesr-animevideov3.pth is a GAN that is worse in dB than bicubic
 no splat touched. Seconds on one thread of a shared machine, those to enlarge the views among them (about 1 s a view with a transformer,
 and an empty cache). The ms of the first row hold the compilation of the backend.
 
-With a network splats are cloned and split to the end, which is what LPIPS asks for.
+`thorough` clones and splits splats to the end, which is what LPIPS asks for. The networks' images are kept on disk, so that of the two
+recipes only the first pays for those that both ask for.
 """
 
 
@@ -49,7 +50,10 @@ def rows_of(model: Wrapped, judge: Judge, scale: float, networks: list[Path], st
     rows = [adapted_row("closed form", model.adapt(scale, recipe="instant", views="train"), judge), enlarged("bicubic")]
     rows.append(adapted_row("default", model.adapt(scale), judge))
     for network in networks:
-        rows += [enlarged(str(network)), adapted_row(f"default + {network.name}", model.adapt(scale, upsampler=str(network), **limit), judge)]
+        rows.append(enlarged(str(network)))
+        for recipe in ("default", "thorough"):
+            adapted = model.adapt(scale, recipe=recipe, upsampler=str(network), **limit)
+            rows.append(adapted_row(f"{recipe} + {network.name}", adapted, judge))
     return rows
 
 

@@ -47,9 +47,9 @@ class AdaptConfig(BaseModel):
     resize: ResizeFilter = Field("pil-bicubic", description="How the base image is made smaller; the filter of the protocol that is aimed at.")
     upsampler: str = Field("bicubic", description="How the base image is made larger, by name in the registry.")
     compare_at: Literal["target", "base", "both"] = Field("target", description="Zoom-in: with the upsampled base, with the base itself, or both.")
-    detail_weight: float = Field(1.0, ge=0, description="`both`: of the difference from the upsampled base, beside the square from the base.")
-    detail_structure: float = Field(0.4, ge=0, le=1, description="`both`: how much of that difference is one of structure, 1 - SSIM.")
-    upsampled_views: int = Field(100, gt=0, description="`both`: views at most, spread over those of the policy; each is upsampled.")
+    detail_weight: float = Field(0.1, ge=0, description="`both`: of the difference from the upsampled base, beside the square from the base.")
+    detail_structure: float = Field(0.0, ge=0, le=1, description="`both`: how much of that difference is one of structure, 1 - SSIM.")
+    upsampled_views: int = Field(50, gt=0, description="`both`: views at most, spread over those of the policy; each is upsampled.")
     quantize_truth: bool = Field(False, description="Round the pseudo truth to 8 bits, as files of PNG do.")
     truth_oversampling: int | None = Field(None, gt=0, description="Render the base at most this many times finer than the target; None: at its own.")
 
@@ -90,7 +90,8 @@ _DEFAULT_OUT = dict(
     rates=LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4),
 )  # fmt: skip
 
-# What more time buys at zoom-out: twice the steps, twice the views in each, five times the views. At zoom-in there is nothing to buy.
+# What more time buys at zoom-out: twice the steps, twice the views in each, five times the views. At zoom-in there is nothing to buy
+# without a network.
 _THOROUGH_OUT = dict(_DEFAULT_OUT, steps=800, views_per_step=8, extra_views=1000)
 
 # Of a zoom-out's splats, times the scale: at x1/8 a tenth is left.
@@ -104,12 +105,18 @@ _DEFAULT_IN = dict(
     rates=LearningRates(opacities=0.02, networks=5e-4),
 )  # fmt: skip
 
-# With a super-resolution network there is something to learn at the new scale too, and finer things than the base's splats can show:
-# they are split and cloned to the end, to four times as many on lego at x2, and centers move. Colors that depend on the view learn
-# little, for what a network makes up differs from view to view.
+# With a super-resolution network there is something to learn at the new scale too: more steps and bolder rates pay, LPIPS above all.
 _DEFAULT_UPSAMPLED = dict(
-    steps=400, compare_at="both", resize="pil-bicubic", views="train", views_per_step=4,
-    densify_gradient=1e-4, most_growth=8, prune_every=50, decay=0.02, betas=(0.8, 0.95),
+    _DEFAULT_IN, steps=800, compare_at="both", resize="pil-bicubic", patience=None, views="train",
+    rates=LearningRates(scales=0.015, quats=0.003, opacities=0.05, sh0=0.01, shN=0.001, networks=5e-4),
+)  # fmt: skip
+
+# And finer things than the base's splats can show: they are split and cloned to the end, to four times as many on lego at x2, and
+# centers move. Colors that depend on the view learn little, for what a network makes up differs from view to view. It suits objects:
+# the thousands of huge splats of an unbounded scene do not recover from being doubled.
+_THOROUGH_UPSAMPLED = dict(
+    steps=400, compare_at="both", resize="pil-bicubic", views="train", upsampled_views=100, detail_weight=1.0, detail_structure=0.4,
+    views_per_step=4, densify_gradient=1e-4, most_growth=8, prune_every=50, decay=0.02, betas=(0.8, 0.95),
     rates=LearningRates(means=0.2, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.002, networks=5e-4),
 )  # fmt: skip
 
@@ -119,9 +126,13 @@ KERNELS = frozenset({"bicubic", "lanczos"})
 
 def recipe(name: Recipe, scale: float, **overrides: Any) -> AdaptConfig:
     """The settings of a recipe at `scale`, with `overrides`. Raises SettingsError for an unknown name or a value out of range."""
-    zoom_in = _DEFAULT_IN if overrides.get("upsampler", "bicubic") in KERNELS else _DEFAULT_UPSAMPLED
     merging = {"merge_to": min(1.0, MERGE_TO * scale)}
-    default, thorough = (_DEFAULT_OUT | merging, _THOROUGH_OUT | merging) if scale < 1 else (zoom_in, zoom_in)
+    if scale < 1:
+        default, thorough = _DEFAULT_OUT | merging, _THOROUGH_OUT | merging
+    elif overrides.get("upsampler", "bicubic") in KERNELS:
+        default = thorough = _DEFAULT_IN
+    else:
+        default, thorough = _DEFAULT_UPSAMPLED, _THOROUGH_UPSAMPLED
     known: dict[str, dict[str, Any]] = {"default": default, "thorough": thorough, "paper": _PAPER, "instant": _INSTANT}
     if name not in known:
         raise SettingsError(f"there is no recipe {name!r}; known are {', '.join(known)}")

@@ -73,7 +73,7 @@ def test_views_that_deny_what_one_claims_outvote_it(upsampler):
 @pytest.mark.parametrize("structure", [0.0, 0.3, 1.0])
 def test_the_loss_mixes_differences_and_structure_where_the_target_is_believed(upsampler, structure):
     upsampler(lambda image, size: (resize(image, size, "pil-bicubic") + 0.2 * (torch.arange(64) > 40)[None, :, None]).clamp(0, 1))
-    part, image = detail(picture(24, 32), detail_structure=structure), picture(*SIZE, seed=1)
+    part, image = detail(picture(24, 32), detail_structure=structure, detail_weight=1.0), picture(*SIZE, seed=1)
     target, confidence = part._make(VIEW)
     confidence = resize(confidence, SIZE, "bilinear")
     mixed = (1 - structure) * (image - target).abs() + structure * (1 - similarity(image, target))
@@ -139,13 +139,14 @@ def test_the_report_says_what_was_enlarged(upsampler):
 
 def test_a_network_grows_splats_up_to_a_limit(upsampler):
     upsampler(lambda image, size: resize(image, size, "lanczos"))
-    eager = dict(steps=8, prune_every=2, densify_gradient=1e-12, min_opacity=0.0)
+    eager = dict(recipe="thorough", steps=8, prune_every=2, densify_gradient=1e-12, min_opacity=0.0)
     before = len(tiny.model())
     assert before < adapted("mine", **eager, most_growth=1.5).report.gaussians_after <= 1.5 * before
     assert adapted("mine", **eager).report.gaussians_after > 1.5 * before
 
 
-def test_an_upsampler_that_is_all_noise_does_no_harm(upsampler):
+@pytest.mark.parametrize("recipe", ["default", "thorough"])
+def test_an_upsampler_that_is_all_noise_does_no_harm(upsampler, recipe):
     """Against the base's own larger render: not below the closed form, whatever the target."""
     upsampler(lambda image, size: torch.rand(*size, 3, generator=torch.Generator().manual_seed(int(image.sum() * 1000))))
     base = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
@@ -155,4 +156,4 @@ def test_an_upsampler_that_is_all_noise_does_no_harm(upsampler):
     def quality(model):
         return sum(psnr(model.render(view.zoomed(2)).image, truth) for view, truth in zip(views, truths, strict=True))
 
-    assert quality(adapted("mine", steps=30)) > quality(base.adapt(2, recipe="instant"))
+    assert quality(adapted("mine", recipe=recipe, steps=30)) > quality(base.adapt(2, recipe="instant"))
