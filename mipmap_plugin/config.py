@@ -113,7 +113,7 @@ _DEFAULT_UPSAMPLED = dict(
 
 # And finer things than the base's splats can show: they are split and cloned to the end, to four times as many on lego at x2, and
 # centers move. Colors that depend on the view learn little, for what a network makes up differs from view to view. It suits objects:
-# the thousands of huge splats of an unbounded scene do not recover from being doubled.
+# on flowers, an unbounded scene, 60 steps of it came out 25 dB further from the base than the closed form (19 dB, 44).
 _THOROUGH_UPSAMPLED = dict(
     steps=400, compare_at="both", resize="pil-bicubic", views="train", upsampled_views=100, detail_weight=1.0, detail_structure=0.4,
     views_per_step=4, densify_gradient=1e-4, most_growth=8, prune_every=50, decay=0.02, betas=(0.8, 0.95),
