@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TypeVar
 
@@ -54,11 +55,12 @@ class Speed:
 
 @dataclass(frozen=True)
 class Scaling:
-    """Forward and backward, one thread and two in turn."""
+    """Forward and backward on one thread, on two, and in two processes of one thread side by side, in turn."""
 
     one: Timing
     two: Timing
-    wall_ratio: Spread  # one over two, pair by pair
+    wall_ratio: Spread  # one over two, run by run
+    machine_ratio: Spread  # twice one over both processes: what two processors gave just then
 
 
 class Job:
@@ -103,14 +105,37 @@ def measure_speed(backend: str, file: Path, warm_up: Path, runs: int) -> Speed:
 
 def measure_scaling(backend: str, file: Path, runs: int) -> Scaling:
     job = Job(backend, file)
+    near, far = get_context("spawn").Pipe()
+    neighbor = get_context("spawn").Process(target=_neighbor, args=(backend, file, far), daemon=True)
+    neighbor.start()
 
-    def on(threads: int) -> tuple[float, float]:
+    def beside() -> None:
+        near.send("go")
+        job.forward_backward()
+        near.recv()
+
+    def on(threads: int, call: Callable[[], None]) -> tuple[float, float]:
         torch.set_num_threads(threads)
-        job.forward_backward()  # not timed: it finds caches as another number of threads left them
-        return _timed(job.forward_backward)
+        call()  # not timed: it finds caches as another number of threads left them
+        return _timed(call)
 
-    one, two = _in_turn([partial(on, 1), partial(on, 2)], runs)
-    return Scaling(Timing.of(one), Timing.of(two), Spread.of([round(a[1] / b[1], 3) for a, b in zip(one, two, strict=True)]))
+    one, two, both = _in_turn([partial(on, 1, job.forward_backward), partial(on, 2, job.forward_backward), partial(on, 1, beside)], runs)
+    neighbor.kill()
+    return Scaling(Timing.of(one), Timing.of(two), _ratio(1, one, two), _ratio(2, one, both))
+
+
+def _neighbor(backend: str, file: Path, far: Connection) -> None:
+    """Does the same on one thread, once each time it is asked to."""
+    torch.set_num_threads(1)
+    job = Job(backend, file)
+    while far.recv():
+        job.forward_backward()
+        far.send("done")
+
+
+def _ratio(work: int, one: list[tuple[float, float]], other: list[tuple[float, float]]) -> Spread:
+    """How many times faster than `one` the `other` did `work` times as much, by the wall clock."""
+    return Spread.of([round(work * a[1] / b[1], 3) for a, b in zip(one, other, strict=True)])
 
 
 def _in_turn(timed: list[Callable[[], tuple[float, float]]], runs: int) -> list[list[tuple[float, float]]]:

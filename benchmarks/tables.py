@@ -83,7 +83,7 @@ def _cells(rows: Rows, row: Row) -> list[str]:
     return [
         row.size.name, row.backend, _spread(forward.cpu_ms), _spread(forward.wall_ms), _spread(both.cpu_ms), _spread(both.wall_ms),
         _ratio(rows.ratio(row, "reference")), _ratio(rows.ratio(row, YARDSTICK)), f"{row.pairs_per_second / 1e6:.2f}",
-        f"{row.speed.extra_mib:.0f}", f"x {row.scaling.wall_ratio.median:.2f}" if row.scaling else "-",
+        f"{row.speed.extra_mib:.0f}", f"x {row.scaling.wall_ratio.median:.2f} of {row.scaling.machine_ratio.median:.2f}" if row.scaling else "-",
     ]  # fmt: skip
 
 

@@ -87,7 +87,7 @@ def test_an_ablation_varies_one_thing_of_its_recipe(name):
 def test_a_measurement_in_pieces_keeps_the_others(tmp_path):
     def row(backend: str, scene: str, ms: float) -> Row:
         timing = Timing(Spread.of([ms]), Spread.of([ms]), 1)
-        return Row(backend, Size(scene, 10, 8, 8, 100), Speed(timing, timing, 1.0), Scaling(timing, timing, Spread.of([2.0])))
+        return Row(backend, Size(scene, 10, 8, 8, 100), Speed(timing, timing, 1.0), Scaling(timing, timing, Spread.of([1.7]), Spread.of([1.9])))
 
     older = [row("cpu", "A", 1.0), row("reference", "A", 30.0), row("cpu", "lego", 2.0)]
     write_json(tmp_path / "facts.json", facts(Rows(older), [older[0].size, older[2].size], {}), overwrite=True)

@@ -6,12 +6,14 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.density import SPLIT_SHRINK, ScreenGradients, densify, prune, reset_opacities, strongest
+from mipmap_plugin.adaptation.density import SPLIT_SHRINK, ScreenGradients, clone_and_split, halve, prune, reset_opacities, strongest
 from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.loop import adapt as optimise
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
 from mipmap_plugin.backends.projection import project
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import AdaptConfig, LearningRates
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 
 COUNT = 6
@@ -53,7 +55,7 @@ def mask(*rows: int) -> torch.Tensor:
 
 
 def grow(student, optimizer, grown, extent):
-    densify(student, optimizer, grown, extent, student.gaussians().detach(), torch.Generator().manual_seed(0))
+    clone_and_split(student, optimizer, grown, extent, student.gaussians().detach(), torch.Generator().manual_seed(0))
 
 
 # Pruning
@@ -135,6 +137,35 @@ def test_densifying_nothing_keeps_every_row(student, optimizer):
     grow(student, optimizer, mask(), extent=1.0)
     assert torch.equal(student.gaussians().means, before.means)
     assert moments(student, optimizer) == [1, 2, 3, 4, 5, 6]
+
+
+def test_halves_replace_a_splat_on_either_side_of_it(student, optimizer):
+    before = student.gaussians().detach()
+    halve(student, optimizer, mask(1, 3), before)
+    after, parents = student.gaussians().detach(), [1, 3, 1, 3]
+    torch.testing.assert_close(after.means[:4], before.means[[0, 2, 4, 5]])
+    torch.testing.assert_close((after.means[4:6] + after.means[6:]) / 2, before.means[[1, 3]])
+    assert (after.scales[4:] < before.scales[parents]).all() and (after.opacities[4:] < before.opacities[parents]).all()
+    assert moments(student, optimizer) == [1, 3, 5, 6, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("opacity", [0.1, 0.5, 0.9, 0.99])
+def test_halves_show_almost_what_the_splat_did(opacity):
+    """Their longest axis, turned a quarter about z, lies along the view; clones are brighter by far."""
+    turned = torch.tensor([[math.sqrt(0.5), 0, 0, math.sqrt(0.5)]])
+    splat = Gaussians(torch.zeros(1, 3), turned, torch.tensor([[0.3, 0.1, 0.2]]), torch.tensor([opacity]), torch.ones(1, 1, 3))
+    camera = tiny.cameras(1)[0]
+
+    def changed(how) -> float:
+        student = type(tiny.model(1)).from_gaussians(splat).copy()
+        how(student, make_optimizer(student, AdaptConfig(), 1.0))
+        images = [ReferenceBackend().render(shown.detach(), camera, Effects()).alpha for shown in (splat, student.gaussians())]
+        return float((images[1] - images[0]).norm() / images[0].norm())
+
+    one = torch.tensor([True])
+    halved = changed(lambda student, optimizer: halve(student, optimizer, one, splat))
+    cloned = changed(lambda student, optimizer: grow(student, optimizer, one, extent=1e6))
+    assert 0 < halved < 0.07 and cloned > 2 * halved
 
 
 # Resetting
@@ -230,7 +261,18 @@ def test_rates_fall_to_their_share_and_the_means_are_in_pixels(student):
     adam = make_optimizer(student, config, pixel=3.0)
     rate = lambda name: next(group["lr"] for group in adam.param_groups if group["name"] == name)  # noqa: E731
     assert (rate("means"), rate("sh0"), rate("quats")) == (pytest.approx(0.3), 0.5, 0)
-    set_rates(adam, config, 0.5)
+    set_rates(adam, config, 0.5, step=5)
     assert (rate("means"), rate("sh0")) == (pytest.approx(0.3 * 0.505), pytest.approx(0.5 * 0.505))
-    set_rates(adam, config, 1.0)
+    set_rates(adam, config, 1.0, step=10)
     assert rate("sh0") == pytest.approx(0.005)
+
+
+def test_bands_above_the_first_rise_to_their_rate(student):
+    config = AdaptConfig(warm_up=4, rates=LearningRates(sh0=0.5, shN=0.2))
+    adam = make_optimizer(student, config, pixel=1.0)
+    told = []
+    for step in (0, 1, 3, 9):
+        set_rates(adam, config, 0.0, step)
+        told.append({group["name"]: group["lr"] for group in adam.param_groups})
+    assert [rates["shN"] for rates in told] == pytest.approx([0.05, 0.1, 0.2, 0.2])
+    assert {rates["sh0"] for rates in told} == {0.5}

@@ -5,7 +5,7 @@ import tiny
 import torch
 from skimage.metrics import structural_similarity
 
-from mipmap_plugin.adaptation.detail import Detail, evenly
+from mipmap_plugin.adaptation.detail import SURE, Detail, evenly
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.structure import similarity
 from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
@@ -70,14 +70,16 @@ def test_views_that_deny_what_one_claims_outvote_it(upsampler):
     torch.testing.assert_close(near.grad, far.grad)
 
 
-@pytest.mark.parametrize("structure", [0.0, 0.3, 1.0])
-def test_the_loss_mixes_differences_and_structure_where_the_target_is_believed(upsampler, structure):
+@pytest.mark.parametrize(("structure", "contrast"), [(0.0, 0.0), (0.3, 0.0), (1.0, 0.0), (0.0, 2.0), (0.4, 3.2)])
+def test_the_loss_mixes_differences_structure_and_contrast_where_the_target_is_believed(upsampler, structure, contrast):
     upsampler(lambda image, size: (resize(image, size, "pil-bicubic") + 0.2 * (torch.arange(64) > 40)[None, :, None]).clamp(0, 1))
-    part, image = detail(picture(24, 32), detail_structure=structure, detail_weight=1.0), picture(*SIZE, seed=1)
+    settings = dict(detail_structure=structure, detail_contrast=contrast, detail_weight=1.0)
+    part, image = detail(picture(24, 32), **settings), picture(*SIZE, seed=1)
     target, confidence = part._make(VIEW)
     confidence = resize(confidence, SIZE, "bilinear")
-    mixed = (1 - structure) * (image - target).abs() + structure * (1 - similarity(image, target))
-    torch.testing.assert_close(part(VIEW, image), (confidence * mixed).mean(), atol=2e-4, rtol=0)  # kept in half precision
+    ssim, as_strong = similarity(image, target)
+    mixed = (1 - structure) * (image - target).abs() + structure * (1 - ssim) + contrast * confidence**SURE * (1 - as_strong)
+    torch.testing.assert_close(part(VIEW, image), (confidence * mixed).mean(), atol=4e-4, rtol=0)  # kept in half precision
     assert confidence.std() > 0.1
 
 
@@ -86,13 +88,22 @@ def test_structural_similarity_is_scikit_images_away_from_the_border():
     settings = dict(gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2, full=True)
     expected = torch.from_numpy(structural_similarity(truth.numpy(), image.numpy(), **settings)[1])
     inside = slice(5, -5), slice(5, -5)
-    torch.testing.assert_close(similarity(image, truth)[inside], expected[inside])
+    torch.testing.assert_close(similarity(image, truth)[0][inside], expected[inside])
+
+
+def test_contrasts_are_as_strong_wherever_they_are_and_weaker_where_blurred():
+    stripes = 0.5 + 0.3 * torch.sin(torch.arange(64.0))[None, :, None].expand(48, 64, 3).double()
+    inside = slice(5, -5), slice(5, -5)
+    ssim, moved = similarity(stripes.roll(3, dims=1), stripes)
+    _, faded = similarity(0.5 + (stripes - 0.5) / 2, stripes)
+    assert ssim[inside].mean() < 0 and moved[inside].mean() > 0.98
+    torch.testing.assert_close(faded[inside], torch.full_like(faded[inside], 0.8), atol=0.02, rtol=0)  # 2·(1/2) / (1 + 1/4)
 
 
 def test_structural_similarity_has_a_gradient_everywhere_also_on_flat_and_dark_images():
     for truth in (torch.zeros(12, 9, 3), torch.full((12, 9, 3), 0.5), picture(12, 9)):
         image = torch.zeros(12, 9, 3, dtype=torch.float64, requires_grad=True)
-        similarity(image, truth.double()).sum().backward()
+        sum(part.sum() for part in similarity(image, truth.double())).backward()
         assert image.grad.isfinite().all()
     image = picture(6, 5).double().requires_grad_()
     assert torch.autograd.gradcheck(lambda image: similarity(image, picture(6, 5, seed=3).double()), image)
@@ -137,9 +148,10 @@ def test_the_report_says_what_was_enlarged(upsampler):
     assert report.seconds["upsampling"] > 0
 
 
-def test_a_network_grows_splats_up_to_a_limit(upsampler):
+@pytest.mark.parametrize("keeps", [False, True])
+def test_a_network_grows_splats_up_to_a_limit(upsampler, keeps):
     upsampler(lambda image, size: resize(image, size, "lanczos"))
-    eager = dict(recipe="thorough", steps=8, prune_every=2, densify_gradient=1e-12, min_opacity=0.0)
+    eager = dict(recipe="thorough", steps=8, prune_every=2, densify_gradient=1e-12, min_opacity=0.0, densify_keeps_image=keeps)
     before = len(tiny.model())
     assert before < adapted("mine", **eager, most_growth=1.5).report.gaussians_after <= 1.5 * before
     assert adapted("mine", **eager).report.gaussians_after > 1.5 * before

@@ -168,7 +168,7 @@ def test_rounds_show_every_view_once_and_start_anywhere():
 
 
 def test_views_are_gathered_evenly_and_then_come_in_rounds():
-    views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=20, views_per_step=3, gathering=0.5)
+    views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=20, views_per_step=3, gathering=0.5, warm_up=0)
     order, known, growth = Order(views, config), set(), []
     for step in range(10):
         taken = order(step, step / 20)
@@ -181,19 +181,29 @@ def test_views_are_gathered_evenly_and_then_come_in_rounds():
     assert [Order(views, config)(step, step / 20) for step in range(20)] == [order(step, step / 20) for step in range(20)]
 
 
+def test_a_step_takes_few_views_at_first_and_later_rounds_miss_none():
+    views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=40, views_per_step=4, gathering=0.2, warm_up=16)
+    order = Order(views, config)
+    taken = [order(step, step / 40) for step in range(40)]
+    assert [len(step) for step in taken] == [1] * 4 + [2] * 4 + [3] * 4 + [4] * 28
+    assert {view for step in taken[:8] for view in step} == set(views)
+    drawn = [view for step in taken[8:] for view in step]  # 12 were drawn before them: a whole round
+    assert all(set(drawn[start : start + 12]) == set(views) for start in range(0, len(drawn) - 11, 12))
+
+
 def test_where_time_is_short_views_come_in_faster():
-    order = Order(tiny.cameras(12), recipe("default", 1 / 4, steps=400, views_per_step=3, time_budget_s=1.0))
+    order = Order(tiny.cameras(12), recipe("default", 1 / 4, steps=400, views_per_step=3, warm_up=0, time_budget_s=1.0))
     early, late = ({view for step in range(3) for view in order(step, progress)} for progress in (0.0, 0.25))
     assert len(early) == 3 and len(late) > 5
 
 
 def test_no_more_views_come_in_than_steps_take():
-    order = Order(tiny.cameras(9), recipe("default", 1 / 4, steps=4, views_per_step=2, gathering=0.5))
+    order = Order(tiny.cameras(9), recipe("default", 1 / 4, steps=4, views_per_step=2, gathering=0.5, warm_up=0))
     assert [len(set(order(0, 0))), len(set(order(0, 0) + order(1, 0.25)))] == [2, 4]
 
 
 def test_a_step_takes_no_view_twice_where_there_are_few():
-    order = Order(tiny.cameras(2), recipe("default", 1 / 4, steps=4, views_per_step=3, gathering=0.5))
+    order = Order(tiny.cameras(2), recipe("default", 1 / 4, steps=4, views_per_step=3, gathering=0.5, warm_up=0))
     assert [len(set(order(step, step / 4))) for step in range(4)] == [len(order(step, step / 4)) for step in range(4)] == [2, 2, 2, 2]
 
 

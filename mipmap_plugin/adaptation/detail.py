@@ -3,8 +3,8 @@
 Three things keep a zoom-in from an upsampler's faults. By frequency: up to what the base itself samples, the target is the base, by
 back-projection (Irani and Peleg 1991), so that only finer detail is the upsampler's. By pixel: where the enlarged image, shrunk, was
 not the base's, little of it counts. Between views: differences count by their size and not by their square, so that what one view
-claims and others deny is outvoted. Part of the difference is one of structure (SSIM): views that disagree by less than a pixel blur
-what is learnt from differences alone.
+claims and others deny is outvoted. Part of the difference is one of structure (SSIM) and of how strong contrasts are: views that
+disagree by less than a pixel blur what is learnt from differences alone.
 """
 
 from __future__ import annotations
@@ -28,6 +28,10 @@ ROUNDS = 3
 # Of 0..1: where the shrunk image is this far from the base's, a quarter of it is believed, and of what is far worse next to nothing.
 TRUST = 0.05
 
+# Noise has the strongest contrasts of all, and agrees with the base by chance here and there: contrasts have to be believed more firmly,
+# by this power. With 2, a network that makes nothing but noise still costs 0.2 dB against the closed form; with 3 nothing.
+SURE = 3
+
 
 class Detail:
     """The part of the loss that draws an image of the new scale towards the upsampled base; each view is enlarged once."""
@@ -47,11 +51,16 @@ class Detail:
         """The loss of `image` [H, W, 3], what the view of the base scale shows at the new one."""
         target, confidence = (tensor.to(image) for tensor in self._of(view))
         confidence = resize(confidence, view.zoomed(self._scale).size, "bilinear")
-        structure = self._config.detail_structure
+        return self._config.detail_weight * (confidence * self._difference(image, target, confidence)).mean()
+
+    def _difference(self, image: Tensor, target: Tensor, confidence: Tensor) -> Tensor:
+        """[H, W, 3]"""
+        structure, contrast = self._config.detail_structure, self._config.detail_contrast
         difference = (1 - structure) * (image - target).abs()
-        if structure:
-            difference = difference + structure * (1 - similarity(image, target))
-        return self._config.detail_weight * (confidence * difference).mean()
+        if structure == contrast == 0:
+            return difference
+        ssim, as_strong = similarity(image, target)
+        return difference + structure * (1 - ssim) + contrast * confidence**SURE * (1 - as_strong)
 
     def _of(self, view: Camera) -> tuple[Tensor, Tensor]:
         if view not in self._made:

@@ -91,7 +91,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
-    set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config))
+    set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config), run.step)
     splats = Activation(run.student, share=len(views) > 1)
     before: Tensor | float = 0.0  # the gradient of the means from the views before this one
     for view in views:
@@ -120,10 +120,12 @@ def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     before = run.student.parameters()["means"]
     if run.gradients is not None and config.densify_gradient is not None:
         shown = run.student.gaussians(task.views[0]).detach()
-        room = task.most_splats - len(before)
-        grown = density.strongest(run.gradients.mean(), config.densify_gradient, room)
-        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
-        density.densify(run.student, run.optimizer, grown, extent(task.views), shown, generator)
+        grown = density.strongest(run.gradients.mean(), config.densify_gradient, task.most_splats - len(before))
+        if config.densify_keeps_image:
+            density.halve(run.student, run.optimizer, grown, shown)
+        else:
+            generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
+            density.clone_and_split(run.student, run.optimizer, grown, extent(task.views), shown, generator)
     density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
     means = run.student.parameters()["means"]
     run.gradients = density.ScreenGradients.of(means, config)

@@ -25,11 +25,15 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torc
     return torch.optim.Adam(groups, betas=config.betas, eps=ADAM_EPS, fused=True)
 
 
-def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float) -> None:
-    """Each rate at `progress` (0..1) of its fall, which is half a cosine (Loshchilov and Hutter 2017, SGDR, equation 5)."""
+def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float, step: int) -> None:
+    """Each rate at `progress` (0..1) of its fall, which is half a cosine (Loshchilov and Hutter 2017, SGDR, equation 5).
+
+    Bands above 0 first rise to it: what a direction shows is not known before many views were seen.
+    """
     share = config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2
     for group in optimizer.param_groups:
-        group["lr"] = group["base_lr"] * share
+        risen = min(1.0, (step + 1) / config.warm_up) if config.warm_up and group["name"] == "shN" else 1.0
+        group["lr"] = group["base_lr"] * share * risen
 
 
 def change_rows(

@@ -24,8 +24,8 @@ class Order:
     """Which views each step takes. Remembers nothing, so that a run can be resumed at any."""
 
     def __init__(self, views: Sequence[Camera], config: AdaptConfig) -> None:
-        self._rounds, self._each = Rounds(views, config.seed), min(config.views_per_step, len(views))
-        self._seed, self._steps = config.seed, config.steps
+        self._rounds, self._seed, self._steps = Rounds(views, config.seed), config.seed, config.steps
+        self._most, self._warm_up = min(config.views_per_step, len(views)), config.warm_up
         self._gathering = math.ceil(config.gathering * config.steps)
 
     def __call__(self, step: int, progress: float) -> list[Camera]:
@@ -33,18 +33,28 @@ class Order:
 
         progress: 0..1, how much of the run is over; more than the steps tell where time is short.
         """
-        pace = max(step, int(progress * self._steps))
+        pace, each = max(step, int(progress * self._steps)), self._each(step)
         if pace >= self._gathering:
-            return [self._rounds(step * self._each + nth) for nth in range(self._each)]
+            first = self._drawn(step)
+            return [self._rounds(first + nth) for nth in range(each)]
         before, known = self._known(pace - 1), self._known(pace)
+        new = range(before, min(known, before + each))
         generator = torch.Generator().manual_seed(self._seed * 1_000_003 + step)
-        again = torch.randperm(before, generator=generator)[: self._each - (known - before)].tolist()
-        return [self._rounds(place) for place in (*range(before, known), *again)]
+        again = torch.randperm(before, generator=generator)[: each - len(new)].tolist()
+        return [self._rounds(place) for place in (*new, *again)]
+
+    def _each(self, step: int) -> int:
+        """How many views a step takes: few at first, when any of them tells where to go."""
+        return self._most if step >= self._warm_up else math.ceil(self._most * (step + 1) / self._warm_up)
+
+    def _drawn(self, step: int) -> int:
+        """How many the steps before took."""
+        return sum(self._each(before) for before in range(min(step, self._warm_up))) + max(0, step - self._warm_up) * self._most
 
     def _known(self, step: int) -> int:
         """How many views have come in with a step: evenly over the steps of gathering, at least one and no more in a step than it takes."""
-        come = max(self._each, step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
-        return min(come, self._each * (step + 1), len(self._rounds.views))
+        come = max(self._each(0), step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
+        return min(come, self._drawn(step + 1), len(self._rounds.views))
 
 
 class Rounds:
