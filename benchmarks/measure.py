@@ -108,6 +108,7 @@ def measure_scaling(backend: str, file: Path, runs: int) -> Scaling:
     near, far = get_context("spawn").Pipe()
     neighbor = get_context("spawn").Process(target=_neighbor, args=(backend, file, far), daemon=True)
     neighbor.start()
+    far.close()  # else nobody would hear of its end
 
     def beside() -> None:
         near.send("go")

@@ -13,6 +13,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 import tyro
 
@@ -60,7 +61,8 @@ def main(
 def kept(file: Path, measured: Sequence[Recipe]) -> list[Row]:
     """The rows of an earlier run that are not measured again."""
     rows = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    return [row for row in rows if "," in row.name and not row.name.startswith(tuple(measured))]
+    made_by = set(get_args(Recipe)) - set(measured)
+    return [row for row in rows if row.name.split(",")[0] in made_by]
 
 
 if __name__ == "__main__":

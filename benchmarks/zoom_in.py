@@ -29,8 +29,8 @@ transformers, realesr-animevideov3.pth is a GAN that is worse in dB than bicubic
 no splat touched. Seconds on one thread of a shared machine, those to enlarge the views among them (about 1 s a view with a transformer,
 and an empty cache). The ms of the first row hold the compilation of the backend.
 
-`thorough` clones and splits splats to the end, which is what LPIPS asks for. The seconds of both were measured
-from an empty cache; run one after the other, `thorough` finds half of its images there.
+`thorough` clones and splits splats to the end and asks for contrasts as strong as the network's, which is what LPIPS asks for. It runs
+after `default`, and finds half of its images in the cache.
 """
 
 

@@ -64,7 +64,7 @@ class AdaptConfig(BaseModel):
     decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's: how long it remembers gradients and their squares.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
-    warm_up: int = Field(0, ge=0, description="Steps over which views per step rise from one, and the rate of bands above 0 from nothing.")
+    warm_up: int = Field(0, ge=0, description="Steps over which views per step and the rate of bands above 0 rise, in a short run as in a long one.")
     gathering: float = Field(0.0, ge=0, le=1, description="Share of the run over which new views come in: each costs a render of the base.")
     prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")

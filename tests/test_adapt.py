@@ -28,7 +28,7 @@ from mipmap_plugin.wrap import Interrupted, wrap_model
 WHITE = (1.0, 1.0, 1.0)
 
 # A few steps in which everything happens: both ways to choose views, two views a step, points of the curve, and splats that are dropped.
-BRIEF = dict(steps=7, views_per_step=2, merge_to=1.0, extra_views=2, check_every=2, prune_every=3, min_opacity=0.4, patience=None)
+BRIEF = dict(steps=7, views_per_step=2, merge_to=1.0, extra_views=2, check_every=2, prune_every=3, min_opacity=0.4, patience=None, warm_up=0)
 BRIEF_PAPER = dict(steps=7, check_every=2, prune_every=3, densify_gradient=1e-9)
 
 

@@ -207,6 +207,12 @@ def test_a_step_takes_no_view_twice_where_there_are_few():
     assert [len(set(order(step, step / 4))) for step in range(4)] == [len(order(step, step / 4)) for step in range(4)] == [2, 2, 2, 2]
 
 
+def test_steps_and_rounds_meet_again_after_the_warm_up():
+    views = tiny.cameras(4)
+    order = Order(views, recipe("default", 1 / 4, steps=400, views_per_step=4, gathering=0.1, warm_up=10))
+    assert all(set(order(step, step / 400)) == set(views) for step in range(40, 60))
+
+
 def test_the_extent_is_inrias_and_one_for_a_single_place():
     views = tiny.cameras(4)
     centers = torch.stack([view.center for view in views])

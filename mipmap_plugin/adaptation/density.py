@@ -82,7 +82,7 @@ def clone_and_split(
     """Clone the small and split the large among the rows where `grown` [N] is True. `shown`: the model's activated splats.
 
     Works on families whose parameters are a plain splat's (means, log scales and the rest by row); anchors, which never move,
-    have no gradient to grow by.
+    have no gradient to grow by, and so never get here.
     """
     large = shown.scales.max(dim=1).values > SPLIT_EXTENT * extent
     split, clone = (grown & large).nonzero()[:, 0], (grown & ~large).nonzero()[:, 0]
@@ -99,24 +99,26 @@ def clone_and_split(
 def halve(model: SplatModel, optimizer: torch.optim.Adam, grown: Tensor, shown: Gaussians) -> None:
     """Split the rows where `grown` [N] is True in two along their longest axis, so that they show almost what they did.
 
-    Seen through one another, two of opacity b and size s have the light of one of opacity a and size 1 where s² (2b - b²/2) = a. Of
-    all such pairs that with b = a/2 + a²/5 is closest to it (least squares, within 5 % for any a); 3DGS-MCMC (Kheradmand et al. 2024,
-    eq. 9) keeps the center's brightness instead, and is up to 12 % away. The longest axis is shorter by what moving apart adds to the
-    variance. Works on the families that `clone_and_split` works on.
+    In one place, two of opacity b and size s have the light of one of opacity a and size 1 where s² (2b - b²/2) = a. Of all such
+    pairs that with b = a/2 + a²/5 is closest to it (least squares, within 5 % for any a); 3DGS-MCMC (Kheradmand et al. 2024, eq. 9)
+    keeps the center's brightness instead, and is up to 12 % away. Moved apart, the longest axis is shorter by what that adds to the
+    variance, and the opacity higher by as much. Works on the families that `clone_and_split` works on; shapes behind a 3D filter
+    shrink by less.
     """
     rows = grown.nonzero()[:, 0].repeat(2)
     opacity = shown.opacities[rows]
-    half = opacity / 2 + opacity.square() / 5
-    size = (opacity / (2 * half - half.square() / 2)).sqrt()
+    share = 1 / 2 + opacity / 5
+    size = (share * (2 - opacity * share / 2)).rsqrt()
+    shorter = math.sqrt(1 - HALF_APART**2)
     longest = torch.nn.functional.one_hot(shown.scales[rows].argmax(dim=1), 3)
-    side = torch.ones_like(half).index_fill(0, torch.arange(len(rows) // 2, device=rows.device), -1.0)
+    side = torch.ones_like(share).index_fill(0, torch.arange(len(rows) // 2, device=rows.device), -1.0)
     offsets = shown.scales[rows] * longest * (HALF_APART * side)[:, None]
 
     def shape(name: str, new: Tensor) -> None:
         if name == "scales":
-            new += (size.log()[:, None] + longest * math.log(1 - HALF_APART**2) / 2)[:, : new.shape[1]]
+            new += size.log()[:, None] + longest * math.log(shorter)
         if name == "opacities":
-            new.copy_((new.sigmoid() * (half / opacity).view_as(new)).logit())
+            new.copy_((new.sigmoid() * share / shorter).logit())
 
     _grow(model, optimizer, ~grown, rows, shown, offsets, shape)
 

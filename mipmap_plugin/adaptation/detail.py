@@ -28,8 +28,9 @@ ROUNDS = 3
 # Of 0..1: where the shrunk image is this far from the base's, a quarter of it is believed, and of what is far worse next to nothing.
 TRUST = 0.05
 
-# Noise has the strongest contrasts of all, and agrees with the base by chance here and there: contrasts have to be believed more firmly,
-# by this power. With 2, a network that makes nothing but noise still costs 0.2 dB against the closed form; with 3 nothing.
+# Noise has the strongest contrasts of all, and agrees with the base by chance here and there: contrasts have to be believed more
+# firmly, by this power beside the one that all counts by. With 2, a network that makes nothing but noise still costs 0.2 dB against
+# the closed form; with 3 nothing.
 SURE = 3
 
 

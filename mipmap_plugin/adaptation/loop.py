@@ -119,17 +119,22 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
 def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     before = run.student.parameters()["means"]
     if run.gradients is not None and config.densify_gradient is not None:
-        shown = run.student.gaussians(task.views[0]).detach()
         grown = density.strongest(run.gradients.mean(), config.densify_gradient, task.most_splats - len(before))
-        if config.densify_keeps_image:
-            density.halve(run.student, run.optimizer, grown, shown)
-        else:
-            generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
-            density.clone_and_split(run.student, run.optimizer, grown, extent(task.views), shown, generator)
+        if grown.any():
+            _grow(run, task, config, grown)
     density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
     means = run.student.parameters()["means"]
     run.gradients = density.ScreenGradients.of(means, config)
     run.rows_changed |= means is not before
+
+
+def _grow(run: Run, task: Task, config: AdaptConfig, grown: Tensor) -> None:
+    shown = run.student.gaussians(task.views[0]).detach()
+    if config.densify_keeps_image:
+        density.halve(run.student, run.optimizer, grown, shown)
+    else:
+        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
+        density.clone_and_split(run.student, run.optimizer, grown, extent(task.views), shown, generator)
 
 
 def _mark(run: Run, config: AdaptConfig) -> None:

@@ -45,15 +45,16 @@ class Order:
 
     def _each(self, step: int) -> int:
         """How many views a step takes: few at first, when any of them tells where to go."""
-        return self._most if step >= self._warm_up else math.ceil(self._most * (step + 1) / self._warm_up)
+        return self._most if self._warm_up <= max(0, step) else math.ceil(self._most * (step + 1) / self._warm_up)
 
     def _drawn(self, step: int) -> int:
-        """How many the steps before took."""
-        return sum(self._each(before) for before in range(min(step, self._warm_up))) + max(0, step - self._warm_up) * self._most
+        """How many the steps before took; those of the warm-up rounded up to whole steps, so that rounds and steps still meet."""
+        first = sum(self._each(before) for before in range(min(step, self._warm_up)))
+        return first if step < self._warm_up else math.ceil(first / self._most) * self._most + (step - self._warm_up) * self._most
 
     def _known(self, step: int) -> int:
         """How many views have come in with a step: evenly over the steps of gathering, at least one and no more in a step than it takes."""
-        come = max(self._each(0), step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
+        come = max(self._each(step), step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
         return min(come, self._drawn(step + 1), len(self._rounds.views))
 
 
