@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -64,7 +65,7 @@ class AdaptConfig(BaseModel):
     decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's: how long it remembers gradients and their squares.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
-    warm_up: int = Field(0, ge=0, description="Steps over which views per step and the rate of bands above 0 rise, in a short run as in a long one.")
+    warm_up: float = Field(0.0, ge=0, le=1, description="Share of the steps over which views per step and the rate of bands above 0 rise.")
     gathering: float = Field(0.0, ge=0, le=1, description="Share of the run over which new views come in: each costs a render of the base.")
     prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")
@@ -72,6 +73,10 @@ class AdaptConfig(BaseModel):
     densify_keeps_image: bool = Field(False, description="Split splats into two that show almost what one did, instead of the published clones.")
     most_growth: float | None = Field(None, ge=1, description="How many times its splats densifying may leave at most; None: no end.")
     reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
+
+    @property
+    def warm_up_steps(self) -> int:
+        return math.ceil(self.warm_up * self.steps)
 
 
 # The published code (renaissanceee/Mipmap-GS): every quirk a named setting. Its centres never move, because its loader leaves the
@@ -90,13 +95,13 @@ _INSTANT = dict(steps=0)
 # knee to stop at before they have fallen. The first steps need few views to know where to go, and too many to know what a direction
 # shows: warming up, a tenth of `paper`'s time has 0.8 dB more (lego at x1/2 and x1/4), and the end is the same.
 _DEFAULT_OUT = dict(
-    steps=400, decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=4, gathering=0.5, warm_up=100, extra_views=200,
+    steps=400, decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=4, gathering=0.5, warm_up=0.25, extra_views=200,
     rates=LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4),
 )  # fmt: skip
 
 # What more time buys at zoom-out: twice the steps, twice the views in each, five times the views. At zoom-in there is nothing to buy
 # without a network.
-_THOROUGH_OUT = dict(_DEFAULT_OUT, steps=800, views_per_step=8, extra_views=1000)
+_THOROUGH_OUT = dict(_DEFAULT_OUT, steps=800, views_per_step=8, warm_up=0.125, extra_views=1000)
 
 # Of a zoom-out's splats, times the scale: at x1/8 a tenth is left.
 MERGE_TO = 0.8

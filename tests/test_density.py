@@ -274,7 +274,7 @@ def test_rates_fall_to_their_share_and_the_means_are_in_pixels(student):
 
 
 def test_bands_above_the_first_rise_to_their_rate(student):
-    config = AdaptConfig(warm_up=4, rates=LearningRates(sh0=0.5, shN=0.2))
+    config = AdaptConfig(steps=16, warm_up=0.25, rates=LearningRates(sh0=0.5, shN=0.2))
     adam = make_optimizer(student, config, pixel=1.0)
     told = []
     for step in (0, 1, 3, 9):

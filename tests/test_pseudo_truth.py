@@ -182,7 +182,7 @@ def test_views_are_gathered_evenly_and_then_come_in_rounds():
 
 
 def test_a_step_takes_few_views_at_first_and_later_rounds_miss_none():
-    views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=40, views_per_step=4, gathering=0.2, warm_up=16)
+    views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=40, views_per_step=4, gathering=0.2, warm_up=0.4)
     order = Order(views, config)
     taken = [order(step, step / 40) for step in range(40)]
     assert [len(step) for step in taken] == [1] * 4 + [2] * 4 + [3] * 4 + [4] * 28
@@ -209,7 +209,7 @@ def test_a_step_takes_no_view_twice_where_there_are_few():
 
 def test_steps_and_rounds_meet_again_after_the_warm_up():
     views = tiny.cameras(4)
-    order = Order(views, recipe("default", 1 / 4, steps=400, views_per_step=4, gathering=0.1, warm_up=10))
+    order = Order(views, recipe("default", 1 / 4, steps=400, views_per_step=4, gathering=0.1, warm_up=0.025))
     assert all(set(order(step, step / 400)) == set(views) for step in range(40, 60))
 
 

@@ -32,7 +32,7 @@ def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float,
     """
     share = config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2
     for group in optimizer.param_groups:
-        risen = min(1.0, (step + 1) / config.warm_up) if config.warm_up and group["name"] == "shN" else 1.0
+        risen = min(1.0, (step + 1) / max(1, config.warm_up_steps)) if group["name"] == "shN" else 1.0
         group["lr"] = group["base_lr"] * share * risen
 
 

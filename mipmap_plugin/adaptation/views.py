@@ -25,7 +25,7 @@ class Order:
 
     def __init__(self, views: Sequence[Camera], config: AdaptConfig) -> None:
         self._rounds, self._seed, self._steps = Rounds(views, config.seed), config.seed, config.steps
-        self._most, self._warm_up = min(config.views_per_step, len(views)), config.warm_up
+        self._most, self._warm_up = min(config.views_per_step, len(views)), config.warm_up_steps
         self._gathering = math.ceil(config.gathering * config.steps)
 
     def __call__(self, step: int, progress: float) -> list[Camera]:

@@ -180,7 +180,8 @@ def counted(self, *scene):
         os.kill(os.getpid(), signal.SIGKILL)
     return render(self, *scene)
 ReferenceBackend.render = counted
-wrap_model(tiny.model(20), cameras=tiny.cameras(3), backend="reference").adapt(1 / 4, steps=6, extra_views=2, views_per_step=2, resume={state!r})
+model = wrap_model(tiny.model(20), cameras=tiny.cameras(3), backend="reference")
+model.adapt(1 / 4, steps=6, extra_views=2, views_per_step=2, warm_up=0, resume={state!r})
 """
 
 
@@ -192,7 +193,7 @@ def test_a_killed_run_goes_on_from_its_last_state_to_the_same_bytes(tmp_path):
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     model = wrap_model(tiny.model(20), cameras=tiny.cameras(3), backend="reference")
     assert torch.load(state, weights_only=True)["step"] == 3
-    resumed, whole = (model.adapt(1 / 4, steps=6, extra_views=2, views_per_step=2, resume=path) for path in (state, None))
+    resumed, whole = (model.adapt(1 / 4, steps=6, extra_views=2, views_per_step=2, warm_up=0, resume=path) for path in (state, None))
     saved = [each.save(tmp_path / f"{i}.ply").read_bytes() for i, each in enumerate((resumed, whole))]
     assert saved[0] == saved[1] and not state.exists()
 
