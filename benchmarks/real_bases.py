@@ -15,7 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import torch
 import tyro
+from pages import write_page
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.config import Recipe
@@ -25,6 +27,10 @@ from mipmap_plugin.files import write_json
 
 # The scales that each base was trained for the study of; see its own page.
 SCALES = {"lego_200": (1, 1 / 2, 1 / 4, 1 / 8), "chair_400": (1, 1 / 2, 1 / 4, 1 / 8), "lego_100": (1, 2, 4, 8), "chair_100": (1, 2, 4, 8)}
+INTRO = """# Real bases against real test images
+
+Made by `python benchmarks/real_bases.py DATA`. Protocol P3, mean of 25 test views; seconds on one thread of a shared machine.
+"""
 RECIPES: tuple[Recipe, ...] = ("instant", "paper", "default")
 
 
@@ -44,6 +50,7 @@ def main(
         recipe: Which recipes; all by default, at zoom-out `thorough` among them.
         backend: A backend's name.
     """
+    torch.set_num_threads(1)
     for base in only or SCALES:
         recipes = recipe or (RECIPES if max(SCALES[base]) > 1 else (*RECIPES, "thorough"))
         wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
@@ -52,10 +59,7 @@ def main(
         rows.sort(key=lambda row: (abs(math.log2(row.scale)), "," in row.name))
         write_json(output / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)
-    parts = [f"## {file.stem}\n\n{table([Row(**row) for row in json.loads(file.read_text())])}\n" for file in sorted(output.glob("*_[0-9]*.json"))]
-    intro = "# Real bases against real test images\n\nMade by `python benchmarks/real_bases.py DATA`. "
-    intro += "Protocol P3, mean of 25 test views; seconds on one thread of a shared machine.\n\n"
-    (output / "real_bases.md").write_text(intro + "\n".join(parts))
+    write_page(output / "real_bases.md", INTRO, output.glob("*_[0-9]*.json"))
 
 
 def kept(file: Path, measured: Sequence[Recipe]) -> list[Row]:

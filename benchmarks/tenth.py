@@ -8,10 +8,11 @@ test views are held out from both. Writes tenth/<base>.json for each base, and t
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
+import torch
 import tyro
+from pages import write_page
 from real_bases import SCALES
 
 from mipmap_plugin import load_scene, wrap_model
@@ -52,6 +53,7 @@ def main(
         only: Which bases; all by default.
         views: How many of the test views are judged.
     """
+    torch.set_num_threads(1)
     for base in only or SCALES:
         model = wrap_model(data / "checkpoints" / "bases" / base)
         judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras[0], model.background)[:views]
@@ -59,9 +61,7 @@ def main(
         rows = [row for scale in SCALES[base] if scale != 1 for row in rows_of(model, judge, scale)]
         write_json(output / "tenth" / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)
-    measured = {file.stem: json.loads(file.read_text()) for file in sorted(output.glob("tenth/*.json"))}
-    parts = [f"## {base}\n\n{table([Row(**row) for row in rows])}\n" for base, rows in measured.items()]
-    (output / "tenth.md").write_text("\n".join([INTRO, *parts]))
+    write_page(output / "tenth.md", INTRO, output.glob("tenth/*.json"))
 
 
 if __name__ == "__main__":

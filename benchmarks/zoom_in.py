@@ -8,11 +8,12 @@ spandrel loads) and `lpips/alexnet_features_fp16.pth`. Writes zoom_in/<base>.jso
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
+import torch
 import tyro
+from pages import write_page
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
@@ -75,6 +76,7 @@ def main(
         steps: Steps with a network, instead of the recipe's.
         views: How many of the test views are judged.
     """
+    torch.set_num_threads(1)
     perceptual = Perceptual("alex", data / "lpips" / "alexnet_features_fp16.pth")
     for base in only or ("lego_100", "chair_100"):
         model = wrap_model(data / "checkpoints" / "bases" / base)
@@ -85,9 +87,7 @@ def main(
             rows += rows_of(model, judge, each, [data / "upsamplers" / name for name in NETWORKS[each]], steps)
         write_json(output / "zoom_in" / f"{base}.json", records(rows), overwrite=True)
         print(f"{table(rows)}\n", flush=True)
-    measured = {file.stem: json.loads(file.read_text()) for file in sorted(output.glob("zoom_in/*.json"))}
-    parts = [f"## {base}\n\n{table([Row(**row) for row in rows])}\n" for base, rows in measured.items()]
-    (output / "zoom_in.md").write_text("\n".join([INTRO, *parts]))
+    write_page(output / "zoom_in.md", INTRO, output.glob("zoom_in/*.json"))
 
 
 if __name__ == "__main__":

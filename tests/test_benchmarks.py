@@ -15,6 +15,8 @@ sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names
 from ablations import ABLATIONS  # noqa: E402
 from backends import facts, joined  # noqa: E402
 from measure import Scaling, Speed, Spread, Timing  # noqa: E402
+from pages import write_page  # noqa: E402
+from real_bases import kept  # noqa: E402
 from scenes import make  # noqa: E402
 from tables import Row, Rows  # noqa: E402
 from workloads import Size, activated, count_pairs, effects_of, from_scene  # noqa: E402
@@ -22,6 +24,8 @@ from workloads import Size, activated, count_pairs, effects_of, from_scene  # no
 from mipmap_plugin.backends import get_backend  # noqa: E402
 from mipmap_plugin.backends.projection import project  # noqa: E402
 from mipmap_plugin.config import recipe as make_config  # noqa: E402
+from mipmap_plugin.evaluation.evaluate import Row as Judged  # noqa: E402
+from mipmap_plugin.evaluation.report import records  # noqa: E402
 from mipmap_plugin.files import write_json  # noqa: E402
 
 
@@ -95,3 +99,22 @@ def test_a_measurement_in_pieces_keeps_the_others(tmp_path):
     rows, sizes = joined(tmp_path / "facts.json", fresh, [one.size for one in fresh])
     assert rows == [fresh[0], older[1], fresh[1], older[2]]
     assert [size.name for size in sizes] == ["A", "B", "lego"]
+
+
+def judged(name: str) -> Judged:
+    return Judged(name, 0.5, "P3", 30.0, None, 1.0, 2.0, 100)
+
+
+def test_rows_of_recipes_that_are_not_measured_again_are_kept_and_no_others(tmp_path):
+    names = ["base", "window", "window, 2 x 2 samples", "paper, held out", "default, scored", "thorough, held out"]
+    write_json(tmp_path / "lego.json", records([judged(name) for name in names]), overwrite=True)
+    assert [row.name for row in kept(tmp_path / "lego.json", ("default",))] == ["paper, held out", "thorough, held out"]
+    assert kept(tmp_path / "chair.json", ("default",)) == []
+
+
+def test_a_page_has_every_base_under_its_name(tmp_path):
+    for base, name in (("lego", "paper"), ("chair", "default")):
+        write_json(tmp_path / f"{base}.json", records([judged(name)]), overwrite=True)
+    write_page(tmp_path / "page.md", "# What\n", tmp_path.glob("*.json"))
+    intro, chair, lego = (tmp_path / "page.md").read_text().split("## ")
+    assert intro == "# What\n\n" and "default" in chair.removeprefix("chair\n") and "paper" in lego.removeprefix("lego\n")

@@ -21,7 +21,7 @@ SPLIT_EXTENT = 0.01
 SPLIT_SHRINK = 1.6
 
 # Of a splat's halves: how far they lie on either side of it along its longest axis, in standard deviations. The further, the sooner
-# they part, but the more the image changes: splitting all of flowers' splats leaves 39 dB at 0, 34 at 0.3, 31 at 0.5, 26 at 0.75.
+# they part, but the more the image changes: splitting all of flowers' splats leaves 39 dB at 0, 34 at 0.3, 31 at 0.5, 20 at 0.75.
 HALF_APART = 0.3
 
 # What an opacity reset leaves at most.
