@@ -71,6 +71,7 @@ class AdaptConfig(BaseModel):
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")
     densify_gradient: float | None = Field(None, gt=0, description="Screen gradient, NDC units, above which a splat is cloned or split; None: never.")
     densify_keeps_image: bool = Field(False, description="Split splats into two that show almost what one did, instead of the published clones.")
+    densify_on_trial: bool = Field(False, description="Undo growth that leaves views farther from the base than the closed form did.")
     most_growth: float | None = Field(None, ge=1, description="How many times its splats densifying may leave at most; None: no end.")
     reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
 
@@ -96,15 +97,20 @@ _INSTANT = dict(steps=0)
 # shows: warming up, a tenth of `paper`'s time has 0.8 dB more (lego at x1/2 and x1/4), and the end is the same.
 _DEFAULT_OUT = dict(
     steps=400, decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=4, gathering=0.5, warm_up=0.25, extra_views=200,
-    rates=LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4),
 )  # fmt: skip
+_RATES_OUT = LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4)
 
 # What more time buys at zoom-out: twice the steps, twice the views in each, five times the views. At zoom-in there is nothing to buy
 # without a network.
 _THOROUGH_OUT = dict(_DEFAULT_OUT, steps=800, views_per_step=8, warm_up=0.125, extra_views=1000)
 
-# Of a zoom-out's splats, times the scale: at x1/8 a tenth is left.
+# Of a zoom-out's splats, times the scale: at x1/8 a tenth is left, at x1/4 a fifth. Nearer to the base, where fewer share a pixel, twice
+# the scale's square: half at x1/2.
 MERGE_TO = 0.8
+
+# Share of the base scale below which rates are whole. Nearer to the base there is less to learn, and steps are shorter by as much: at x1/2
+# a tenth of `paper`'s time has 0.4 dB more with half the rates (chair; lego 0.3), and the end is the same.
+WHOLE_RATES = 0.25
 
 # Towards a bicubic or Lanczos target every step loses real dB against the closed form: the target knows nothing that the
 # base does not, and adds the kernel's ringing. So the image is shrunk and compared with the base itself, at gentle rates. Centers
@@ -127,7 +133,8 @@ _DEFAULT_UPSAMPLED = dict(
 # from the base (36 with `densify_keeps_image`), where the closed form has 39 and `default` 42.
 _THOROUGH_UPSAMPLED = dict(
     steps=400, compare_at="both", resize="pil-bicubic", views="train", upsampled_views=100, detail_weight=1.0,
-    detail_structure=0.4, detail_contrast=3.2, views_per_step=4, densify_gradient=1e-4, most_growth=8, prune_every=50, decay=0.02, betas=(0.8, 0.95),
+    detail_structure=0.4, detail_contrast=3.2, views_per_step=4, decay=0.02, betas=(0.8, 0.95),
+    densify_gradient=1e-4, densify_on_trial=True, most_growth=8, prune_every=50,
     rates=LearningRates(means=0.2, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.002, networks=5e-4),
 )  # fmt: skip
 
@@ -135,11 +142,15 @@ _THOROUGH_UPSAMPLED = dict(
 KERNELS = frozenset({"bicubic", "lanczos"})
 
 
+def _slower(rates: LearningRates, share: float) -> LearningRates:
+    return LearningRates(**{name: share * rate for name, rate in rates.model_dump().items()})
+
+
 def recipe(name: Recipe, scale: float, **overrides: Any) -> AdaptConfig:
     """The settings of a recipe at `scale`, with `overrides`. Raises SettingsError for an unknown name or a value out of range."""
-    merging = {"merge_to": min(1.0, MERGE_TO * scale)}
     if scale < 1:
-        default, thorough = _DEFAULT_OUT | merging, _THOROUGH_OUT | merging
+        fitted = {"merge_to": min(1.0, scale * max(MERGE_TO, 2 * scale)), "rates": _slower(_RATES_OUT, min(1.0, WHOLE_RATES / scale))}
+        default, thorough = _DEFAULT_OUT | fitted, _THOROUGH_OUT | fitted
     elif overrides.get("upsampler", "bicubic") in KERNELS:
         default = thorough = _DEFAULT_IN
     else:

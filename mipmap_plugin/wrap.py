@@ -129,7 +129,7 @@ class Wrapped:
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = real.cameras if real else self.cameras
-        backend, why = self.backend(gradients=config.steps > 0)
+        backend, why = self.backend(gradients=config.steps > 0 or config.merge_to < 1)
         base = Base(self.model, self.effects(), self.trained.keeps_filter, backend, why)
         return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
 

@@ -6,7 +6,17 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.density import HALF_APART, SPLIT_SHRINK, ScreenGradients, clone_and_split, halve, prune, reset_opacities, strongest
+from mipmap_plugin.adaptation.density import (
+    HALF_APART,
+    SPLIT_SHRINK,
+    ScreenGradients,
+    clone_and_split,
+    halve,
+    prune,
+    put_back,
+    reset_opacities,
+    strongest,
+)
 from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.loop import adapt as optimise
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
@@ -123,6 +133,14 @@ def test_the_halves_of_a_flat_splat_stay_in_its_plane():
     grow(student, make_optimizer(student, AdaptConfig(), 1.0), torch.tensor([True]), extent=1e-6)
     means = student.gaussians().means.detach()
     assert (means[:, 1].abs() < 1e-6).all() and (means[:, [0, 2]].abs() > 1e-3).all()
+
+
+def test_what_is_put_back_is_as_it_was_bit_by_bit_and_starts_anew(student, optimizer):
+    before = {name: tensor.detach().clone() for name, tensor in student.parameters().items()}
+    grow(student, optimizer, mask(1, 3), extent=1e6)
+    put_back(student, optimizer, before)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in student.parameters().items())
+    assert moments(student, optimizer) == [0] * COUNT
 
 
 def test_large_and_small_together(student, optimizer):

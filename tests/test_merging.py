@@ -1,4 +1,4 @@
-"""Merging: what a group becomes has its weight, mean and covariance, and only like splats that share pixels are grouped."""
+"""Merging: what a pair becomes has its weight, mean and covariance, and only like splats that share pixels are paired."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import torch
 from tiny import cameras
 from tiny import model as tiny_model
 
-from mipmap_plugin.adaptation.merging import LARGEST_CELL, merge
+from mipmap_plugin.adaptation.merging import FARTHEST, merge
 from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.config import recipe
 from mipmap_plugin.errors import SettingsError
@@ -29,58 +29,95 @@ def covariances(gaussians: Gaussians) -> torch.Tensor:
     return axes @ axes.mT
 
 
-def test_a_group_becomes_its_weight_mean_and_covariance():
+def merged(gaussians: Gaussians, share: float, pixel: float = 1.0, light: torch.Tensor | None = None) -> Gaussians:
+    """All splats show as much, if nothing else is said."""
+    ones = torch.ones(len(gaussians))
+    return merge(gaussians, pixel * ones, 0.01 * ones if light is None else light, share)
+
+
+def test_a_pair_becomes_its_weight_mean_and_covariance():
     pair = cloud(2)
     pair = replace(pair, means=torch.tensor([[0.1, 0.1, 0.1], [0.12, 0.1, 0.1]]), scales=torch.full((2, 3), 0.01), opacities=torch.tensor([0.3, 0.1]))
     pair.sh[1] = 0.32
-    one = merge(pair, torch.ones(2), 0.5)
+    one = merged(pair, 0.5, light=torch.tensor([0.3, 0.1]))
     torch.testing.assert_close(one.means, torch.tensor([[0.105, 0.1, 0.1]]))  # weighed 3 : 1
     torch.testing.assert_close(one.sh, torch.full((1, 4, 3), 0.305))
     spread = 0.25 * 0.75 * 0.02**2
     torch.testing.assert_close(covariances(one)[0], torch.diag(torch.tensor([1e-4 + spread, 1e-4, 1e-4])))
-    assert 0.3 < one.opacities[0] < 0.4  # the light of both over a surface a little larger
 
 
-def test_a_splat_that_is_alone_stays_what_it_is():
+def test_optical_depth_times_surface_stays():
+    pair = cloud(2)
+    pair = replace(pair, means=torch.full((2, 3), 0.1), scales=torch.full((2, 3), 0.01), opacities=torch.tensor([0.3, 0.6]))
+    torch.testing.assert_close(merged(pair, 0.5).opacities, torch.tensor([1 - 0.7 * 0.4]))  # one behind the other, of the same shape
+
+
+def test_a_splat_that_is_alone_stays_what_it_is_bit_by_bit():
     lonely = cloud(20)
     lonely = replace(lonely, means=lonely.means * 1000)
-    same = merge(lonely, torch.ones(20), 0.5)
-    order = torch.cdist(lonely.means, same.means).argmin(dim=1)
-    torch.testing.assert_close(covariances(same)[order], covariances(lonely))
-    torch.testing.assert_close(same.opacities[order], lonely.opacities)
+    same = merged(lonely, 0.5)
+    assert same is lonely
+
+
+def test_splats_beside_a_merged_pair_stay_what_they_are_bit_by_bit():
+    some = cloud(20)
+    some = replace(some, means=some.means * 1000)
+    some.means[1] = some.means[0]
+    left = merged(some, 0.5)
+    assert len(left) == 19
+    assert torch.equal(left.scales[:-1], some.scales[2:])
+    assert torch.equal(left.opacities[:-1], some.opacities[2:])
 
 
 @pytest.mark.parametrize("share", [0.5, 0.2, 0.1])
 def test_as_many_are_left_as_were_asked_for(share):
-    assert 0.5 * share < len(merge(cloud(2000), torch.full((2000,), 0.2), share)) / 2000 <= share
+    assert len(merged(cloud(2000), share, pixel=0.2)) == round(share * 2000)
 
 
-def test_cells_do_not_grow_without_end():
-    left = merge(cloud(2000), torch.full((2000,), 0.25 / LARGEST_CELL), 0.001)
-    assert len(left) == 4**3
+def test_what_shows_much_stays_and_what_shows_little_goes():
+    some = cloud(200)
+    light = torch.full((200,), 1e-4)
+    light[:100] = 1.0
+    left = merged(some, 0.6, light=light)
+    assert torch.cdist(some.means[:100], left.means).amin(dim=1).max() < 0.01  # none has moved by more than a faint one can
+
+
+def test_a_pair_that_costs_too_much_stays_two():
+    close = replace(cloud(2), means=torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
+    assert len(merged(close, 0.5, light=torch.full((2,), 0.4))) == 1  # 0.4 * 0.4 / 0.8 px of light, 2 px apart: 0.8
+    assert len(merged(close, 0.5, light=torch.full((2,), 0.6))) == 2
+
+
+def test_splats_that_are_far_apart_stay_two():
+    far = replace(cloud(2), means=torch.tensor([[0.0, 0.0, 0.0], [1.01 * FARTHEST, 0.0, 0.0]]))
+    assert len(merged(far, 0.5)) == 2
 
 
 def test_unlike_colors_stay_apart():
     mixed = cloud(100)
     mixed.sh[50:, 0] = -0.3
-    assert len(merge(mixed, torch.ones(100), 0.01)) == 2
+    left = merged(mixed, 0.01)
+    assert len(left) == 2
+    assert left.sh[:, 0].unique().numel() == 2
 
 
-def test_splats_larger_than_their_cell_stay_alone():
-    large = replace(cloud(50), scales=torch.full((50, 3), 10.0))
-    assert len(merge(large, torch.ones(50), 0.1)) == 50
+def test_the_world_may_lie_far_from_its_origin():
+    there = cloud(2000)
+    there = replace(there, means=there.means.double().add(1e5).float())  # as georeferenced scenes do; a hundredth of a unit is left of their places
+    assert len(merged(there, 0.2, pixel=0.2)) == 400
 
 
 @pytest.mark.parametrize("degenerate", [0.0, 1e-30, 1e4])
 def test_scales_of_any_size_give_finite_splats(degenerate):
     odd = cloud(30)
     odd.scales[::2, 0] = degenerate
-    merged = merge(odd, torch.ones(30), 0.1)
-    assert all(field.isfinite().all() for field in (merged.means, merged.quats, merged.scales, merged.opacities, merged.sh))
+    left = merged(odd, 0.1)
+    assert all(field.isfinite().all() for field in (left.means, left.quats, left.scales, left.opacities, left.sh))
 
 
 def test_the_default_recipe_merges_for_zoom_out_only():
-    assert recipe("default", 1 / 4).merge_to == pytest.approx(0.2)
+    assert [recipe("default", scale).merge_to for scale in (1 / 2, 1 / 4, 1 / 8)] == pytest.approx([0.5, 0.2, 0.1])
+    assert recipe("default", 0.9).merge_to == 1
     assert recipe("default", 4).merge_to == 1
 
 

@@ -10,7 +10,7 @@ from mipmap_plugin.adaptation import views as views_module
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
-from mipmap_plugin.adaptation.views import Order, Rounds, choose_views, extent
+from mipmap_plugin.adaptation.views import Order, Rounds, choose_views, evenly, extent
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import AdaptConfig, recipe
 from mipmap_plugin.effects import Effects
@@ -165,6 +165,12 @@ def test_rounds_show_every_view_once_and_start_anywhere():
     assert drawn[:5] != drawn[5:10]
     assert [Rounds(views, seed=2)(draw) for draw in range(15)] == drawn
     assert [Rounds(views, seed=3)(draw) for draw in range(15)] != drawn
+
+
+def test_views_are_spread_over_their_order():
+    views = tiny.cameras(7)
+    assert evenly(views, 3) == [views[0], views[2], views[4]]
+    assert evenly(views, 7) == views and evenly(views, 100) == views
 
 
 def test_views_are_gathered_evenly_and_then_come_in_rounds():

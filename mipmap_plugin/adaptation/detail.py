@@ -83,8 +83,3 @@ class Detail:
     def _lacking(self, enlarged: Tensor, base: Tensor) -> Tensor:
         """What the enlarged image, shrunk, is short of the base's image [h, w, 3]."""
         return base - resize(enlarged, (base.shape[0], base.shape[1]), self._config.resize)
-
-
-def evenly(views: Sequence[Camera], most: int) -> list[Camera]:
-    """At most `most` of the views, spread over their order."""
-    return [views[place * len(views) // most] for place in range(most)] if len(views) > most else list(views)

@@ -14,10 +14,11 @@ from mipmap_plugin.adaptation import density
 from mipmap_plugin.adaptation.activation import Activation
 from mipmap_plugin.adaptation.closed_form import pixel_size
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress, reason_to_stop
+from mipmap_plugin.adaptation.growing import Trial, control_density, still
 from mipmap_plugin.adaptation.interrupt import interruptible
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.views import Order, extent
+from mipmap_plugin.adaptation.resize import difference_from
+from mipmap_plugin.adaptation.views import Order
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
@@ -48,7 +49,8 @@ class Run:
     student: SplatModel
     optimizer: torch.optim.Adam
     watch: Stopwatch
-    gradients: density.ScreenGradients | None  # None: nothing is cloned or split, so nobody asks for them
+    gradients: density.ScreenGradients | None  # None: nothing is cloned or split (any more), so nobody asks for them
+    trial: Trial | None = None  # None: whatever grows stays
     step: int = 0
     curve: list[CurvePoint] = field(default_factory=list)
     square_error: Tensor | float = 0.0  # summed over the views since the last point of the curve, where the images are: no step waits for it
@@ -57,8 +59,10 @@ class Run:
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
         means = student.parameters()["means"]
-        optimizer = make_optimizer(student, config, task.pixel(means))
-        return cls(student, optimizer, Stopwatch(), density.ScreenGradients.of(means, config))
+        optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch()
+        with watch:
+            trial = Trial.begin(student, task, config) if config.densify_on_trial else None
+        return cls(student, optimizer, watch, density.ScreenGradients.of(means, config), trial)
 
 
 def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], None] = lambda run: None) -> str:
@@ -91,16 +95,14 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
-    set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config), run.step)
+    set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config), run.step, still=still(run))
     splats = Activation(run.student, share=len(views) > 1)
     before: Tensor | float = 0.0  # the gradient of the means from the views before this one
     for view in views:
         camera = cameras[view]
         target = task.truth(view)  # r(x̂): the frozen base, resized
         image = task.render(splats(camera), camera)  # x: the student at the new scale
-        # Where the truth is the base itself, it is compared with at the base's scale.
-        shrunk = image if image.shape == target.shape else resize(image, (target.shape[0], target.shape[1]), config.resize)
-        difference = shrunk - target
+        difference = difference_from(target, image, config.resize)
         loss = difference.square().mean() if config.loss == "l2" else difference.abs().mean()
         (loss if task.detail is None else loss + task.detail(view, image)).backward()
         run.square_error = run.square_error + difference.detach().square().mean().double() / len(views)
@@ -112,29 +114,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     run.optimizer.zero_grad()
     run.step += 1
     if run.step % config.prune_every == 0 and run.step < config.steps:
-        _control_density(run, task, config)
-
-
-@torch.no_grad()
-def _control_density(run: Run, task: Task, config: AdaptConfig) -> None:
-    before = run.student.parameters()["means"]
-    if run.gradients is not None and config.densify_gradient is not None:
-        grown = density.strongest(run.gradients.mean(), config.densify_gradient, task.most_splats - len(before))
-        if grown.any():
-            _grow(run, task, config, grown)
-    density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
-    means = run.student.parameters()["means"]
-    run.gradients = density.ScreenGradients.of(means, config)
-    run.rows_changed |= means is not before
-
-
-def _grow(run: Run, task: Task, config: AdaptConfig, grown: Tensor) -> None:
-    shown = run.student.gaussians(task.views[0]).detach()
-    if config.densify_keeps_image:
-        density.halve(run.student, run.optimizer, grown, shown)
-    else:
-        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
-        density.clone_and_split(run.student, run.optimizer, grown, extent(task.views), shown, generator)
+        control_density(run, task, config)
 
 
 def _mark(run: Run, config: AdaptConfig) -> None:

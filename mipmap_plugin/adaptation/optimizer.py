@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import torch
 from torch import Tensor
@@ -25,15 +25,15 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torc
     return torch.optim.Adam(groups, betas=config.betas, eps=ADAM_EPS, fused=True)
 
 
-def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float, step: int) -> None:
+def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float, step: int, still: Collection[str] = ()) -> None:
     """Each rate at `progress` (0..1) of its fall, which is half a cosine (Loshchilov and Hutter 2017, SGDR, equation 5).
 
-    Bands above 0 first rise to it: what a direction shows is not known before many views were seen.
+    Bands above 0 first rise to it: what a direction shows is not known before many views were seen. The groups in `still` stand.
     """
     share = config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2
     for group in optimizer.param_groups:
         risen = min(1.0, (step + 1) / max(1, config.warm_up_steps)) if group["name"] == "shN" else 1.0
-        group["lr"] = group["base_lr"] * share * risen
+        group["lr"] = 0.0 if group["name"] in still else group["base_lr"] * share * risen
 
 
 def change_rows(

@@ -11,6 +11,7 @@ import torch
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.density import ScreenGradients
+from mipmap_plugin.adaptation.growing import Trial
 from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.optimizer import make_optimizer
 from mipmap_plugin.config import AdaptConfig
@@ -18,7 +19,8 @@ from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.torch_file import save_torch
 
-# Seconds between two states of a long run: what a killed process loses at most. A state is about three times as large as the model.
+# Seconds between two states of a long run: what a killed process loses at most. A state is about three times as large as the model,
+# four times where that grows on trial.
 KEEP_EVERY_S = 60.0
 
 
@@ -70,6 +72,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
         "optimizer": run.optimizer.state_dict(),
         "gradients": None if run.gradients is None else (run.gradients.total, run.gradients.seen),
+        "trial": None if run.trial is None else (run.trial.least_db, run.trial.before),
     }
     save_torch(path, state, overwrite=True)
 
@@ -91,11 +94,20 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
             tensor.copy_(state["shared"][name])
     optimizer = make_optimizer(student, config, pixel=1.0)  # the state knows the rates
     optimizer.load_state_dict(state["optimizer"])
-    gradients = ScreenGradients.of(student.parameters()["means"], config)
+    gradients = ScreenGradients.of(student.parameters()["means"], config) if state["gradients"] else None
     if gradients is not None:
         gradients.total, gradients.seen = (tensor.to(device) for tensor in state["gradients"])
-    curve = [CurvePoint(**point) for point in state["curve"]]
-    return Run(student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, state["step"], curve, state["square_error"], state["rows_changed"])
+    return Run(
+        student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, _trial(state["trial"], device), state["step"],
+        [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"],
+    )  # fmt: skip
+
+
+def _trial(state: tuple[float, dict[str, torch.Tensor] | None] | None, device: torch.device) -> Trial | None:
+    if state is None:
+        return None
+    least_db, before = state
+    return Trial(least_db, before and {name: tensor.to(device) for name, tensor in before.items()})
 
 
 def _read(path: Path) -> Any:

@@ -15,14 +15,15 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.closed_form import closed_form, pixel_size
 from mipmap_plugin.adaptation.curve import CurvePoint
-from mipmap_plugin.adaptation.detail import Detail, evenly
+from mipmap_plugin.adaptation.detail import Detail
+from mipmap_plugin.adaptation.light import light
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
 from mipmap_plugin.adaptation.merging import merge
 from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
 from mipmap_plugin.adaptation.resume import Keeper
-from mipmap_plugin.adaptation.views import choose_views, with_times
+from mipmap_plugin.adaptation.views import choose_views, evenly, with_times
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
@@ -35,6 +36,9 @@ from mipmap_plugin.models.exposure import exposed
 
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
+
+# Views that tell how much of the base's images each splat makes up.
+LIT_VIEWS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +143,8 @@ class Session:
         """Fewer splats; only a family that offers `rebuild` is asked for it (`Wrapped.adapt`)."""
 
         def fewer(gaussians: Gaussians) -> Gaussians:
-            return merge(gaussians, pixel_size(gaussians.means, self.views) / self.scale, self.config.merge_to)
+            shown = light(gaussians, evenly(self.views, LIT_VIEWS), self.backend, self.trained) * self.scale**2
+            return merge(gaussians, pixel_size(gaussians.means, self.views) / self.scale, shown, self.config.merge_to)
 
         began = time.perf_counter()
         student.rebuild(fewer)  # type: ignore[attr-defined]

@@ -1,0 +1,89 @@
+"""Density control in the loop: what does nothing is dropped, and splats are added, on trial where that was asked for.
+
+A clone doubles what its splat hides. On an object the steps until the next growth make good for most of that (lego at x2: from 38 dB to
+37 after 50 steps, and 38 again after 100); in an unbounded scene, whose splats all hide each other, they do not (flowers at x2: from 43 dB
+to 18, and 32 after 350 steps). So what views show is compared with the base when the next growth is due. Where they agree with it less
+than the closed form does, the last growth is undone, and nothing is added any more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation import density
+from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.resize import difference_from
+from mipmap_plugin.adaptation.views import evenly, extent
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.models.base import SplatModel
+
+if TYPE_CHECKING:
+    from mipmap_plugin.adaptation.loop import Run, Task
+
+# Views that are asked how far they agree with the base.
+JUDGES = 8
+
+@dataclass(frozen=True)
+class Trial:
+    """What a growth is judged by, and what it is undone to."""
+
+    least_db: float  # how close the views were to the base's when the run began
+    before: dict[str, Tensor] | None = None  # the parameters before the last growth; None: nothing has grown
+
+    @classmethod
+    def begin(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Trial:
+        """Of a run that begins with `student`."""
+        return cls(_agreement(student, task, config))
+
+
+@torch.no_grad()
+def control_density(run: Run, task: Task, config: AdaptConfig) -> None:
+    """Judge the last growth, grow, and prune."""
+    means = run.student.parameters()["means"]
+    if run.trial is not None and run.trial.before is not None and _agreement(run.student, task, config) < run.trial.least_db:
+        density.put_back(run.student, run.optimizer, run.trial.before)
+        run.trial = replace(run.trial, before=None)
+        run.gradients = None
+    elif run.gradients is not None:
+        _grow(run, task, config, run.gradients.mean())
+    density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
+    before, means = means, run.student.parameters()["means"]
+    run.gradients = None if run.gradients is None else density.ScreenGradients.of(means, config)
+    run.rows_changed |= means is not before
+
+
+def still(run: Run) -> tuple[str, ...]:
+    """The parameters that do not move now. On trial, centers move to part what was cloned, and not where nothing is."""
+    return ("means",) if run.trial is not None and run.trial.before is None else ()
+
+
+def _grow(run: Run, task: Task, config: AdaptConfig, gradients: Tensor) -> None:
+    if run.trial is not None and run.trial.before is None and run.step + config.prune_every >= config.steps:
+        return  # the first would come too late to be judged
+    assert config.densify_gradient is not None
+    grown = density.strongest(gradients, config.densify_gradient, task.most_splats - len(gradients))
+    if not grown.any():
+        return
+    if run.trial is not None:
+        run.trial = replace(run.trial, before={name: tensor.detach().clone() for name, tensor in run.student.parameters().items()})
+    shown = run.student.gaussians(task.views[0]).detach()
+    if config.densify_keeps_image:
+        density.halve(run.student, run.optimizer, grown, shown)
+    else:
+        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
+        density.clone_and_split(run.student, run.optimizer, grown, extent(task.views), shown, generator)
+
+
+@torch.no_grad()
+def _agreement(student: SplatModel, task: Task, config: AdaptConfig) -> float:
+    """dB: how close some of the views are to the truth."""
+    errors = []
+    for view in evenly(task.views, JUDGES):
+        camera = view.zoomed(task.scale)
+        image = task.render(student.gaussians(camera), camera)
+        errors.append(difference_from(task.truth(view), image, config.resize).square().mean())
+    return decibel(float(torch.stack(errors).mean()))

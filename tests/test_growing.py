@@ -1,0 +1,112 @@
+"""Growing on trial: what views do not get over is undone, and was the last."""
+
+import math
+import signal
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation import growing
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.wrap import Interrupted, wrap_model
+
+# Every splat that is seen grows at steps 2, 4 and 6, if nothing forbids it.
+EAGER = dict(recipe="thorough", steps=8, prune_every=2, check_every=1, densify_gradient=1e-12, min_opacity=0.0, views_per_step=2)
+
+
+@pytest.fixture(autouse=True)
+def upsampler(monkeypatch):
+    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
+    register_upsampler("mine", lambda image, size: resize(image, size, "lanczos"), replace=True)
+
+
+@pytest.fixture
+def judged(monkeypatch):
+    """Let the views agree with the base by these dB: at the start, at each judgment; the last stays."""
+
+    def by(*agreements):
+        left = list(agreements)
+        monkeypatch.setattr(growing, "_agreement", lambda *_: left.pop(0) if len(left) > 1 else left[0])
+
+    return by
+
+
+def adapted(resume=None, observe=None, **settings):
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    return model.adapt(2, upsampler="mine", resume=resume, observe=observe, **{**EAGER, **settings})
+
+
+def counts(run) -> list[int]:
+    """How many splats there were after each step."""
+    return [point.gaussians for point in run.report.curve]
+
+
+def test_splats_grow_while_views_get_over_it(judged):
+    judged(30.0, 30.0, 31.0)
+    sizes = counts(adapted())
+    assert len(tiny.model()) == sizes[0] < sizes[1] < sizes[3] < sizes[5]
+
+
+def test_a_growth_that_views_do_not_get_over_is_undone_and_was_the_last(judged):
+    judged(30.0, 30.5, 29.0, 99.0)
+    sizes = counts(adapted())
+    assert sizes[1] < sizes[3] and sizes[5:] == [sizes[1]] * 3
+
+
+def test_centers_move_only_where_splats_are_added(judged):
+    judged(30.0)
+    for gradient, moves in ((1e-12, True), (1e9, False)):
+        start, end = (adapted(steps=steps, densify_gradient=gradient).model.parameters()["means"] for steps in (0, 8))
+        assert torch.equal(end[: len(start)], start) != moves
+
+
+def test_the_first_growth_has_to_be_judged(judged):
+    judged(30.0)
+    assert set(counts(adapted(steps=4))) == {len(tiny.model())}
+    assert counts(adapted(steps=5))[-1] > len(tiny.model())
+
+
+def test_published_growing_is_not_on_trial(monkeypatch):
+    monkeypatch.setattr(growing, "_agreement", lambda *_: pytest.fail("asked"))
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    run = model.adapt(2, recipe="paper", steps=3, prune_every=2, densify_gradient=1e-12)
+    assert run.report.gaussians_after > len(tiny.model())
+
+
+def test_agreement_at_the_start_is_that_of_the_closed_form(monkeypatch):
+    found = []
+    agreement = growing._agreement
+    monkeypatch.setattr(growing, "_agreement", lambda *given: found.append(agreement(*given)) or found[-1])
+    adapted(steps=1)
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    closed = base.adapt(2, recipe="instant")
+    errors = []
+    for view in tiny.cameras(6):
+        truth = base.render(view).image.clamp(0, 1)
+        errors.append((resize(closed.render(view.zoomed(2)).image, tuple(truth.shape[:2]), "pil-bicubic") - truth).square().mean())
+    assert found[0] == pytest.approx(-10 * math.log10(sum(errors) / 6), abs=0.01)
+
+
+@pytest.mark.parametrize("agreements", [(30.0, 31.0, 32.0), (30.0, 20.0)])
+@pytest.mark.parametrize("pressed", [6, 10])  # with a growth on trial; after its judgment
+def test_a_resumed_run_equals_an_uninterrupted_one(judged, monkeypatch, tmp_path, agreements, pressed):
+    judged(*agreements)
+    whole = adapted().save(tmp_path / "whole.ply").read_bytes()
+    render, calls = ReferenceBackend.render, []
+
+    def interrupting(self, gaussians, *scene):
+        calls.append(gaussians.means.requires_grad)
+        if sum(calls) == pressed and calls[-1]:
+            signal.raise_signal(signal.SIGINT)
+        return render(self, gaussians, *scene)
+
+    judged(*agreements)
+    with monkeypatch.context() as patched:
+        patched.setattr(ReferenceBackend, "render", interrupting)
+        with pytest.raises(Interrupted):
+            adapted(resume=tmp_path / "state")
+    resumed = adapted(resume=tmp_path / "state").save(tmp_path / "resumed.ply").read_bytes()
+    assert resumed == whole
