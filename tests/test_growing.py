@@ -82,7 +82,7 @@ def test_agreement_at_the_start_is_that_of_the_closed_form(monkeypatch):
     monkeypatch.setattr(growing, "_agreement", lambda *given: found.append(agreement(*given)) or found[-1])
     adapted(steps=1)
     base = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
-    closed = base.adapt(2, recipe="instant")
+    closed = base.adapt(2, recipe="instant", views="train")
     errors = []
     for view in tiny.cameras(6):
         truth = base.render(view).image.clamp(0, 1)
