@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # Views that are asked how far they agree with the base.
 JUDGES = 8
 
+
 @dataclass(frozen=True)
 class Trial:
     """What a growth is judged by, and what it is undone to."""
