@@ -46,14 +46,18 @@ def counts(run) -> list[int]:
 
 def test_splats_grow_while_views_get_over_it(judged):
     judged(30.0, 30.0, 31.0)
-    sizes = counts(adapted())
+    run = adapted()
+    sizes = counts(run)
+    assert run.report.ended_by == "8 steps"
     assert len(tiny.model()) == sizes[0] < sizes[1] < sizes[3] < sizes[5]
 
 
 def test_a_growth_that_views_do_not_get_over_is_undone_and_was_the_last(judged):
     judged(30.0, 30.5, 29.0, 99.0)
-    sizes = counts(adapted())
+    run = adapted()
+    sizes = counts(run)
     assert sizes[1] < sizes[3] and sizes[5:] == [sizes[1]] * 3
+    assert run.report.ended_by == "8 steps; growing was undone at step 6, for it left views farther from the base's than the start was"
 
 
 def test_centers_move_only_where_splats_are_added(judged):
@@ -94,7 +98,7 @@ def test_agreement_at_the_start_is_that_of_the_closed_form(monkeypatch):
 @pytest.mark.parametrize("pressed", [6, 10])  # with a growth on trial; after its judgment
 def test_a_resumed_run_equals_an_uninterrupted_one(judged, monkeypatch, tmp_path, agreements, pressed):
     judged(*agreements)
-    whole = adapted().save(tmp_path / "whole.ply").read_bytes()
+    whole = adapted()
     render, calls = ReferenceBackend.render, []
 
     def interrupting(self, gaussians, *scene):
@@ -108,5 +112,6 @@ def test_a_resumed_run_equals_an_uninterrupted_one(judged, monkeypatch, tmp_path
         patched.setattr(ReferenceBackend, "render", interrupting)
         with pytest.raises(Interrupted):
             adapted(resume=tmp_path / "state")
-    resumed = adapted(resume=tmp_path / "state").save(tmp_path / "resumed.ply").read_bytes()
-    assert resumed == whole
+    resumed = adapted(resume=tmp_path / "state")
+    assert resumed.save(tmp_path / "resumed.ply").read_bytes() == whole.save(tmp_path / "whole.ply").read_bytes()
+    assert resumed.report.ended_by == whole.report.ended_by

@@ -34,6 +34,7 @@ class Trial:
 
     least_db: float  # how close the views were to the base's when the run began
     before: dict[str, Tensor] | None = None  # the parameters before the last growth; None: nothing has grown
+    undone_at: int | None = None  # the step at which that was put back
 
     @classmethod
     def begin(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Trial:
@@ -47,7 +48,7 @@ def control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     means = run.student.parameters()["means"]
     if run.trial is not None and run.trial.before is not None and _agreement(run.student, task, config) < run.trial.least_db:
         density.put_back(run.student, run.optimizer, run.trial.before)
-        run.trial = replace(run.trial, before=None)
+        run.trial = replace(run.trial, before=None, undone_at=run.step)
         run.gradients = None
     elif run.gradients is not None:
         _grow(run, task, config, run.gradients.mean())
@@ -55,6 +56,13 @@ def control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     before, means = means, run.student.parameters()["means"]
     run.gradients = None if run.gradients is None else density.ScreenGradients.of(means, config)
     run.rows_changed |= means is not before
+
+
+def verdict(run: Run) -> str:
+    """What to say of a run that grew on trial, after what ended it; nothing where all went well."""
+    if run.trial is None or run.trial.undone_at is None:
+        return ""
+    return f"; growing was undone at step {run.trial.undone_at}, for it left views farther from the base's than the start was"
 
 
 def still(run: Run) -> tuple[str, ...]:

@@ -72,7 +72,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
         "optimizer": run.optimizer.state_dict(),
         "gradients": None if run.gradients is None else (run.gradients.total, run.gradients.seen),
-        "trial": None if run.trial is None else (run.trial.least_db, run.trial.before),
+        "trial": None if run.trial is None else (run.trial.least_db, run.trial.before, run.trial.undone_at),
     }
     save_torch(path, state, overwrite=True)
 
@@ -103,11 +103,11 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
     )  # fmt: skip
 
 
-def _trial(state: tuple[float, dict[str, torch.Tensor] | None] | None, device: torch.device) -> Trial | None:
+def _trial(state: tuple[float, dict[str, torch.Tensor] | None, int | None] | None, device: torch.device) -> Trial | None:
     if state is None:
         return None
-    least_db, before = state
-    return Trial(least_db, before and {name: tensor.to(device) for name, tensor in before.items()})
+    least_db, before, undone_at = state
+    return Trial(least_db, before and {name: tensor.to(device) for name, tensor in before.items()}, undone_at)
 
 
 def _read(path: Path) -> Any:

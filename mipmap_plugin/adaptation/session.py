@@ -16,6 +16,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.closed_form import closed_form, pixel_size
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.detail import Detail
+from mipmap_plugin.adaptation.growing import verdict
 from mipmap_plugin.adaptation.light import light
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
 from mipmap_plugin.adaptation.merging import merge
@@ -136,7 +137,7 @@ class Session:
         ended_by = adapt(run, task, self.config, keeper.stop, look)
         self.seconds["optimization"] = run.watch.seconds
         self.seconds["total"] += run.watch.seconds
-        return run.curve, ended_by
+        return run.curve, ended_by + verdict(run)
 
     @torch.no_grad()
     def _merge(self, student: SplatModel) -> None:
