@@ -160,7 +160,7 @@ def test_the_base_against_photographs_of_itself_is_perfect(model, scene):
 
 def test_rows_for_every_scale_and_recipe(model, scene):
     rows = evaluate(model, scene, [1, 1 / 4], ["default", "paper"], "P1", **BRIEF)
-    free = ["naive", "scaled", "window", "antialiased", "resized base", "window, 2 x 2 samples"]
+    free = ["naive", "scaled", "window", "antialiased", "resized base", "supersampling, 4 x 4", "window, 2 x 2 samples"]
     assert [row.name for row in rows if row.scale == 1] == ["base"]
     zoomed = {row.name: row for row in rows if row.scale == 1 / 4}
     assert list(zoomed) == [*free, "default, held out", "default, scored", "paper, held out", "paper, scored"]
@@ -170,6 +170,7 @@ def test_rows_for_every_scale_and_recipe(model, scene):
     assert all(row.ssim is None for row in zoomed.values())
     assert zoomed["resized base"].psnr_db > 45  # the photographs are the base's own, and P1 is a box
     assert zoomed["window, 2 x 2 samples"].psnr_db > zoomed["window"].psnr_db
+    assert zoomed["supersampling, 4 x 4"].psnr_db > 45
     assert zoomed["naive"].psnr_db < min(zoomed[name].psnr_db for name in ("resized base", "default, held out"))
 
 

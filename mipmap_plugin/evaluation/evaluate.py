@@ -83,7 +83,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic", without: Sequence[str] = ()) -> list[Row]:
-    """The base as it is, each screen filter that needs no training, and the base's own render resized (for zoom-out, supersampling).
+    """The base as it is, each screen filter that needs no training, the base's own render resized, and, for zoom-out, supersampling.
+
+    It takes samples as fine as the base's own pixels.
 
     `without`: filters that are left out.
     """
@@ -97,6 +99,8 @@ def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: st
 
     served = [name for name in FILTERS if name not in without and not model.lacks(name)]
     shows = {"naive": filtered(None), **{name: filtered(name) for name in served}, "resized base": resized("bicubic")}
+    if (fine := math.ceil(1 / scale)) > 1:
+        shows[f"supersampling, {fine} x {fine}"] = filtered("scaled", fine)
     samples = math.ceil(1 / (WINDOW_REACH * scale))
     if "window" in served and samples > 1:
         shows[f"window, {samples} x {samples} samples"] = filtered("window", samples)
