@@ -83,9 +83,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic", without: Sequence[str] = ()) -> list[Row]:
-    """The base as it is, each screen filter that needs no training, the base's own render resized, and, for zoom-out, supersampling.
-
-    It takes samples as fine as the base's own pixels.
+    """The base as it is, each screen filter that needs no training, the base's own render resized, and at zoom-out N x N supersampling.
 
     `without`: filters that are left out.
     """
