@@ -11,6 +11,7 @@ from mipmap_plugin.adaptation import growing
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
 from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.config import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 # Every splat that is seen grows at steps 2, 4 and 6, if nothing forbids it.
@@ -57,20 +58,42 @@ def test_a_growth_that_views_do_not_get_over_is_undone_and_was_the_last(judged):
     run = adapted()
     sizes = counts(run)
     assert sizes[1] < sizes[3] and sizes[5:] == [sizes[1]] * 3
-    assert run.report.ended_by == "8 steps; growing was undone at step 6, for it left views farther from the base's than the start was"
+    assert run.report.ended_by == "8 steps; growing was undone at step 6, for it left views farther from the base than at the start"
 
 
-def test_centers_move_only_where_splats_are_added(judged):
+def test_centers_move_once_something_has_grown(judged):
     judged(30.0)
-    for gradient, moves in ((1e-12, True), (1e9, False)):
-        start, end = (adapted(steps=steps, densify_gradient=gradient).model.parameters()["means"] for steps in (0, 8))
-        assert torch.equal(end[: len(start)], start) != moves
+
+    def means(**settings):
+        return adapted(**settings).model.parameters()["means"]
+
+    assert torch.equal(means(densify_gradient=1e9), means(steps=0))
+    unmoved = recipe("thorough", 2, upsampler="mine").rates.model_copy(update={"means": 0.0})
+    assert not torch.equal(means(), means(rates=unmoved))
 
 
-def test_the_first_growth_has_to_be_judged(judged):
-    judged(30.0)
-    assert set(counts(adapted(steps=4))) == {len(tiny.model())}
-    assert counts(adapted(steps=5))[-1] > len(tiny.model())
+@pytest.mark.parametrize("ending", [dict(steps=3), dict(target_db=1.0, check_every=2), dict(time_budget_s=1e-9, prune_every=1)])
+def test_a_growth_is_judged_when_the_run_ends(judged, ending):
+    judged(30.0, 10.0)
+    run = adapted(**ending)
+    assert run.report.gaussians_after == len(tiny.model())
+    assert "growing was undone at step" in run.report.ended_by
+
+
+def test_what_is_no_number_is_undone(judged):
+    judged(30.0, math.nan)
+    assert adapted().report.gaussians_after == len(tiny.model())
+
+
+def test_a_growth_that_has_passed_is_not_judged_again(judged):
+    judged(30.0, 30.0, 10.0)
+    assert adapted(most_growth=1.5).report.gaussians_after > len(tiny.model())  # there is no room for a second
+
+
+def test_without_growing_nothing_is_on_trial(monkeypatch):
+    monkeypatch.setattr(growing, "_agreement", lambda *_: pytest.fail("asked"))
+    start, end = (adapted(densify_gradient=None, steps=steps).model.parameters()["means"] for steps in (0, 2))
+    assert not torch.equal(start, end)
 
 
 def test_published_growing_is_not_on_trial(monkeypatch):

@@ -1,9 +1,12 @@
 """Light: how many pixels each splat fills, from any backend."""
 
+import pytest
 import torch
 from tiny import cameras, model
 
 from mipmap_plugin.adaptation.light import light
+from mipmap_plugin.backends import get_backend
+from mipmap_plugin.backends.harmonics import C0
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -11,15 +14,22 @@ from mipmap_plugin.gaussians import Gaussians
 
 def opacity(gaussians: Gaussians, view) -> torch.Tensor:
     """What an image of splats that shine white shows on black."""
-    white = torch.full_like(gaussians.sh[:, :1], 0.5 / 0.28209479177387814)
+    white = torch.full_like(gaussians.sh[:, :1], 0.5 / C0)
     shining = Gaussians(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, white)
     return ReferenceBackend().render(shining, view, Effects(0)).image[..., 0]
 
 
-def test_all_light_together_is_what_the_background_lacks():
+@pytest.fixture(params=["reference", "cpu"])
+def backend(request):
+    if request.param == "cpu":
+        pytest.importorskip("numba")
+    return get_backend(request.param)
+
+
+def test_all_light_together_is_what_the_background_lacks(backend):
     splats, views = model(60).gaussians().detach(), cameras(3)
     filled = torch.stack([opacity(splats, view).sum() for view in views]).mean()
-    torch.testing.assert_close(light(splats, views, ReferenceBackend(), Effects(1)).sum(), filled, rtol=1e-4, atol=0.0)
+    torch.testing.assert_close(light(splats, views, backend, Effects(1)).sum(), filled, rtol=1e-4, atol=0.0)
 
 
 def test_a_splat_alone_fills_what_it_covers():

@@ -101,10 +101,33 @@ def test_unlike_colors_stay_apart():
     assert left.sh[:, 0].unique().numel() == 2
 
 
-def test_the_world_may_lie_far_from_its_origin():
-    there = cloud(2000)
-    there = replace(there, means=there.means.double().add(1e5).float())  # as georeferenced scenes do; a hundredth of a unit is left of their places
-    assert len(merged(there, 0.2, pixel=0.2)) == 400
+def test_unlike_shapes_stay_apart():
+    needles = replace(cloud(2), means=torch.zeros(2, 3), scales=torch.tensor([[5.0, 0.1, 0.1], [0.1, 5.0, 0.1]]))
+    needles = replace(needles, quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1))
+    assert len(merged(needles, 0.5)) == 2
+    along = replace(needles, scales=needles.scales[[0, 0]])
+    assert len(merged(along, 0.5)) == 1
+
+
+def test_of_splats_that_no_view_saw_the_larger_weighs_more():
+    unseen = replace(cloud(2), means=torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), scales=torch.tensor([[1.0] * 3, [0.1] * 3]))
+    one = merged(unseen, 0.5, light=torch.zeros(2))
+    assert len(one) == 1 and one.means[0, 0] < 0.1
+
+
+@pytest.mark.parametrize("origin", [0.0, 1e6])  # as georeferenced scenes have it
+def test_partners_are_found_wherever_the_scene_lies_and_in_whatever_order_it_comes(origin):
+    """2,000 pairs, 2 px within and 20 px between: neighbors in space are none in the file."""
+    order = torch.randperm(4000, generator=torch.Generator().manual_seed(1))
+    pair = torch.arange(4000) // 2
+    grid = torch.stack([pair % 13, pair // 13 % 13, pair // 169], dim=1) * 20.0
+    grid[:, 0] += 2.0 * (torch.arange(4000) % 2)
+    splats = cloud(4000)
+    splats = replace(splats, means=(grid + origin)[order])
+    left = merged(splats, 0.5)
+    assert 2000 <= len(left) <= 2010  # a few of the last are not looked for
+    middles = (grid[::2] + grid[1::2]) / 2 + origin
+    assert (torch.cdist(middles, left.means).amin(dim=1) < 0.1).sum() >= 1990
 
 
 @pytest.mark.parametrize("degenerate", [0.0, 1e-30, 1e4])
@@ -112,6 +135,7 @@ def test_scales_of_any_size_give_finite_splats(degenerate):
     odd = cloud(30)
     odd.scales[::2, 0] = degenerate
     left = merged(odd, 0.1)
+    assert len(left) < 30
     assert all(field.isfinite().all() for field in (left.means, left.quats, left.scales, left.opacities, left.sh))
 
 

@@ -69,7 +69,7 @@ def prune(model: SplatModel, optimizer: torch.optim.Adam, keep: Tensor) -> None:
 
 
 def put_back(model: SplatModel, optimizer: torch.optim.Adam, before: Mapping[str, Tensor]) -> None:
-    """Let the model hold the parameters that it had `before`, and forget what was learned about others."""
+    """Let the model hold the parameters that it had `before`; their moments begin at 0."""
     rows = len(before["means"])
     change_rows(model, optimizer, lambda name, _: before[name], lambda old: old.new_zeros(rows, *old.shape[1:]))
 

@@ -2,8 +2,8 @@
 
 A clone doubles what its splat hides. On an object the steps until the next growth make good for most of that (lego at x2: from 38 dB to
 37 after 50 steps, and 38 again after 100); in an unbounded scene, whose splats all hide each other, they do not (flowers at x2: from 43 dB
-to 18, and 32 after 350 steps). So what views show is compared with the base when the next growth is due. Where they agree with it less
-than the closed form does, the last growth is undone, and nothing is added any more.
+to 18, and 32 after 350 steps). So what views show is compared with the base when the next growth is due, and when the run ends. Where
+they agree with it less than at the start of the run, the last growth is undone, and nothing is added any more.
 """
 
 from __future__ import annotations
@@ -30,49 +30,62 @@ JUDGES = 8
 
 @dataclass(frozen=True)
 class Trial:
-    """What a growth is judged by, and what it is undone to."""
+    """What growths are judged by, and what the last one is undone to."""
 
-    least_db: float  # how close the views were to the base's when the run began
-    before: dict[str, Tensor] | None = None  # the parameters before the last growth; None: nothing has grown
-    undone_at: int | None = None  # the step at which that was put back
+    least_db: float  # how close the views were to the truth when the run began
+    before: dict[str, Tensor] | None = None  # the parameters before a growth that is not judged yet
+    passed: bool = False  # a growth has been judged, and stays
+    undone_at: int | None = None  # the step at which one was undone
 
     @classmethod
-    def begin(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Trial:
-        """Of a run that begins with `student`."""
-        return cls(_agreement(student, task, config))
+    def begin(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Trial | None:
+        """Of a run that begins with `student`; None where whatever grows stays."""
+        if config.densify_on_trial and config.densify_gradient is not None:
+            return cls(_agreement(student, task, config))
+        return None
 
 
 @torch.no_grad()
 def control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     """Judge the last growth, grow, and prune."""
-    means = run.student.parameters()["means"]
-    if run.trial is not None and run.trial.before is not None and _agreement(run.student, task, config) < run.trial.least_db:
-        density.put_back(run.student, run.optimizer, run.trial.before)
-        run.trial = replace(run.trial, before=None, undone_at=run.step)
-        run.gradients = None
-    elif run.gradients is not None:
+    judge(run, task, config)
+    began_with = run.student.parameters()["means"]
+    if run.gradients is not None:
         _grow(run, task, config, run.gradients.mean())
     density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
-    before, means = means, run.student.parameters()["means"]
+    means = run.student.parameters()["means"]
     run.gradients = None if run.gradients is None else density.ScreenGradients.of(means, config)
-    run.rows_changed |= means is not before
+    run.rows_changed |= means is not began_with
+
+
+@torch.no_grad()
+def judge(run: Run, task: Task, config: AdaptConfig) -> None:
+    """Undo the last growth if it is on trial and views have not got over it; then nothing grows any more."""
+    trial = run.trial
+    if trial is None or trial.before is None:
+        return
+    if _agreement(run.student, task, config) >= trial.least_db:
+        run.trial = replace(trial, before=None, passed=True)
+        return
+    density.put_back(run.student, run.optimizer, trial.before)
+    run.trial = replace(trial, before=None, undone_at=run.step)
+    run.gradients, run.rows_changed = None, True
 
 
 def verdict(run: Run) -> str:
     """What to say of a run that grew on trial, after what ended it; nothing where all went well."""
     if run.trial is None or run.trial.undone_at is None:
         return ""
-    return f"; growing was undone at step {run.trial.undone_at}, for it left views farther from the base's than the start was"
+    return f"; growing was undone at step {run.trial.undone_at}, for it left views farther from the base than at the start"
 
 
 def still(run: Run) -> tuple[str, ...]:
     """The parameters that do not move now. On trial, centers move to part what was cloned, and not where nothing is."""
-    return ("means",) if run.trial is not None and run.trial.before is None else ()
+    stays = run.trial is not None and run.trial.before is None and not run.trial.passed
+    return ("means",) if stays else ()
 
 
 def _grow(run: Run, task: Task, config: AdaptConfig, gradients: Tensor) -> None:
-    if run.trial is not None and run.trial.before is None and run.step + config.prune_every >= config.steps:
-        return  # the first would come too late to be judged
     assert config.densify_gradient is not None
     grown = density.strongest(gradients, config.densify_gradient, task.most_splats - len(gradients))
     if not grown.any():

@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation import density
 from mipmap_plugin.adaptation.activation import Activation
 from mipmap_plugin.adaptation.closed_form import pixel_size
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress, reason_to_stop
-from mipmap_plugin.adaptation.growing import Trial, control_density, still
+from mipmap_plugin.adaptation.growing import Trial, control_density, judge, still
 from mipmap_plugin.adaptation.interrupt import interruptible
 from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
 from mipmap_plugin.adaptation.resize import difference_from
@@ -61,7 +61,7 @@ class Run:
         means = student.parameters()["means"]
         optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch()
         with watch:
-            trial = Trial.begin(student, task, config) if config.densify_on_trial else None
+            trial = Trial.begin(student, task, config)
         return cls(student, optimizer, watch, density.ScreenGradients.of(means, config), trial)
 
 
@@ -75,7 +75,8 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     bar = tqdm(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step")
     with bar, interruptible() as interrupted:
         observe(run)
-        while run.step < config.steps:
+        reason = None
+        while run.step < config.steps and reason is None:
             with run.watch:
                 _step(run, task, config, order(run.step, progress(run.step, run.watch.seconds, config)), cameras)
                 if run.step % config.check_every == 0 or run.step == config.steps:
@@ -87,9 +88,10 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             observe(run)
             if interrupted():
                 on_interrupt(run)
-            if reason := reason_to_stop(run.curve, run.watch.seconds, config):
-                return reason
-    return f"{config.steps} steps"
+            reason = reason_to_stop(run.curve, run.watch.seconds, config)
+        with run.watch:
+            judge(run, task, config)
+    return reason or f"{config.steps} steps"
 
 
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:

@@ -39,5 +39,4 @@ _METHODS = {
 
 def difference_from(target: Tensor, image: Tensor, method: str) -> Tensor:
     """How far `image` [H, W, 3] is from `target` [h, w, 3], at the target's size: where the truth is the base itself, the base's."""
-    size = (target.shape[0], target.shape[1])
-    return (image if image.shape == target.shape else resize(image, size, method)) - target
+    return resize(image, (target.shape[0], target.shape[1]), method) - target

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -72,7 +73,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
         "optimizer": run.optimizer.state_dict(),
         "gradients": None if run.gradients is None else (run.gradients.total, run.gradients.seen),
-        "trial": None if run.trial is None else (run.trial.least_db, run.trial.before, run.trial.undone_at),
+        "trial": None if run.trial is None else {field.name: getattr(run.trial, field.name) for field in fields(run.trial)},
     }
     save_torch(path, state, overwrite=True)
 
@@ -83,9 +84,10 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
     if not isinstance(state, dict) or state.get("fingerprint") != fingerprint:
         raise SettingsError(f"{path}: it belongs to another base, other settings or other views; repeat those, or delete the file to start anew")
     device = student.parameters()["means"].device
-    if state["rows_changed"]:
+    # On a GPU light is summed in any order, so that merging anew may leave a splat more or less than it did.
+    if state["rows_changed"] or state["parameters"]["means"].shape != student.parameters()["means"].shape:
         student.replace_parameters({name: tensor.to(device).requires_grad_() for name, tensor in state["parameters"].items()})
-    else:  # the rows are those of the base, and so are whatever the model carries along by row
+    else:  # the rows are those that the run began with, and so is whatever the model carries along by row
         with torch.no_grad():
             for name, tensor in student.parameters().items():
                 tensor.copy_(state["parameters"][name])
@@ -103,11 +105,11 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
     )  # fmt: skip
 
 
-def _trial(state: tuple[float, dict[str, torch.Tensor] | None, int | None] | None, device: torch.device) -> Trial | None:
+def _trial(state: dict[str, Any] | None, device: torch.device) -> Trial | None:
     if state is None:
         return None
-    least_db, before, undone_at = state
-    return Trial(least_db, before and {name: tensor.to(device) for name, tensor in before.items()}, undone_at)
+    before = state["before"] and {name: tensor.to(device) for name, tensor in state["before"].items()}
+    return Trial(**{**state, "before": before})
 
 
 def _read(path: Path) -> Any:

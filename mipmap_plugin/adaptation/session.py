@@ -144,8 +144,8 @@ class Session:
         """Fewer splats; only a family that offers `rebuild` is asked for it (`Wrapped.adapt`)."""
 
         def fewer(gaussians: Gaussians) -> Gaussians:
-            shown = light(gaussians, evenly(self.views, LIT_VIEWS), self.backend, self.trained) * self.scale**2
-            return merge(gaussians, pixel_size(gaussians.means, self.views) / self.scale, shown, self.config.merge_to)
+            filled = light(gaussians, evenly(self.views, LIT_VIEWS), self.backend, self.trained) * self.scale**2
+            return merge(gaussians, pixel_size(gaussians.means, self.views) / self.scale, filled, self.config.merge_to)
 
         began = time.perf_counter()
         student.rebuild(fewer)  # type: ignore[attr-defined]
