@@ -14,7 +14,9 @@ import torch
 import torch_checkpoints
 
 from mipmap_plugin import load_model, load_scene, wrap_model
-from mipmap_plugin.adaptation import optimizer
+from mipmap_plugin.adaptation import growing, optimizer
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.filters import USUAL_EPS2D
@@ -53,6 +55,19 @@ def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
     assert [point.psnr_db for point in there.report.curve] == pytest.approx([point.psnr_db for point in here.report.curve], abs=1e-3)
     if family == "3dgs":  # networks' products of matrices are taken apart in another way there
         assert all(torch.equal(tensor, found[name]) for name, tensor in here.model.parameters().items())
+
+
+@pytest.mark.parametrize("enough", [True, False])
+def test_growing_is_judged_and_undone_there(enough, monkeypatch):
+    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
+    register_upsampler("mine", lambda image, size: resize(image, size, "lanczos"), replace=True)
+    agreements = iter([0.0, *[0.0 if enough else -1.0] * 9])
+    monkeypatch.setattr(growing, "decibel", lambda _: next(agreements))
+    grown = dict(recipe="thorough", upsampler="mine", steps=5, prune_every=2, densify_gradient=1e-12, min_opacity=0.0)
+    with pretended.pretending():
+        model = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference")
+        there = model.adapt(2, **grown)
+    assert (there.report.gaussians_after > len(tiny.model())) == enough
 
 
 @pytest.mark.parametrize("screen_filter", USUAL_EPS2D)
