@@ -2,6 +2,7 @@
 
 import math
 import signal
+from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -70,6 +71,14 @@ def test_centers_move_once_something_has_grown(judged):
     assert torch.equal(means(densify_gradient=1e9), means(steps=0))
     unmoved = recipe("thorough", 2, upsampler="mine").rates.model_copy(update={"means": 0.0})
     assert not torch.equal(means(), means(rates=unmoved))
+
+
+def test_centers_go_on_moving_when_a_growth_has_passed_and_stand_when_the_first_was_undone():
+    def still(**trial):
+        return growing.still(SimpleNamespace(trial=growing.Trial(30.0, **trial)))
+
+    assert still() == still(undone_at=4) == ("means",)
+    assert still(before={}) == still(passed=True) == still(passed=True, undone_at=6) == ()
 
 
 @pytest.mark.parametrize("ending", [dict(steps=3), dict(target_db=1.0, check_every=2), dict(time_budget_s=1e-9, prune_every=1)])
