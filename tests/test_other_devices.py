@@ -38,6 +38,7 @@ FAMILIES = {
     "scaffold": lambda path: anchor_checkpoints.write(path),
     "octree": lambda path: anchor_checkpoints.write(path, anchor_checkpoints.Layout("octree", level=True)),
     "deformable": moving.write_deformable,
+    "hexplane": moving.write_hexplane,
     "gsplat": lambda path: torch_checkpoints.gsplat_folder(path, torch_checkpoints.splats()),
 }
 
