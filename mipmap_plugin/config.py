@@ -128,9 +128,9 @@ _DEFAULT_UPSAMPLED = dict(
 
 # And finer things than the base's splats can show: they are split and cloned to the end, to as many as eight times, and centers
 # move to part them. Colors that depend on the view learn little, for what a network makes up differs from view to view; the mean of
-# that is soft, and so contrasts have to be as strong as the network's. Splats split by `densify_keeps_image` are softer but truer: on
-# lego at x2 29.5 dB and LPIPS .060 instead of 28.6 and .052. All this suits objects. On flowers, an unbounded scene, 400 steps of it end
-# 32 dB from the base, where the closed form has 39; on trial the first growth is undone, and they end at 43 (`default` 42).
+# that is soft, and so contrasts have to be as strong as the network's. Splats split by `densify_keeps_image` are softer but truer. All
+# this suits objects. On flowers, an unbounded scene, 400 steps of it end 32 dB from the base, where the closed form has 39; on trial the
+# first growth is undone, and they end at 43 (benchmarks/results/unbounded.md).
 _THOROUGH_UPSAMPLED = dict(
     steps=400, compare_at="both", resize="pil-bicubic", views="train", upsampled_views=100, detail_weight=1.0,
     detail_structure=0.4, detail_contrast=3.2, views_per_step=4, decay=0.02, betas=(0.8, 0.95),
