@@ -4,21 +4,23 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tiny
 import torch
+from PIL import Image
 
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation import protocols
+from mipmap_plugin.evaluation import measure, protocols
 from mipmap_plugin.evaluation.evaluate import Judge, evaluate, means, training_free_rows
-from mipmap_plugin.evaluation.metrics import psnr, ssim
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, resized_base
+from mipmap_plugin.evaluation.metrics import SAME_DB, psnr, ssim
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.published import PUBLISHED, published
 from mipmap_plugin.evaluation.report import markdown, published_table, records, table
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.scenes.images import write_image
-from mipmap_plugin.wrap import wrap_model
+from mipmap_plugin.wrap import Wrapped, wrap_model
 
 BRIEF = dict(steps=2, extra_views=1, check_every=1)
 
@@ -76,13 +78,29 @@ def test_ssim_is_not_known_for_an_image_smaller_than_its_window():
 # Protocols
 
 
-def test_p1_truncates_the_mean_of_blocks_and_the_others_round_pillows_bicubic():
+def test_p1_truncates_the_mean_of_blocks():
     photograph = noise(24, 32, 3)
     view = protocols.TestView(tiny.cameras(1)[0], photograph, Path("photograph.png"))
-    levels = {name: view.truth(1 / 4, PROTOCOLS[name]) * 255 for name in ("P1", "P2", "P3")}
-    torch.testing.assert_close(levels["P1"], (photograph.view(6, 4, 8, 4, 3).mean(dim=(1, 3)) * 255).floor(), atol=1e-3, rtol=0)
-    for name in ("P2", "P3"):
-        torch.testing.assert_close(levels[name], (resize(photograph, (6, 8), "pil-bicubic").clamp(0, 1) * 255).round(), atol=1e-3, rtol=0)
+    means = photograph.view(6, 4, 8, 4, 3).mean(dim=(1, 3)) * 255
+    torch.testing.assert_close(view.truth(1 / 4, PROTOCOLS["P1"]) * 255, means.floor(), atol=1e-3, rtol=0)
+
+
+def test_p3_is_pillows_bicubic_on_bytes_and_not_on_floats():
+    stored = (noise(24, 32, 3) > 0.5).byte().mul(255)  # black and white: Pillow clamps between its two passes
+    view = protocols.TestView(tiny.cameras(1)[0], stored / 255, Path("photograph.png"))
+    bytes_of_pillow = np.asarray(Image.fromarray(stored.numpy()).resize((8, 6), Image.Resampling.BICUBIC))
+    truth = (view.truth(1 / 4, PROTOCOLS["P3"]) * 255).round().byte().numpy()
+    on_floats = (resize(stored / 255, (6, 8), "pil-bicubic").clamp(0, 1) * 255).round().byte().numpy()
+    assert (truth == bytes_of_pillow).all() and (truth != on_floats).any()
+
+
+def test_images_are_judged_as_the_8_bit_files_that_they_would_be_saved_as():
+    image = torch.tensor([-0.1, 0.49 / 255, 0.51 / 255, 1.2])
+    assert all(torch.equal(each.judged(image), torch.tensor([0, 0, 1 / 255, 1])) for each in PROTOCOLS.values())
+    assert torch.equal(protocols.Protocol("floats", "area", eight_bit=False).judged(image), image)
+    views = [protocols.TestView(tiny.cameras(1)[0], torch.full((24, 32, 3), 100 / 255), Path("photograph.png"))]
+    row = Judge(views, PROTOCOLS["P3"]).row("gray", 1, lambda camera: torch.full((*camera.size, 3), 100.4 / 255), gaussians=0)
+    assert row.psnr_db == SAME_DB
 
 
 def test_a_truth_finer_than_the_photograph_is_refused():
@@ -134,13 +152,6 @@ def test_a_scene_without_photographs_is_refused(scene):
         protocols.test_views(replace(scene, images={}), tiny.cameras()[0], (0.0, 0.0, 0.0))
 
 
-def test_the_base_resized():
-    image = noise(24, 32, 3)
-    torch.testing.assert_close(resized_base(image, (6, 8)), resize(image, (6, 8), "box"))
-    torch.testing.assert_close(resized_base(image, (7, 10)), resize(image, (7, 10), "area"))
-    torch.testing.assert_close(resized_base(image, (48, 64)), resize(image, (48, 64), "pil-bicubic"))
-
-
 # Rows
 
 
@@ -160,7 +171,7 @@ def test_the_base_against_photographs_of_itself_is_perfect(model, scene):
 
 def test_rows_for_every_scale_and_recipe(model, scene):
     rows = evaluate(model, scene, [1, 1 / 4], ["default", "paper"], "P1", **BRIEF)
-    free = ["naive", "scaled", "window", "antialiased", "resized base", "supersampling, 4 x 4", "window, 2 x 2 samples"]
+    free = ["base", "scaled", "window", "antialiased", "supersampling, 4 x 4", "window, 2 x 2 samples", "base, resized"]
     assert [row.name for row in rows if row.scale == 1] == ["base"]
     zoomed = {row.name: row for row in rows if row.scale == 1 / 4}
     assert list(zoomed) == [*free, "default, held out", "default, scored", "paper, held out", "paper, scored"]
@@ -168,18 +179,34 @@ def test_rows_for_every_scale_and_recipe(model, scene):
     assert zoomed["paper, held out"].adapted_on == "the 4 train views"
     assert {zoomed[name].adapted_on for name in ("default, scored", "paper, scored")} == {"the 2 given views"}
     assert all(row.ssim is None for row in zoomed.values())
-    assert zoomed["resized base"].psnr_db > 45  # the photographs are the base's own, and P1 is a box
+    assert zoomed["base, resized"].psnr_db > 45  # the photographs are the base's own, and P1 is a box
     assert zoomed["window, 2 x 2 samples"].psnr_db > zoomed["window"].psnr_db
     assert zoomed["supersampling, 4 x 4"].psnr_db > 45
-    assert zoomed["naive"].psnr_db < min(zoomed[name].psnr_db for name in ("resized base", "default, held out"))
+    assert zoomed["base"].psnr_db < min(zoomed[name].psnr_db for name in ("base, resized", "default, held out"))
+    assert zoomed["default, held out"].ended_by == "2 steps" and zoomed["base"].ended_by == ""
 
 
 def test_an_upsampler_has_a_row_of_its_own(model, scene, monkeypatch):
     gray = {"bicubic": 0.0, "mine": 0.999}
-    monkeypatch.setattr(protocols, "find_upsampler", lambda name: lambda image, size: image.new_full((*size, 3), gray[name]))
+    monkeypatch.setattr(measure, "find_upsampler", lambda name: lambda image, size: image.new_full((*size, 3), gray[name]))
     views = [protocols.TestView(tiny.cameras(1)[0], torch.ones(96, 128, 3), Path("photograph.png"))]
     rows = {row.name: row.psnr_db for row in training_free_rows(model, Judge(views, PROTOCOLS["P3"]), 2, "mine")}
-    assert rows["resized base"] < 1 and rows["base upsampled by mine"] > 50
+    assert rows["base, resized"] < 1 and rows["base upsampled by mine"] > 50
+
+
+def test_a_row_is_not_called_held_out_where_a_judged_pose_was_adapted_to(scene):
+    """Without `eval` in cfg_args every camera of the checkpoint counts as one of training."""
+    judged = [replace(camera, split="train", name="another") for camera in tiny.cameras(2, seed=9)]
+    own = wrap_model(tiny.model(), cameras=[*tiny.cameras(2), judged[0]], backend="reference")
+    rows = {row.name: row for row in evaluate(own, scene, [1 / 4], ["instant", "default"], "P3", **BRIEF) if row.ended_by}
+    assert list(rows) == [f"{recipe}, {on}" for recipe in ("instant", "default") for on in ("1 of 2 judged views adapted to", "scored")]
+
+
+def test_what_compiles_at_first_use_is_billed_to_no_adaptation(model, scene, monkeypatch):
+    steps, real = [], Wrapped.adapt
+    monkeypatch.setattr(Wrapped, "adapt", lambda *args, **settings: (steps.append(settings["steps"]), real(*args, **settings))[1])
+    evaluate(model, scene, [1, 1 / 4], ["default"], "P3", **BRIEF)
+    assert steps == [1, 2, 2]
 
 
 def test_the_mean_over_scenes(model, scene):
@@ -220,6 +247,7 @@ def test_lpips_has_a_column_that_says_which(model, scene):
     head, _, first, *_, last = table(rows).splitlines()
     assert "| LPIPS (half) |" in head and "| 0.5000 " in first and "| - " in last
     assert (rows[0].lpips, rows[0].lpips_label, rows[-1].lpips) == (0.5, "LPIPS (half)", None)
+    assert rows[1].name == "base"  # the untouched base, whose needles are crisp
 
 
 def test_published_rows_name_their_protocol_and_source():

@@ -12,7 +12,7 @@ def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
     """[H, W, 3] -> [size[0], size[1], 3], not clamped, differentiable.
 
     `box`: the mean of whole blocks (P1); `area`: the same for any ratio; `bilinear`: two taps and no prefilter, as the
-    paper's cv2.resize; `pil-bicubic` and `lanczos`: antialiased, equal to Pillow's (P2, P3).
+    paper's cv2.resize; `pil-bicubic` and `lanczos`: antialiased, equal to Pillow's on floats.
     Raises SettingsError when `box` is asked for a ratio that is not whole.
     """
     if tuple(image.shape[:2]) == tuple(size):

@@ -51,6 +51,7 @@ class Adapted:
     backend: Backend
     effects: Effects
     state: Path | None = None  # of the run, which is of use until the model is saved
+    views: Sequence[Camera] = ()  # of the base scale, that were adapted to
 
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False) -> Rendered:
         """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`."""
@@ -112,7 +113,7 @@ class Session:
             curve, ended_by = self._optimize(student, resume, observe)
         else:
             resume = None  # whatever run it is of
-        return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects, resume)
+        return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects, resume, self.views)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[list[CurvePoint], str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""

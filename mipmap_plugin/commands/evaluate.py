@@ -21,7 +21,7 @@ def evaluate(
     images: tuple[Path, ...],
     scale: Scales,
     recipe: tyro.conf.UseAppendAction[tuple[Recipe, ...]] = (),
-    protocol: Literal["P1", "P2", "P3", "P4"] = "P3",
+    protocol: Literal["P1", "P3", "P4"] = "P3",
     lpips: Literal["alex", "vgg", "vgg-01"] | None = None,
     lpips_weights: Path | None = None,
     published: Literal["nerf-synthetic", "mip-nerf-360"] | None = None,
@@ -41,8 +41,8 @@ def evaluate(
         checkpoint: A PLY or a model folder, whose cameras tell the base scale; or several, which are also averaged.
         images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images), one for each checkpoint.
         scale: Target over base, such as 1/4 or 4; 1 is the base itself. May be given several times.
-        recipe: Adapt with this recipe, once on views that are not judged on and once on those that are; may be given several times.
-        protocol: The truth at another scale: P1 box, truncated; P2, P3 Pillow's bicubic; P4 the folders images_2, images_4, ... of a COLMAP scene.
+        recipe: Adapt with this recipe, once on the checkpoint's training views and once on those that are judged; may be given several times.
+        protocol: The truth at another scale: P1 box, cut off; P3 Pillow's bicubic on 8 bits; P4 the folders images_2, images_4, ... of COLMAP.
         lpips: Also measure LPIPS, with AlexNet or VGG; vgg-01 feeds images in 0..1, which is not LPIPS' definition but what the papers do.
         lpips_weights: The backbone's weights, as torchvision saves them; by default they are downloaded, once.
         published: Also print what papers published for this data set.

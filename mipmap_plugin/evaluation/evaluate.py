@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation.measure import FILTERS, Show, rivals, seen_before, warm_up, warm_watch
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, not_exposed, resized_base, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, not_exposed, test_views
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.wrap import Adapted, Wrapped
-
-# Screen filters that need no training, for the rows beside the base as it is.
-FILTERS = ("scaled", "window", "antialiased")
-
-# A window sees through splats in front of it rightly as long as a pixel is at most so many of the base's: with more it needs samples.
-WINDOW_REACH = 2
 
 
 @dataclass(frozen=True)
@@ -47,6 +37,7 @@ class Row:
     lpips: float | None = None  # None: not asked for, or the image is too small
     lpips_label: str = ""  # which LPIPS
     scene: str = ""
+    ended_by: str = ""  # of an adaptation
 
 
 @dataclass(frozen=True)
@@ -58,21 +49,20 @@ class Judge:
     perceptual: Perceptual | None = None
     scene: str = ""
 
-    def row(self, name: str, scale: float, show: Callable[[Camera], Tensor], **facts: Any) -> Row:
+    def row(self, name: str, scale: float, show: Show, **facts: Any) -> Row:
         """The mean quality of `show(camera at the base scale)` over the views. PSNR per view, then the mean, as the literature does."""
-        decibels, similarities, distances, seconds = [], [], [], []
+        decibels, similarities, distances = [], [], []
+        watch = warm_watch(show, self.views[0].camera)
         for view in tqdm(self.views, disable=None, desc=f"{name} x{scale:g}", leave=False):
-            began = time.perf_counter()
-            with torch.no_grad():
+            with torch.no_grad(), watch:
                 image = show(view.camera)
-            seconds.append(time.perf_counter() - began)
-            truth = view.truth(scale, self.protocol).to(image)
+            image, truth = self.protocol.judged(image), view.truth(scale, self.protocol).to(image)
             decibels.append(psnr(image, truth))
             similarities.append(ssim(image, truth))
             distances.append(self.perceptual(image, truth) if self.perceptual else None)
         label = self.perceptual.label if self.perceptual else ""
         quality = dict(psnr_db=fmean(decibels), ssim=_mean(similarities), lpips=_mean(distances), lpips_label=label)
-        facts = {"adapt_seconds": 0.0, "ms_per_view": 1000 * fmean(seconds), **facts}
+        facts = {"adapt_seconds": 0.0, "ms_per_view": 1000 * watch.seconds / len(self.views), **facts}
         return Row(name=name, scale=scale, protocol=self.protocol.name, scene=self.scene, **quality, **facts)  # type: ignore[arg-type]
 
 
@@ -83,30 +73,11 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic", without: Sequence[str] = ()) -> list[Row]:
-    """The base as it is, each screen filter that needs no training, the base's own render resized, and at zoom-out N x N supersampling.
-
-    `without`: filters that are left out.
-    """
+    """The base as it is, and everything that shows it better without adapting (`measure.rivals`). `without`: filters that are left out."""
     count = len(model.model.gaussians(model.any_camera()))
-
-    def filtered(screen_filter: str | None, samples: int = 1) -> Callable[[Camera], Tensor]:
-        return lambda camera: model.render(camera.zoomed(scale), scale, screen_filter, supersampling=samples).image
-
-    def resized(by: str) -> Callable[[Camera], Tensor]:
-        return lambda camera: resized_base(model.render(camera).image.clamp(0, 1), camera.zoomed(scale).size, by)
-
-    served = [name for name in FILTERS if name not in without and not model.lacks(name)]
-    shows = {"naive": filtered(None), **{name: filtered(name) for name in served}, "resized base": resized("bicubic")}
-    if (fine := math.ceil(1 / scale)) > 1:
-        shows[f"supersampling, {fine} x {fine}"] = filtered("scaled", fine)
-    samples = math.ceil(1 / (WINDOW_REACH * scale))
-    if "window" in served and samples > 1:
-        shows[f"window, {samples} x {samples} samples"] = filtered("window", samples)
-    if scale > 1 and upsampler != "bicubic":
-        shows[f"base upsampled by {Path(upsampler).name}"] = resized(upsampler)
-    if scale == 1:
-        shows = {"base": filtered(None)}
-    return [judge.row(name, scale, show, gaussians=count) for name, show in shows.items()]
+    filters = [name for name in FILTERS if name not in without]
+    found = rivals(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
+    return [judge.row(rival.name, scale, rival.show, gaussians=count) for rival in found]
 
 
 def notes(model: Wrapped, scales: Sequence[float]) -> list[str]:
@@ -119,7 +90,7 @@ def notes(model: Wrapped, scales: Sequence[float]) -> list[str]:
 def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:
     """An adapted model, rendered as any classic viewer renders its file."""
     report = adapted.report
-    facts = dict(adapt_seconds=report.seconds["total"], gaussians=report.gaussians_after, adapted_on=report.views)
+    facts = dict(adapt_seconds=report.seconds["total"], gaussians=report.gaussians_after, adapted_on=report.views, ended_by=report.ended_by)
     return judge.row(name, report.scale, lambda camera: adapted.render(camera.zoomed(report.scale)).image, **facts)
 
 
@@ -134,8 +105,9 @@ def evaluate(
 ) -> list[Row]:
     """All rows: for each scale the training-free ones, then each recipe twice. Raises SettingsError.
 
-    "held out": adapted on the checkpoint's training poses, and around them if the recipe says so; the honest row, for a user
-    zooms to views that nobody adapted to. "scored": adapted on the very views that are judged, as the paper does.
+    Once on the checkpoint's training poses, and around them if the recipe says so; the honest row, for a user zooms to views that nobody adapted
+    to. It is called "held out" only if none of the judged poses was among them, else it says how many were. And once "scored": adapted on the very
+    views that are judged, as the paper does.
     """
     scene = model.place(scene)
     if not model.cameras:
@@ -145,9 +117,11 @@ def evaluate(
     rows = []
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"))
-        for name, on in product(recipes if scale != 1 else [], ("held out", "scored")):
+        if recipes and scale != 1:
+            warm_up(model, scale, model.cameras)
+        for name, on in product(recipes if scale != 1 else [], ("train", "scored")):
             adapted = model.adapt(scale, recipe=name, **(settings | _views(name, on, judged)))
-            rows.append(adapted_row(f"{name}, {on}", adapted, judge))
+            rows.append(adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judged, adapted)}", adapted, judge))
     return rows
 
 
@@ -155,6 +129,12 @@ def _views(name: Recipe, on: str, judged: Sequence[TestView]) -> dict[str, Any]:
     if on == "scored":
         return {"views": "given", "cameras": [view.camera for view in judged]}
     return {} if name in ("default", "thorough") else {"views": "train"}
+
+
+def _unseen(judged: Sequence[TestView], adapted: Adapted) -> str:
+    """Whether the judged views are new to an adapted model, as its row says it."""
+    seen = len(seen_before([view.camera for view in judged], adapted.views))
+    return f"{seen} of {len(judged)} judged views adapted to" if seen else "held out"
 
 
 def means(rows: Sequence[Row]) -> list[Row]:
@@ -170,6 +150,7 @@ def _averaged(group: Sequence[Row]) -> Row:
         group[0],
         scene=f"mean of {len(group)}",
         adapted_on=group[0].adapted_on if len({row.adapted_on for row in group}) == 1 else "each scene's own",
+        ended_by="; ".join(dict.fromkeys(row.ended_by for row in group if row.ended_by)),
         psnr_db=fmean(row.psnr_db for row in group),
         ssim=_mean([row.ssim for row in group]),
         lpips=_mean([row.lpips for row in group]),

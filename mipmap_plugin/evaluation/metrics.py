@@ -10,10 +10,15 @@ from torch import Tensor
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 
+# dB of images that are the same, as 8-bit images can be, so that means stay finite: beyond single precision.
+SAME_DB = 120.0
+
 
 def psnr(image: Tensor, truth: Tensor) -> float:
-    """dB between two images [H, W, 3], both clamped to 0..1."""
-    return float(peak_signal_noise_ratio(_array(truth), _array(image), data_range=1.0))
+    """dB between two images [H, W, 3], both clamped to 0..1; SAME_DB at most."""
+    if np.array_equal(a := _array(image), b := _array(truth)):
+        return SAME_DB
+    return min(SAME_DB, float(peak_signal_noise_ratio(b, a, data_range=1.0)))
 
 
 def ssim(image: Tensor, truth: Tensor) -> float | None:

@@ -1,4 +1,12 @@
-"""How a real photograph becomes the truth at another scale. Two good filters differ by 40 dB, so every table names its protocol."""
+"""How a real photograph becomes the truth at another scale. Two good filters differ by 40 dB, so every table names its protocol.
+
+P1, of Mip-Splatting on NeRF-Synthetic: 2 x 2 means in float, cut off to 8 bits. P3, of Mipmap-GS and of Mip-Splatting on mip-NeRF 360: put
+on the background and cut off to 8 bits as INRIA's reader does, then Pillow's bicubic on those bytes. P4: the files of images_2, images_4, ...
+There is no P2: Mip-Splatting's protocol on mip-NeRF 360 makes the same truth of a JPEG as P3 does, byte for byte.
+
+Under each of them the images that are judged are rounded to 8 bits: the authors' render.py writes PNG files by torchvision's `save_image`, which
+rounds, and their metrics.py reads those.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +20,13 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.photographs import as_sampled
 from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.base import SplatModel, exposures_of
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.scenes.images import image_size, read_image
+from mipmap_plugin.scenes.images import image_size, pillow_bicubic, read_image
 
-ProtocolName = Literal["P1", "P2", "P3", "P4"]
+ProtocolName = Literal["P1", "P3", "P4"]
 
 # COLMAP scenes come with their photographs made smaller beforehand: images_2, images_4, images_8 beside images.
 READY_MADE = re.compile(r"images(_\d+)?$")
@@ -30,22 +37,38 @@ ROUNDING = 4
 
 @dataclass(frozen=True)
 class Protocol:
-    """One way to make the truth, as the papers do it."""
+    """One way to make the truth and to judge by it, as the papers do it."""
 
     name: str
     resize: str | None  # of the photograph, already composited on the background; None: files of the wanted size are read
-    truncate: bool  # P1 writes its levels with truncation to 8 bits, the others with rounding
+    truncate: bool = False  # P1 writes its levels with truncation to 8 bits, the others with rounding
+    eight_bit: bool = True  # images are judged as the PNG files that they would be saved as
+
+    @property
+    def shrink_by(self) -> str:
+        """The filter that makes the truth. Of P4 it is ImageMagick's, which shrinks opaque images by Lanczos unless told otherwise."""
+        return self.resize or "lanczos"
+
+    def shrunk(self, photograph: Tensor, size: tuple[int, int]) -> Tensor:
+        """The truth [*size, 3] of a photograph [H, W, 3] on 8 bits."""
+        if self.resize is None or self.resize == "pil-bicubic":
+            return pillow_bicubic(photograph, size)
+        return self.quantized(resize(photograph, size, self.resize))
 
     def quantized(self, image: Tensor) -> Tensor:
+        """An image of the truth on 8 bits."""
         steps = image.clamp(0, 1) * 255
         return (steps.floor() if self.truncate else steps.round()) / 255
+
+    def judged(self, image: Tensor) -> Tensor:
+        """An image [h, w, 3] as it is compared with the truth."""
+        return (image.clamp(0, 1) * 255).round() / 255 if self.eight_bit else image
 
 
 PROTOCOLS: dict[str, Protocol] = {
     "P1": Protocol("P1", "box", truncate=True),
-    "P2": Protocol("P2", "pil-bicubic", truncate=False),
-    "P3": Protocol("P3", "pil-bicubic", truncate=False),
-    "P4": Protocol("P4", None, truncate=False),
+    "P3": Protocol("P3", "pil-bicubic"),
+    "P4": Protocol("P4", None),
 }
 
 
@@ -71,11 +94,11 @@ class TestView:
         """[h, w, 3] at `scale` times the base scale. Raises SettingsError where there is no photograph as large."""
         size = self.camera.zoomed(scale).size
         if protocol.resize is None:
-            return resize(read_image(ready_made(self.file, size), self.background), size, "pil-bicubic")
+            return protocol.shrunk(read_image(ready_made(self.file, size), self.background), size)
         if size[0] > self.photograph.shape[0]:
             has = f"{self.photograph.shape[1]} x {self.photograph.shape[0]}"
             raise SettingsError(f"x{scale:g} asks for {size[1]} x {size[0]} px, but the photographs have only {has}; evaluate a smaller scale")
-        return protocol.quantized(resize(self.photograph, size, protocol.resize))
+        return protocol.shrunk(self.photograph, size)
 
 
 def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
@@ -108,11 +131,3 @@ def not_exposed(model: SplatModel) -> list[str]:
     """That photographs have exposures of their own, in a sentence, where the model knows of them; none is applied in judging."""
     exposures = exposures_of(model)
     return [f"{exposures.found()}, which is not applied here: part of every difference from a photograph is exposure"] if exposures.changed else []
-
-
-def resized_base(render: Tensor, size: tuple[int, int], upsampler: str = "bicubic") -> Tensor:
-    """The base render itself, box-averaged or upsampled to `size`: what zoom costs when no splat is touched."""
-    if size[0] < render.shape[0]:
-        whole = render.shape[0] % size[0] == 0 and render.shape[1] % size[1] == 0
-        return resize(render, size, "box" if whole else "area")
-    return find_upsampler(upsampler)(render, size)

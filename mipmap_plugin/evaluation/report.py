@@ -10,15 +10,17 @@ from mipmap_plugin.evaluation.published import LPIPS_LABEL, Published
 
 
 def table(rows: Sequence[Row]) -> str:
-    """A Markdown table, which is legible in a terminal too. Scenes and LPIPS have columns where there are any."""
+    """A Markdown table, which is legible in a terminal too. Scenes, LPIPS and what ended the runs have columns where there are any."""
     several, label = len({row.scene for row in rows}) > 1, next((row.lpips_label for row in rows if row.lpips_label), "")
     head = ["scene"] * several + ["scale", "protocol", "what", "adapted on", "PSNR dB", "SSIM"] + [label] * bool(label)
-    head += ["adapt s", "ms/view", "splats"]
+    ended = any(row.ended_by for row in rows)
+    head += ["adapt s", "ms/view", "splats"] + ["ended by"] * ended
     body = [
         [row.scene] * several
         + [f"x{row.scale:g}", row.protocol, row.name, row.adapted_on, f"{row.psnr_db:.2f}", _digits(row.ssim, 4)]
         + [_digits(row.lpips, 4)] * bool(label)
         + [f"{row.adapt_seconds:.1f}", f"{row.ms_per_view:.0f}", f"{row.gaussians:,}"]
+        + [row.ended_by] * ended
         for row in rows
     ]
     return markdown(head, body)

@@ -3,17 +3,15 @@ needs no adapting. Measuring quality is not billed as adapting, and no view that
 
 from __future__ import annotations
 
-import math
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from mipmap_plugin.adaptation.curve import Stopwatch
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.backends.filters import SCREEN_FILTERS
@@ -21,15 +19,10 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.protocols import resized_base
+from mipmap_plugin.evaluation.measure import BASE, FILTERS, RESIZED, Kind, Rival, Show, rivals, warm_up, warm_watch
 from mipmap_plugin.evaluation.tradeoff_truth import Yardstick
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.wrap import Adapted, Wrapped
-
-Kind = Literal["base", "filter", "supersampling", "adapted", "renderer"]
-Show = Callable[[Camera], Tensor]
-
-RESIZED = "base, resized"
 
 # Steps after which a run is looked at: even on the logarithmic axis of time.
 LOOKS = (0, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
@@ -97,16 +90,16 @@ class Plan:
 def measure(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> Iterator[Point]:
     """Each point as soon as it is measured. Raises SettingsError and BackendUnavailable."""
     runs = [(name, steps, backend) for backend in plan.backends for name in plan.recipes for steps in plan.steps or (None,)]
-    free = [way for backend in plan.backends for way in _free_ways(on_backend(model, backend), scale, plan.supersampling)]
-    free = [way for way in free if not (yardstick.is_resized_base and way[1] == RESIZED)]  # it is the truth
+    free = [rival for backend in plan.backends for rival in _rivals(on_backend(model, backend), yardstick, scale, plan)]
+    count = len(model.model.gaussians(model.any_camera()))
     bar = tqdm(total=len(free) + len(runs) * plan.repeats + len(RENDERERS) * plan.renderers, disable=None, desc=f"tradeoff x{scale:g}")
     first: Adapted | None = None
     with bar:
-        for kind, name, backend, show, count in free:
-            yield _judged(Point(scale, kind, name, backend, count), show, yardstick, plan.repeats)
+        for rival in free:
+            yield _judged(Point(scale, rival.kind, rival.name, rival.backend, count), rival.show, yardstick, plan.repeats)
             bar.update()
         for backend in plan.backends if runs else ():
-            _warm_up(on_backend(model, backend), yardstick, scale)
+            warm_up(on_backend(model, backend), scale, yardstick.adapt_on)
         for name, steps, backend in runs:
             points, adapted = _run(on_backend(model, backend), yardstick, scale, plan, name, steps, bar)
             yield from points
@@ -121,41 +114,28 @@ def on_backend(model: Wrapped, name: str) -> Wrapped:
     return Wrapped(model.model, model.cameras, name, model.trained)
 
 
-def _free_ways(model: Wrapped, scale: float, supersampling: Sequence[int]) -> list[tuple[Kind, str, str, Show, int]]:
-    """Everything that needs no adapting: kind, name, backend, what shows a view of the base scale, splats."""
-    count = len(model.model.gaussians(model.any_camera()))
-
-    def rendered(screen_filter: str | None, n: int = 1) -> Show:
-        return lambda view: model.render(view.zoomed(scale), scale, screen_filter, n).image
-
-    def resized(view: Camera) -> Tensor:
-        return resized_base(model.render(view).image.clamp(0, 1), view.zoomed(scale).size)
-
-    own = model.backend()[0].name
-    served = [name for name in _other_filters(model) if not model.lacks(name)]
-    ways: list[tuple[Kind, str, str, Show]] = [("base", "base as it is", own, rendered(None)), ("filter", "scaled filter", own, rendered("scaled"))]
-    ways += [("filter", f"{name} filter", model.backend(screen_filter=name)[0].name, rendered(name)) for name in served]
-    enough = max(2, math.ceil(1 / scale))  # samples as fine as the base's own pixels; finer ones show nothing more
-    ways += [("supersampling", f"{n} x {n} samples", own, rendered("scaled", n)) for n in supersampling if n <= enough]
-    ways += [("supersampling" if scale < 1 else "filter", RESIZED, own, resized)]
-    return [(*way, count) for way in ways]
+def _rivals(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> list[Rival]:
+    """Everything that needs no adapting, but what is the truth itself."""
+    found = rivals(model, scale, yardstick.shrink_by, filters=_filters(model), samples=plan.supersampling)
+    return [rival for rival in found if not (yardstick.is_resized_base and rival.name == RESIZED)]
 
 
-def _other_filters(model: Wrapped) -> list[str]:
-    return sorted(SCREEN_FILTERS - {model.trained.screen_filter})
+def _filters(model: Wrapped) -> list[str]:
+    """Every filter but the one that the model was trained with: first those of every table."""
+    return [name for name in (*FILTERS, *sorted(SCREEN_FILTERS - set(FILTERS))) if name != model.trained.screen_filter]
 
 
 def left_out(model: Wrapped, plan: Plan) -> list[str]:
     """The filters that a backend of the plan lacks, in sentences."""
     on = [on_backend(model, name) for name in plan.backends]
-    return [f"there is no {name} filter, since {why}" for each in on for name in _other_filters(each) if (why := each.lacks(name))]
+    return [f"there is no {name} filter, since {why}" for each in on for name in _filters(each) if (why := each.lacks(name))]
 
 
 def _judged(point: Point, show: Show, yardstick: Yardstick, repeats: int) -> Point:
     """`point` with its dB and its milliseconds a frame, the mean over the views in each repeat."""
     times, decibels = [], []
     with torch.no_grad():
-        watch = Stopwatch(show(yardstick.views[0]).device)  # the first image may compile what it needs
+        watch = warm_watch(show, yardstick.views[0])
         for repeat in range(repeats):
             watch.seconds = 0.0
             for view in yardstick.views:
@@ -165,11 +145,6 @@ def _judged(point: Point, show: Show, yardstick: Yardstick, repeats: int) -> Poi
                     decibels.append(yardstick.psnr(view, image))
             times.append(1000 * watch.seconds / len(yardstick.views))
     return replace(point, psnr_db=Spread.of([statistics.fmean(decibels)]), ms_per_frame=Spread.of(times))
-
-
-def _warm_up(model: Wrapped, yardstick: Yardstick, scale: float) -> None:
-    """One step on one view, so that what compiles at first use is not billed."""
-    model.adapt(scale, cameras=yardstick.adapt_on[:1], views="given" if yardstick.adapt_on else "orbit", extra_views=1, steps=1)
 
 
 def _run(
@@ -223,7 +198,7 @@ def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterato
     backend = get_backend("reference")
     shown: SplatModel = adapted.model if adapted else model.model
     effects = adapted.effects if adapted else model.effects(scale)
-    who = adapted.report.settings.recipe if adapted else "base as it is"
+    who = adapted.report.settings.recipe if adapted else BASE
     seconds = Spread.of([adapted.report.seconds["total"]]) if adapted else NOTHING
     count = len(shown.gaussians(model.any_camera()))
     for name, settings, dtype in RENDERERS:

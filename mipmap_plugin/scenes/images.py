@@ -50,6 +50,16 @@ def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
     return (blended * 255.0).astype(np.uint8)
 
 
+def pillow_bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """`image` [H, W, 3] in 0..1, rounded to 8 bits, as Pillow's bicubic makes it on bytes: [*size, 3] in 0..1, multiples of 1/255.
+
+    Not what the same filter makes of floats: Pillow rounds and clamps to 8 bits between its two passes and after them.
+    """
+    height, width = size
+    small = Image.fromarray(_bytes(image)).resize((width, height), Image.Resampling.BICUBIC)
+    return torch.from_numpy(np.asarray(small).astype(np.float32)) / 255
+
+
 def is_file(path: Path) -> bool:
     """Whether there is a file; False also for a name that the system does not take, which files that list images may hold."""
     try:
@@ -74,9 +84,8 @@ def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> 
         raise ShapeError(f"image for {path}: expected shape [H, W, 3], got {list(image.shape)}")
     if not image.isfinite().all():
         raise SceneError(f"{path}: the image holds NaN or infinity and is not written; check the render that it came from")
-    pixels = (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     with new_file(path, overwrite) as temporary:
-        Image.fromarray(pixels).save(temporary, format="PNG")
+        Image.fromarray(_bytes(image)).save(temporary, format="PNG")
     return path
 
 
@@ -88,6 +97,10 @@ def write_array(path: str | Path, values: Tensor, *, overwrite: bool = False) ->
     with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
         np.save(file, values.detach().to("cpu", torch.float32).numpy())
     return path
+
+
+def _bytes(image: Tensor) -> np.ndarray:
+    return (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 def _opened(path: str | Path) -> Image.Image:

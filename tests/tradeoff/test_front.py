@@ -11,7 +11,7 @@ def point(db, s=0.0, ms=None, kind="adapted", name="default"):
     return Point(1 / 8, kind, name, "cpu", 100, Spread.of([db]), Spread.of([s]), spread)
 
 
-BASE = point(10, 0, 5.0, "base", "base as it is")
+BASE = point(10, 0, 5.0, "base", "base")
 
 # After 2 s a doubling buys half a dB.
 RUN = [BASE, point(18, 1), point(21.3, 2), point(21.8, 4), point(22.3, 8, 4.0)]
@@ -27,7 +27,7 @@ def test_the_front_leaves_out_what_something_cheaper_equals():
 
 
 def test_the_front_of_seconds_is_of_files_and_that_of_frames_of_what_was_timed():
-    free = [point(30, 0, 50, "supersampling", "8 x 8 samples"), point(15, 0, 6, "filter", "scaled filter"), point(22, 8, 900, "renderer", "tile 8")]
+    free = [point(30, 0, 50, "supersampling", "supersampling, 8 x 8"), point(15, 0, 6, "filter", "scaled"), point(22, 8, 900, "renderer", "tile 8")]
     assert files([*RUN, *free]) == RUN
     assert frames([*RUN, *free]) == [BASE, RUN[-1], *free]
 
@@ -50,9 +50,9 @@ def test_what_adapting_buys_is_said():
 
 
 def test_what_a_slower_frame_buys_is_said():
-    free = [point(30, 0, 8.0, "supersampling", "4 x 4 samples"), point(31, 0, 32.0, "supersampling", "8 x 8 samples")]
+    free = [point(30, 0, 8.0, "supersampling", "supersampling, 4 x 4"), point(31, 0, 32.0, "supersampling", "supersampling, 8 x 8")]
     said = Tradeoff(1 / 8, "dB", [*RUN, *free]).sentences()[1]
-    assert said == "the quickest frame, 4 ms, has 22.3 dB (default); 8 ms buy 7.7 dB more (4 x 4 samples); each doubling after that 0.5 dB"
+    assert said == "the quickest frame, 4 ms, has 22.3 dB (default); 8 ms buy 7.7 dB more (supersampling, 4 x 4); each doubling after that 0.5 dB"
     assert Tradeoff(1 / 8, "dB", RUN).sentences()[1].endswith("and no slower one is better")
 
 

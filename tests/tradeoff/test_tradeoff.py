@@ -15,6 +15,7 @@ from mipmap_plugin.backends.filters import SCREEN_FILTERS
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.evaluation import tradeoff as measuring
+from mipmap_plugin.evaluation.measure import rivals
 from mipmap_plugin.evaluation.tradeoff import LOOKS, RENDERERS, Plan, measure
 from mipmap_plugin.evaluation.tradeoff_files import facts, table
 from mipmap_plugin.evaluation.tradeoff_front import Tradeoff
@@ -86,10 +87,11 @@ def points():
 
 
 def test_everything_that_needs_no_adapting_stands_beside_the_adapted(points):
-    assert [point.name for point in points if point.kind == "base"] == ["base as it is"]
+    assert [point.name for point in points if point.kind == "base"] == ["base"]
     filters = {point.name for point in points if point.kind == "filter"}
-    assert filters == {"scaled filter", *(f"{name} filter" for name in SCREEN_FILTERS - {"classic"})}
-    assert [point.name for point in points if point.kind == "supersampling"] == ["2 x 2 samples"]  # the base, resized, is the truth
+    assert filters == {"scaled", *(SCREEN_FILTERS - {"classic"})}
+    sampled = [point.name for point in points if point.kind == "supersampling"]
+    assert sampled == ["supersampling, 2 x 2", "window, 2 x 2 samples"]  # the base, resized, is the truth
     assert all(point.adapt_seconds.high == 0 for point in points if point.kind in ("base", "filter", "supersampling"))
 
 
@@ -98,17 +100,18 @@ def test_a_filter_that_the_backend_lacks_is_named(monkeypatch):
     monkeypatch.setattr(ReferenceBackend, "capabilities", few)
     [note] = measuring.left_out(wrapped(), PLAN)
     assert note.startswith("there is no window filter, since backend 'reference' cannot do this: ") and note.endswith("not window")
-    names = [name for kind, name, *_ in measuring._free_ways(wrapped(), 1 / 4, ()) if kind == "filter"]
-    assert names == ["scaled filter", "analytic filter", "antialiased filter", "mip filter"]
-    one = measuring.Point(1 / 4, "base", "base as it is", "reference", 30, ms_per_frame=measuring.NOTHING)
+    model = wrapped()
+    names = [rival.name for rival in measuring._rivals(model, base_itself(model, 1 / 4, 1), 1 / 4, PLAN) if rival.kind == "filter"]
+    assert names == ["scaled", "antialiased", "analytic", "mip"]
+    one = measuring.Point(1 / 4, "base", "base", "reference", 30, ms_per_frame=measuring.NOTHING)
     found = Tradeoff(1 / 4, "dB", [one], [note])
     assert table(found).endswith(note) and facts([found], complete=True)["scales"][0]["notes"] == [note]
 
 
 @pytest.mark.parametrize(("scale", "samples"), [(1 / 4, [2, 4]), (4, [2])])
 def test_samples_finer_than_the_pixels_of_the_base_are_left_out(scale, samples):
-    ways = measuring._free_ways(wrapped(), scale, (2, 4, 8))
-    assert [name for kind, name, *_ in ways if kind == "supersampling" and "samples" in name] == [f"{n} x {n} samples" for n in samples]
+    names = [rival.name for rival in rivals(wrapped(), scale, "area", samples=(2, 4, 8))]
+    assert [name for name in names if name.startswith("supersampling")] == [f"supersampling, {n} x {n}" for n in samples]
 
 
 def test_a_run_is_looked_at_on_its_way_and_at_its_end(points):
@@ -139,6 +142,27 @@ def test_the_base_resized_stands_beside_photographs(tmp_path):
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene"))
     yardstick = photographs(model, scene, 1 / 4, 1)
     assert "base, resized" in [point.name for point in measure(model, yardstick, 1 / 4, replace(PLAN, recipes=()))]
+
+
+def test_photographs_that_the_checkpoint_counts_as_of_training_are_not_adapted_to(tmp_path):
+    """Without `eval` in cfg_args every camera of the checkpoint does."""
+    photographed, others = [replace(camera, split="train") for camera in tiny.cameras(2, seed=9)], tiny.cameras(2)
+    yardstick = photographs(wrapped([*photographed, *others]), load_scene(tiny.scene(tmp_path / "scene")), 1 / 4, 1)
+    assert yardstick.adapt_on == others
+
+
+def test_where_every_camera_has_a_photograph_each_eighth_is_judged(tmp_path):
+    views = tiny.cameras(10)
+    scene = load_scene(tiny.scene(tmp_path / "scene", test=[replace(view, split="test") for view in views]))
+    yardstick = photographs(wrapped(views), scene, 1 / 4, None)
+    assert [view.name for view in yardstick.views] == ["view_0", "view_8"]
+    assert [view.name for view in yardstick.adapt_on] == [f"view_{n}" for n in range(10) if n % 8]
+
+
+def test_a_checkpoint_of_which_every_view_is_judged_is_refused(tmp_path):
+    scene = load_scene(tiny.scene(tmp_path / "scene", test=[replace(tiny.cameras(1)[0], split="test")]))
+    with pytest.raises(SettingsError, match="none is left to adapt to; give photographs of fewer views"):
+        photographs(wrapped(tiny.cameras(1)), scene, 1 / 4, None)
 
 
 def test_measuring_is_not_billed(monkeypatch):
@@ -248,7 +272,7 @@ def command(tmp_path, *more):
 def test_the_command_prints_a_table_and_refuses_to_replace_it(tmp_path, capsys):
     assert command(tmp_path) == 0
     out = capsys.readouterr().out
-    assert "x0.25, dB against the base supersampled 4 x 4 (no photographs)" in out and "base as it is" in out
+    assert "x0.25, dB against the base supersampled 4 x 4 (no photographs)" in out and "| base  " in out
     assert command(tmp_path) == 2
     assert "exists already" in capsys.readouterr().err
     assert command(tmp_path, "--overwrite", "--json") == 0

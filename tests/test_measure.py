@@ -1,0 +1,182 @@
+"""What every table measures by: one clock, one list of rivals under one set of names, and poses compared."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.upsamplers import register_upsampler
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.evaluation import protocols
+from mipmap_plugin.evaluation.evaluate import Judge, training_free_rows
+from mipmap_plugin.evaluation.measure import resized_base, rivals, seen_before, warm_up, warm_watch
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol
+from mipmap_plugin.evaluation.tradeoff import Plan, measure
+from mipmap_plugin.evaluation.tradeoff_truth import photographs
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes.trajectories import rotation_matrix
+from mipmap_plugin.wrap import wrap_model
+
+
+def wrapped(**options):
+    return wrap_model(tiny.model(30, **options), cameras=tiny.cameras(2), backend="reference")
+
+
+# Rivals
+
+
+@pytest.mark.parametrize(
+    ("scale", "names"),
+    [
+        (1, ["base"]),
+        (1 / 2, ["base", "scaled", "window", "antialiased", "supersampling, 2 x 2", "base, resized"]),
+        (1 / 8, ["base", "scaled", "window", "antialiased", "supersampling, 8 x 8", "window, 4 x 4 samples", "base, resized"]),
+        (4, ["base", "scaled", "window", "antialiased", "base, resized"]),
+    ],
+)
+def test_everything_that_needs_no_adapting_has_its_name(scale, names):
+    assert [rival.name for rival in rivals(wrapped(), scale, "area")] == names
+
+
+def test_the_filter_of_training_is_the_base_and_no_row_of_its_own():
+    model = wrapped(trained=TrainedScale("antialiased", 0.3))
+    assert [rival.name for rival in rivals(model, 2, "area")] == ["base", "scaled", "window", "base, resized"]
+
+
+def test_an_upsampler_stands_beside_the_bicubic_one_at_zoom_in_only():
+    register_upsampler("tests/mine", lambda image, size: image.new_zeros(*size, 3))
+    shown = {rival.name: rival.show for rival in rivals(wrapped(), 2, "area", upsampler="tests/mine")}
+    assert shown["base upsampled by mine"](tiny.cameras(1)[0]).max() == 0 < shown["base, resized"](tiny.cameras(1)[0]).max()
+    assert "base upsampled by mine" not in [rival.name for rival in rivals(wrapped(), 1 / 2, "area", upsampler="tests/mine")]
+
+
+def test_a_table_and_a_tradeoff_have_the_same_rivals_under_the_same_names_with_the_same_decibels(tmp_path):
+    model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", count=30))
+    judge = Judge(protocols.test_views(scene, model.cameras[0], model.background), PROTOCOLS["P3"])
+    rows = {row.name: row.psnr_db for row in training_free_rows(model, judge, 1 / 4)}
+    plan = Plan(recipes=(), backends=("reference",), supersampling=(4,), renderers=False, repeats=1)
+    points = {point.name: point.psnr_db.median for point in measure(model, photographs(model, scene, 1 / 4, None), 1 / 4, plan)}
+    assert {name: points.get(name) for name in rows} == pytest.approx(rows)
+    assert set(points) - set(rows) == {"mip", "analytic"}
+
+
+def test_the_base_is_resized_by_the_filter_that_judges_and_clamped_before():
+    image = 3 * torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(0)) - 1
+    for method, same in (("box", "box"), ("area", "area"), ("pil-bicubic", "pil-bicubic"), ("lanczos", "lanczos")):
+        torch.testing.assert_close(resized_base(image, (6, 8), shrink_by=method), resize(image.clamp(0, 1), (6, 8), same))
+    torch.testing.assert_close(resized_base(image, (7, 10), shrink_by="box"), resize(image.clamp(0, 1), (7, 10), "area"))
+    torch.testing.assert_close(resized_base(image, (48, 64), shrink_by="area"), resize(image.clamp(0, 1), (48, 64), "pil-bicubic"))
+
+
+def test_every_protocol_names_the_filter_that_makes_its_truth():
+    assert {name: each.shrink_by for name, each in PROTOCOLS.items()} == {"P1": "box", "P3": "pil-bicubic", "P4": "lanczos"}
+
+
+def test_the_base_resized_is_the_ceiling_of_what_is_judged_by_the_same_filter(tmp_path):
+    """The photographs are the base's own images: only the filter is between them and the truth."""
+    model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", count=30))
+    judge = Judge(protocols.test_views(scene, model.cameras[0], model.background), Protocol("floats", "pil-bicubic", eight_bit=False))
+    rows = {row.name: row.psnr_db for row in training_free_rows(model, judge, 1 / 4)}
+    assert rows["base, resized"] > max(rows[name] for name in rows if name != "base, resized") + 10
+
+
+# The clock
+
+
+def test_the_first_image_of_a_row_is_not_billed(monkeypatch):
+    now, calls = [0.0], []
+
+    def show(view):
+        calls.append(view)
+        now[0] += 1000 if len(calls) == 1 else 1  # seconds; the first compiles
+        return torch.zeros(*view.size, 3)
+
+    class Black:
+        camera = tiny.cameras(1)[0]
+
+        def truth(self, scale, protocol):
+            now[0] += 10  # judging is not drawing
+            return torch.ones(*self.camera.size, 3)
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    row = Judge([Black(), Black()], PROTOCOLS["P3"]).row("black", 1, show, gaussians=0)
+    assert row.ms_per_view == 1000 and len(calls) == 3
+
+
+def test_the_watch_waits_for_the_device_that_draws(monkeypatch):
+    waited = []
+    monkeypatch.setattr(torch.cuda, "synchronize", waited.append)
+
+    class OnGpu:
+        device = torch.device("cuda")
+
+    with warm_watch(lambda view: OnGpu(), tiny.cameras(1)[0]):
+        pass
+    assert waited == [torch.device("cuda")] * 2
+
+
+def test_warming_up_takes_one_step_on_one_view(monkeypatch):
+    drawn, draw = set(), ReferenceBackend.render
+
+    def render(self, gaussians, camera, effects):
+        drawn.add(tuple(camera.viewmat.flatten().tolist()))
+        return draw(self, gaussians, camera, effects)
+
+    monkeypatch.setattr(ReferenceBackend, "render", render)
+    model = wrapped()
+    warm_up(model, 2, model.cameras)
+    assert drawn == {tuple(model.cameras[0].viewmat.flatten().tolist())}
+
+
+# Poses
+
+
+def turned(camera, degrees):
+    viewmat = camera.viewmat.clone()
+    viewmat[:3] = rotation_matrix(torch.tensor([0.0, degrees * torch.pi / 180, 0.0], dtype=torch.float64)) @ viewmat[:3]  # about its own eye
+    return replace(camera, viewmat=viewmat)
+
+
+def shifted(camera, by):
+    viewmat = camera.viewmat.clone()
+    viewmat[0, 3] += by
+    return replace(camera, viewmat=viewmat)
+
+
+def test_a_view_is_known_again_by_its_pose_whatever_its_name_lens_and_digits():
+    views = tiny.cameras(5)
+    as_written = [replace(view.zoomed(3), viewmat=(view.viewmat * 1e4).round() / 1e4, name="other") for view in views]
+    assert seen_before(views, as_written[1:3]) == views[1:3]
+
+
+def test_a_single_view_far_from_the_origin_is_known_again_but_for_its_digits():
+    view = tiny.cameras(1)[0]
+    far = replace(view, viewmat=view.viewmat + torch.tensor([0, 0, 0, 1e4]) * torch.tensor([1, 1, 1, 0])[:, None])
+    assert seen_before([far], [replace(far, viewmat=far.viewmat.float().double())]) == [far]
+
+
+@pytest.mark.parametrize("change", [lambda view: turned(view, 1.0), lambda view: shifted(view, 0.02)], ids=["turned", "shifted"])
+def test_a_view_beside_another_is_another(change):
+    views = tiny.cameras(5)
+    assert seen_before(views, [change(view) for view in views]) == []
+    assert seen_before(views, []) == seen_before([], views) == []
+
+
+def test_the_same_pose_at_another_time_is_another_view():
+    still = tiny.cameras(1)[0]
+    at = [replace(still, time=time) for time in (0.0, 0.5)]
+    assert seen_before(at, [at[1]]) == [at[1]]
+    assert seen_before(at, [still]) == at  # at which time it was adapted to is not known
+
+
+@pytest.mark.parametrize("recipe", ["instant", "default", "paper"])
+def test_an_adapted_model_knows_the_views_that_it_was_adapted_to(recipe):
+    model = wrapped()
+    adapted = model.adapt(1 / 4, recipe=recipe, steps=0 if recipe == "instant" else 1, extra_views=3, views="jittered")
+    assert len(adapted.views) == 5 and seen_before(model.cameras, adapted.views) == model.cameras
