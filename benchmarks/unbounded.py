@@ -1,15 +1,18 @@
-"""An unbounded scene, of which there are no photographs: how close its views stay to the base's own, on cameras that nothing was adapted to.
+"""Captures that are no objects on a white table: how good every way to show them is, on views that nothing was adapted to.
 
-    python benchmarks/unbounded.py DATA --only 0.25
+    python benchmarks/unbounded.py DATA
+    python benchmarks/unbounded.py DATA --only bird_272 --scale 0.25 --views 4
 
-DATA holds `checkpoints/flowers_r8`. At x1/4 an image is compared with the base's, resized. At x2, for which cameras are half as large, it is
-shrunk and compared with the base's; Lanczos takes a network's place. Every 24th camera is held out. Writes unbounded/x<scale>.json for
-each scale, and unbounded.md from both. Half a minute to ten minutes a row.
+DATA holds `checkpoints/` and `images/bird`. Views are held out of the cameras, one of so many; where a checkpoint came without cameras, new
+views of an orbit are judged. Without photographs the truth is the base's own image, shrunk: by averaging (N x N samples a pixel) and by
+Pillow's bicubic. A zoom-in is shrunk and compared with the base. Writes unbounded/<capture>_x<scale>.json for each, and
+unbounded.md from all of them. One to ten minutes a file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,30 +25,58 @@ from torch import Tensor
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import register_upsampler
-from mipmap_plugin.evaluation.evaluate import Judge
-from mipmap_plugin.evaluation.protocols import Protocol
+from mipmap_plugin.adaptation.views import choose_views, evenly
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
+from mipmap_plugin.evaluation.measure import RESIZED, Show, resized_base, rivals, seen_before, warm_up
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView
 from mipmap_plugin.evaluation.report import records, table
+from mipmap_plugin.evaluation.tradeoff_truth import JUDGES_SEED
 from mipmap_plugin.files import write_json
+from mipmap_plugin.scenes.images import read_image
+from mipmap_plugin.wrap import Wrapped
 
-INTRO = """# An unbounded scene
+INTRO = """# Captures
 
-Made by `python benchmarks/unbounded.py DATA`: flowers of mip-NeRF 360, judged on cameras that nothing was adapted to, by how close their
-views are to the base's own: at x1/4 resized; at x2 (of cameras half as large) the view is shrunk. Lanczos takes a network's place there.
-One thread of a shared machine.
+Made by `python benchmarks/unbounded.py DATA`, judged on views that nothing was adapted to: those held out of the cameras, one of so many as the
+name says (of bird_272 one of 8, on which the base was not trained either), or six new views of an orbit where the checkpoint came without
+cameras. The protocol says by what: *N x N samples*, the base's own image averaged; *base, bicubic*, the same shrunk by Pillow's bicubic (a zoom-in
+is shrunk itself and compared with the base's image as it is); P3, photographs. What is the truth itself has no row. Of flowers at x2 the base's
+cameras are half as large, and Lanczos takes a network's place. One thread of a shared machine.
 """
-HELD_OUT = 24  # one camera of so many
 
-# By scale: the share of the cameras' size that is the base's, and the settings of each row.
 LANCZOS = dict(upsampler="lanczos as a network")
-ROWS: dict[float, tuple[float, dict[str, dict[str, Any]]]] = {
-    0.25: (1.0, {"closed form": dict(recipe="instant"), "default": {}, "default, nothing merged": dict(merge_to=1.0)}),
-    2.0: (0.5, {
-        "closed form": dict(recipe="instant"),
-        "default": LANCZOS,
-        "thorough": dict(LANCZOS, recipe="thorough"),
-        "thorough, not on trial": dict(LANCZOS, recipe="thorough", densify_on_trial=False),
-    }),
-}  # fmt: skip
+
+# New views of an orbit.
+ORBIT_VIEWS = 6
+
+# By what the base's own image is shrunk; floats, for 8 bits end at 59 dB.
+AVERAGED = Protocol("N x N samples", "area", eight_bit=False)
+BICUBIC = Protocol("base, bicubic", "pil-bicubic", eight_bit=False)
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A checkpoint, the views of it that are held out, and the scales that it is shown at."""
+
+    checkpoint: str  # below checkpoints/
+    scales: tuple[float, ...]
+    every: int | None = None  # one camera of so many is held out; None: it came without cameras
+    photographs: str | None = None  # below images/, named as the cameras are
+    share: float = 1.0  # of the cameras' size that is the base's
+    screen_filter: str | None = None  # that the base was trained with, where its file does not say
+    network: bool = False  # Lanczos enlarges the views of a zoom-in
+
+
+CAPTURES = {
+    "flowers_r8_every_2": Capture("flowers_r8", (1 / 4, 1 / 8), every=2),
+    "flowers_r8_every_8": Capture("flowers_r8", (1 / 4, 1 / 8), every=8),
+    "flowers_r8_every_24": Capture("flowers_r8", (2.0,), every=24, share=0.5, network=True),
+    "yashica-t4": Capture("yashica-t4/yashica-t4-top8192.ply", (1 / 4,)),
+    "vanilla_iter7000": Capture("vanilla_iter7000", (1 / 4,)),
+    "donut_mip_fused": Capture("donut_mip_fused/fused.ply", (1 / 4,), screen_filter="mip"),
+    "bird_272": Capture("captures/bird_272", (1 / 2, 1 / 4, 1 / 8, 2.0), every=8, photographs="bird"),
+}
 
 
 @dataclass(frozen=True)
@@ -56,43 +87,99 @@ class BaseView:
     image: Tensor
 
     def truth(self, scale: float, protocol: Protocol) -> Tensor:
-        return resize(self.image, self.camera.zoomed(min(scale, 1.0)).size, "pil-bicubic")
+        return resized_base(self.image, self.camera.zoomed(min(scale, 1.0)).size, shrink_by=protocol.shrink_by)
 
 
-def no_larger(render: Callable[[Camera], Tensor], scale: float) -> Callable[[Camera], Tensor]:
-    """What a camera of the base scale sees at `scale`, shrunk to the base's size where it is larger."""
-    return lambda camera: resize(render(camera.zoomed(scale)).clamp(0, 1), camera.zoomed(min(scale, 1.0)).size, "pil-bicubic")
+class BaseJudge(Judge):
+    """Judges by the base's own images: a zoom-in is shrunk to their size."""
+
+    def row(self, name: str, scale: float, show: Show, **facts: Any) -> Row:
+        def no_larger(camera: Camera) -> Tensor:
+            return resize(show(camera).clamp(0, 1), camera.zoomed(min(scale, 1.0)).size, self.protocol.shrink_by)
+
+        return super().row(name, scale, no_larger, **facts)
+
+
+def split(base: Wrapped, capture: Capture) -> tuple[list[Camera], list[Camera]]:
+    """The views to judge, and the cameras that are left to adapt to; none: an orbit is generated."""
+    if capture.every is None:
+        return choose_views([], base.model.parameters()["means"], AdaptConfig(seed=JUDGES_SEED, extra_views=ORBIT_VIEWS))[0], []
+    cameras = sorted((replace(camera.zoomed(capture.share), split="train") for camera in base.cameras), key=lambda camera: camera.name)
+    return cameras[:: capture.every], [camera for number, camera in enumerate(cameras) if number % capture.every]
+
+
+def judges(base: Wrapped, capture: Capture, name: str, scale: float, cameras: Sequence[Camera], data: Path) -> list[Judge]:
+    with torch.no_grad():
+        views = [BaseView(camera, base.render(camera).image.clamp(0, 1)) for camera in cameras]
+    found: list[Judge] = [BaseJudge(views, protocol, scene=name) for protocol in ((AVERAGED, BICUBIC) if scale < 1 else (BICUBIC,))]
+    if capture.photographs:
+        files = [data / "images" / capture.photographs / f"{camera.name}.jpg" for camera in cameras]
+        photographs = [TestView(camera, read_image(file, base.background), file) for camera, file in zip(cameras, files, strict=True)]
+        found.insert(0, Judge(photographs, PROTOCOLS["P3"], scene=name))
+    return found
+
+
+def free_rows(base: Wrapped, judge: Judge, scale: float) -> list[Row]:
+    """Everything that needs no adapting, but what is the truth itself."""
+    finest, count = math.ceil(1 / scale), len(base.model.gaussians(base.any_camera()))
+    found = rivals(base, scale, judge.protocol.shrink_by, filters=("scaled", "window"), samples=sorted({2, finest}) if scale < 1 else ())
+    truth = {AVERAGED: (RESIZED, f"supersampling, {finest} x {finest}"), BICUBIC: (RESIZED,)}.get(judge.protocol, ())
+    return [judge.row(rival.name, scale, rival.show, gaussians=count) for rival in found if rival.name not in truth]
+
+
+def recipes(capture: Capture, scale: float) -> dict[str, dict[str, Any]]:
+    """The settings of each row."""
+    enlarged = LANCZOS if capture.network else {}
+    rows: dict[str, dict[str, Any]] = {"instant": dict(recipe="instant"), "default": enlarged}
+    if scale < 1 or enlarged:  # else it does what `default` does
+        rows["thorough"] = dict(enlarged, recipe="thorough")
+    if enlarged:
+        rows["thorough, not on trial"] = dict(enlarged, recipe="thorough", densify_on_trial=False)
+    return rows
+
+
+def rows_of(name: str, scale: float, data: Path, most: int | None) -> list[Row]:
+    capture = CAPTURES[name]
+    base = wrap_model(data / "checkpoints" / capture.checkpoint, screen_filter=capture.screen_filter)
+    judged, others = split(base, capture)
+    judged = evenly(judged, most or len(judged))
+    judged_by = judges(base, capture, name, scale, judged, data)
+    rows = [free_rows(base, judge, scale) for judge in judged_by]
+    warm_up(base, scale, others)
+    for recipe, settings in recipes(capture, scale).items():
+        adapted = base.adapt(scale, cameras=others, **settings)
+        assert not seen_before(judged, adapted.views), f"{name}: views that are judged were adapted to"
+        for judge, beside in zip(judged_by, rows, strict=True):
+            beside.append(adapted_row(recipe, adapted, judge))
+            print(table(beside[-1:]), flush=True)
+    return [row for each in rows for row in each]
 
 
 def main(
     data: tyro.conf.Positional[Path],
     output: Path = Path("benchmarks/results"),
-    only: tyro.conf.UseAppendAction[tuple[float, ...]] = (),
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    scale: tyro.conf.UseAppendAction[tuple[float, ...]] = (),
+    views: int | None = None,
 ) -> None:
     """Measure, and write the tables.
 
     Args:
-        data: The folder with checkpoints/.
-        output: Where the results go; those of scales that were measured before are replaced.
-        only: Which scales, 0.25 or 2; both by default.
+        data: The folder with checkpoints/ and images/.
+        output: Where the results go; those that were measured before are replaced.
+        only: Which captures, by name; all by default.
+        scale: Which scales; all of a capture by default.
+        views: How many of the held-out views are judged, at most; all by default.
     """
+    if unknown := set(only) - CAPTURES.keys():
+        raise SystemExit(f"there is no capture {', '.join(sorted(unknown))}; known are {', '.join(CAPTURES)}")
     torch.set_num_threads(1)
     register_upsampler(LANCZOS["upsampler"], lambda image, size: resize(image, size, "lanczos"))
-    base = wrap_model(data / "checkpoints" / "flowers_r8")
-    for scale in only or ROWS:
-        share, settings = ROWS[scale]
-        cameras = [replace(camera.zoomed(share), split="train") for camera in base.cameras]
-        with torch.no_grad():
-            views = [BaseView(camera, base.render(camera).image.clamp(0, 1)) for camera in cameras[::HELD_OUT]]
-        others = [camera for camera in cameras if camera not in cameras[::HELD_OUT]]
-        judge = Judge(views, Protocol("base", "pil-bicubic", truncate=False))
-        rows = []
-        for name, chosen in settings.items():
-            adapted = base.adapt(scale, cameras=others, **chosen)
-            facts = dict(adapt_seconds=adapted.report.seconds["total"], gaussians=adapted.report.gaussians_after, adapted_on=adapted.report.views)
-            rows.append(judge.row(name, scale, no_larger(lambda camera, made=adapted: made.render(camera).image, scale), **facts))
-            print(table(rows[-1:]), adapted.report.ended_by, flush=True)
-        write_json(output / "unbounded" / f"x{scale:g}.json", records(rows), overwrite=True)
+    for name in only or CAPTURES:
+        for each in scale or CAPTURES[name].scales:
+            rows = rows_of(name, each, data, views)
+            write_json(output / "unbounded" / f"{name}_x{each:g}.json", records(rows), overwrite=True)
+            print(f"{name}\n{table(rows)}\n", flush=True)
     write_page(output / "unbounded.md", INTRO, output.glob("unbounded/*.json"))
 
 
