@@ -17,6 +17,7 @@ from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.commands.types import Scale
 from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.evaluation.evaluate import Judge, adapted_row
+from mipmap_plugin.evaluation.measure import warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.files import new_file
@@ -67,6 +68,7 @@ def main(
     scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
     judge = Judge(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
     scored = dict(views="given", cameras=[view.camera for view in judge.views])
+    warm_up(wrapped, scale, wrapped.cameras)
     for name in only or ABLATIONS:
         recipe, variants = ABLATIONS[name]
         rows = []

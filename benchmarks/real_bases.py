@@ -56,7 +56,7 @@ def main(
         wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
         scene = load_scene(data / "images" / base.split("_")[0])
         rows = kept(output / f"{base}.json", recipes) + evaluate(wrapped, scene, SCALES[base], recipes, "P3")
-        rows.sort(key=lambda row: (abs(math.log2(row.scale)), "," in row.name))
+        rows.sort(key=lambda row: (abs(math.log2(row.scale)), recipe_of(row) is not None))
         write_json(output / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)
     write_page(output / "real_bases.md", INTRO, output.glob("*_[0-9]*.json"))
@@ -65,8 +65,13 @@ def main(
 def kept(file: Path, measured: Sequence[Recipe]) -> list[Row]:
     """The rows of an earlier run that are not measured again."""
     rows = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    made_by = set(get_args(Recipe)) - set(measured)
-    return [row for row in rows if row.name.split(",")[0] in made_by]
+    return [row for row in rows if recipe_of(row) not in (None, *measured)]
+
+
+def recipe_of(row: Row) -> str | None:
+    """What a row was adapted by; None: it needs no adapting."""
+    name = row.name.split(",")[0]
+    return name if name in get_args(Recipe) else None
 
 
 if __name__ == "__main__":

@@ -174,7 +174,7 @@ def main(
     if unknown := set(only) - CAPTURES.keys():
         raise SystemExit(f"there is no capture {', '.join(sorted(unknown))}; known are {', '.join(CAPTURES)}")
     torch.set_num_threads(1)
-    register_upsampler(LANCZOS["upsampler"], lambda image, size: resize(image, size, "lanczos"))
+    register_upsampler(LANCZOS["upsampler"], lambda image, size: resize(image, size, "lanczos"), replace=True)
     for name in only or CAPTURES:
         for each in scale or CAPTURES[name].scales:
             rows = rows_of(name, each, data, views)

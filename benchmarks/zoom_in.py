@@ -17,8 +17,9 @@ from pages import write_page
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
+from mipmap_plugin.evaluation.measure import BASE, resized_base, warm_up
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, resized_base, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import records, table
 from mipmap_plugin.files import write_json
 from mipmap_plugin.wrap import Wrapped
@@ -28,7 +29,7 @@ INTRO = """# Zoom-in with super-resolution networks
 Made by `python benchmarks/zoom_in.py DATA`. Protocol P3, mean of the test views, nothing adapted to any of them. X2.pt and X4.pt are DCTLSA
 transformers, realesr-animevideov3.pth is a GAN that is worse in dB than bicubic. *Enlarged by* is the network's image of the base's,
 no splat touched. Seconds on one thread of a shared machine, those to enlarge the views among them (about 1 s a view with a transformer,
-and an empty cache). The ms of the first row hold the compilation of the backend.
+and an empty cache). The *base* as it is can have the better LPIPS, for its needles are crisp.
 
 `thorough` clones and splits splats to the end and asks for contrasts as strong as the network's, which is what LPIPS asks for. It runs
 after `default`, and finds half of its images in the cache.
@@ -40,15 +41,17 @@ NETWORKS = {2: ("X2.pt", "realesr-animevideov3.pth"), 4: ("X4.pt", "realesr-anim
 
 
 def rows_of(model: Wrapped, judge: Judge, scale: float, networks: list[Path], steps: int | None) -> list[Row]:
-    """The closed form, the recipe without a network, and for each network its own image and the recipe with it."""
+    """The base as it is, the closed form, the recipe without a network, and for each network its own image and the recipe with it."""
     count = len(model.model.gaussians(model.any_camera()))
     limit = {} if steps is None else {"steps": steps}
 
     def enlarged(by: str) -> Row:
-        show = lambda camera: resized_base(model.render(camera).image.clamp(0, 1), camera.zoomed(scale).size, by)  # noqa: E731
+        show = lambda camera: resized_base(model.render(camera).image, camera.zoomed(scale).size, shrink_by=judge.protocol.shrink_by, upsampler=by)  # noqa: E731
         return judge.row(f"enlarged by {Path(by).name}", scale, show, gaussians=count)
 
-    rows = [adapted_row("closed form", model.adapt(scale, recipe="instant", views="train"), judge), enlarged("bicubic")]
+    warm_up(model, scale, model.cameras)
+    rows = [judge.row(BASE, scale, lambda camera: model.render(camera.zoomed(scale), scale).image, gaussians=count)]
+    rows += [adapted_row("closed form", model.adapt(scale, recipe="instant", views="train"), judge), enlarged("bicubic")]
     rows.append(adapted_row("default", model.adapt(scale), judge))
     for network in networks:
         rows.append(enlarged(str(network)))

@@ -1,17 +1,21 @@
 """The benchmarks' own parts: scenes, counts and the yardstick are what the tables say that they are."""
 
 import importlib.util
+import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tiny
 import torch
 from conftest import SHARED
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
 
+import unbounded  # noqa: E402
 from ablations import ABLATIONS  # noqa: E402
 from backends import facts, joined  # noqa: E402
 from measure import Scaling, Speed, Spread, Timing  # noqa: E402
@@ -25,8 +29,10 @@ from mipmap_plugin.backends import get_backend  # noqa: E402
 from mipmap_plugin.backends.projection import project  # noqa: E402
 from mipmap_plugin.config import recipe as make_config  # noqa: E402
 from mipmap_plugin.evaluation.evaluate import Row as Judged  # noqa: E402
+from mipmap_plugin.evaluation.measure import seen_before  # noqa: E402
 from mipmap_plugin.evaluation.report import records  # noqa: E402
 from mipmap_plugin.files import write_json  # noqa: E402
+from mipmap_plugin.wrap import wrap_model  # noqa: E402
 
 
 def brute_force_pairs(gaussians, camera):
@@ -106,9 +112,9 @@ def judged(name: str) -> Judged:
 
 
 def test_rows_of_recipes_that_are_not_measured_again_are_kept_and_no_others(tmp_path):
-    names = ["base", "window", "window, 2 x 2 samples", "paper, held out", "default, scored", "thorough, held out"]
+    names = ["base", "base, resized", "window, 2 x 2 samples", "paper, 3 of 25 judged views adapted to", "default, scored", "thorough, held out"]
     write_json(tmp_path / "lego.json", records([judged(name) for name in names]), overwrite=True)
-    assert [row.name for row in kept(tmp_path / "lego.json", ("default",))] == ["paper, held out", "thorough, held out"]
+    assert [row.name for row in kept(tmp_path / "lego.json", ("default",))] == [names[3], names[5]]
     assert kept(tmp_path / "chair.json", ("default",)) == []
 
 
@@ -118,3 +124,50 @@ def test_a_page_has_every_base_under_its_name(tmp_path):
     write_page(tmp_path / "page.md", "# What\n", tmp_path.glob("*.json"))
     intro, chair, lego = (tmp_path / "page.md").read_text().split("## ")
     assert intro == "# What\n\n" and "default" in chair.removeprefix("chair\n") and "paper" in lego.removeprefix("lego\n")
+
+
+@pytest.fixture
+def captures(tmp_path, monkeypatch):
+    """What `unbounded.py` measures of one small capture; by photographs where they are asked for."""
+    tiny.folder(tmp_path / "checkpoints" / "ball", tiny.cameras(6))
+    tiny.scene(tmp_path / "images", test=[replace(view, split="test") for view in tiny.cameras(6)])
+    for png in (tmp_path / "images" / "test").glob("*.png"):
+        png.rename(png.with_suffix(".jpg"))  # Pillow looks at the bytes
+
+    def measured(scale, photographs=None):
+        monkeypatch.setattr(unbounded, "CAPTURES", {"ball": unbounded.Capture("ball", (scale,), every=3, photographs=photographs)})
+        monkeypatch.setattr(unbounded, "recipes", lambda capture, scale: {"instant": dict(recipe="instant")})
+        unbounded.main(tmp_path, tmp_path)
+        return [Judged(**row) for row in json.loads((tmp_path / "unbounded" / f"ball_x{scale:g}.json").read_text())]
+
+    return measured
+
+
+def test_a_capture_has_every_row_under_every_truth_but_the_truth_itself(captures, tmp_path):
+    rows = captures(1 / 4, "test")
+    names = {protocol: [row.name for row in rows if row.protocol == protocol] for protocol in ("P3", "N x N samples", "base, bicubic")}
+    free = ["base", "scaled", "window", "supersampling, 2 x 2", "supersampling, 4 x 4", "window, 2 x 2 samples", "base, resized"]
+    assert names["P3"] == [*free, "instant"]
+    assert names["N x N samples"] == [*free[:4], free[5], "instant"]
+    assert names["base, bicubic"] == [*free[:6], "instant"]
+    assert {row.adapted_on for row in rows if row.name == "instant"} == {"4 train views and 100 around them"}
+    assert "## ball_x0.25" in (tmp_path / "unbounded.md").read_text()
+
+
+def test_a_zoom_in_of_a_capture_is_shrunk_and_compared_with_the_base(captures):
+    rows = {row.name: row for row in captures(2.0)}
+    assert list(rows) == ["base", "scaled", "window", "instant"] and {row.protocol for row in rows.values()} == {"base, bicubic"}
+    assert rows["scaled"].psnr_db > rows["base"].psnr_db
+
+
+def test_held_out_views_of_a_capture_come_in_the_order_of_names(tmp_path):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(9)[::-1], backend="reference")
+    judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,), every=4))
+    assert [view.name for view in judged] == ["view_0", "view_4", "view_8"] and len(others) == 6
+
+
+def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_draws():
+    base = wrap_model(tiny.model(), cameras=[], backend="reference")
+    judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,)))
+    adapted = base.adapt(0.25, recipe="instant", cameras=others)
+    assert len(judged) == 6 and others == [] and seen_before(judged, adapted.views) == []
