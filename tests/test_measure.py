@@ -19,6 +19,7 @@ from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol
 from mipmap_plugin.evaluation.tradeoff import Plan, measure
 from mipmap_plugin.evaluation.tradeoff_truth import photographs
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.scenes.trajectories import rotation_matrix
 from mipmap_plugin.wrap import wrap_model
@@ -72,6 +73,16 @@ def test_the_base_is_resized_by_the_filter_that_judges_and_clamped_before():
         torch.testing.assert_close(resized_base(image, (6, 8), shrink_by=method), resize(image.clamp(0, 1), (6, 8), same))
     torch.testing.assert_close(resized_base(image, (7, 10), shrink_by="box"), resize(image.clamp(0, 1), (7, 10), "area"))
     torch.testing.assert_close(resized_base(image, (48, 64), shrink_by="area"), resize(image.clamp(0, 1), (48, 64), "pil-bicubic"))
+
+
+def test_samples_are_clamped_before_they_are_averaged():
+    splats = tiny.gaussians(30)
+    splats.sh.mul_(4)  # highlights beyond 1, which no display shows
+    model = wrap_model(VanillaModel.from_gaussians(splats), cameras=tiny.cameras(1), backend="reference")
+    show = {rival.name: rival.show for rival in rivals(model, 1 / 4, "area")}
+    view = model.cameras[0]
+    assert model.render(view).image.max() > 1.2
+    torch.testing.assert_close(show["supersampling, 4 x 4"](view), show["base, resized"](view), atol=1e-5, rtol=0)
 
 
 def test_every_protocol_names_the_filter_that_makes_its_truth():

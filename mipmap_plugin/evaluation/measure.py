@@ -59,6 +59,7 @@ def rivals(
 ) -> list[Rival]:
     """The base as it is, each of `filters` that this machine has, supersampling at zoom-out, and the base's own image, resized.
 
+    Samples are clamped before they are averaged, and the base's image before it is resized, as the pseudo truth is.
     `shrink_by`: the filter that made the truth, which makes the base's image smaller too: the ceiling of zoom-out. `samples`: N for N x N
     samples a pixel, finer than the base's pixels left out; by default as fine. `upsampler`: has a row beside the bicubic one at zoom-in.
     At scale 1 there is the base alone.
@@ -66,7 +67,7 @@ def rivals(
 
     def drawn(name: str, kind: Kind, screen_filter: str | None, n: int = 1) -> Rival:
         backend = model.backend(screen_filter=screen_filter)[0].name
-        return Rival(name, kind, backend, lambda view: model.render(view.zoomed(scale), scale, screen_filter, supersampling=n).image)
+        return Rival(name, kind, backend, lambda view: _drawn(model, view.zoomed(scale), scale, screen_filter, n))
 
     def resized(name: str, by: str) -> Rival:
         show = lambda view: resized_base(model.render(view).image, view.zoomed(scale).size, shrink_by=shrink_by, upsampler=by)  # noqa: E731
@@ -87,6 +88,14 @@ def rivals(
     if scale > 1 and upsampler != "bicubic":
         found.append(resized(f"base upsampled by {Path(upsampler).name}", upsampler))
     return found
+
+
+def _drawn(model: Wrapped, camera: Camera, scale: float, screen_filter: str | None, n: int) -> Tensor:
+    """The base's view of `camera`, the mean of n x n samples a pixel; filters that know of the zoom keep their size in pixels of the output."""
+    if n == 1:
+        return model.render(camera, scale, screen_filter).image
+    fine = camera.resized(camera.width * n, camera.height * n)
+    return resize(model.render(fine, scale * n, screen_filter).image.clamp(0, 1), camera.size, "box")
 
 
 def resized_base(render: Tensor, size: tuple[int, int], *, shrink_by: str, upsampler: str = "bicubic") -> Tensor:
