@@ -184,6 +184,7 @@ def test_rows_for_every_scale_and_recipe(model, scene):
     assert zoomed["supersampling, 4 x 4"].psnr_db > 45
     assert zoomed["base"].psnr_db < min(zoomed[name].psnr_db for name in ("base, resized", "default, held out"))
     assert zoomed["default, held out"].ended_by == "2 steps" and zoomed["base"].ended_by == ""
+    assert table(rows).splitlines()[0].endswith("| ended by |") and "ended by" not in table([zoomed["base"]])
 
 
 def test_an_upsampler_has_a_row_of_its_own(model, scene, monkeypatch):
