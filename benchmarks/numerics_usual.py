@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import Rendered
-from mipmap_plugin.backends.compositing import MAX_ALPHA
+from mipmap_plugin.effects import MAX_ALPHA
 from mipmap_plugin.backends.harmonics import colors
 from mipmap_plugin.backends.projection import FRUSTUM_MARGIN, rotations
 from mipmap_plugin.camera import Camera

@@ -17,10 +17,6 @@ from torch.utils.checkpoint import checkpoint
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import RenderSettings
 
-# A published constant (diff-gaussian-rasterization, forward.cu): it keeps 1 - alpha away from 0, where the gradient of everything
-# behind the splat vanishes.
-MAX_ALPHA = 0.99
-
 # (splat, pixel) pairs composited at once: about ten tensors of this many float32 live together, 0.3 GiB.
 BATCH_PAIRS = 1 << 23
 
@@ -38,12 +34,16 @@ class Splats:
     room: int = 1  # how many times the memory of a Gaussian `alphas` takes
 
 
-def alone(alpha: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """`Splats.alphas` of splats whose alpha does not depend on those in front."""
+def alone(alpha: Callable[[Tensor, Tensor, Tensor], Tensor], most: float, gated: bool) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
+    """`Splats.alphas` of splats whose alpha does not depend on those in front, and is at most `most`.
+
+    gated: the last of what `alpha` needs is the share of a splat that is drawn, 1, or 0 where it is culled.
+    """
 
     def alphas(feet: Tensor, dx: Tensor, dy: Tensor, least: Tensor) -> Tensor:
-        found = alpha(feet, dx, dy).clamp_max(MAX_ALPHA)
-        return torch.where(found >= least, found, 0.0)
+        found = alpha(feet, dx, dy)
+        drawn = found.clamp_max(most) >= least
+        return torch.where(drawn, (feet[..., -1] * found if gated else found).clamp_max(most), 0.0)
 
     return alphas
 

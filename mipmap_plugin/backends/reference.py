@@ -7,10 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
 from mipmap_plugin.backends.compositing import Splats, alone, composite
 from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
 from mipmap_plugin.backends.harmonics import colors
+from mipmap_plugin.backends.packing import packed
 from mipmap_plugin.backends.pixel_integral import PixelIntegral
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.backends.window import WindowIntegral
@@ -25,22 +26,28 @@ class ReferenceBackend:
     name = "reference"
     api_version = API_VERSION
     speed = 0
-    capabilities = Capabilities(devices=None, dtypes=frozenset({torch.float32, torch.float64}), screen_filters=SCREEN_FILTERS, settings=True)
+    capabilities = Capabilities(None, frozenset({torch.float32, torch.float64}), SCREEN_FILTERS, settings=frozenset(SETTINGS))
 
     def lacking(self, needs: Needs) -> list[str]:
         return self.capabilities.lacking(needs)
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+        settings = effects.settings
+        if settings.packing is not None:
+            gaussians = packed(gaussians, camera, settings.packing)
         with torch.no_grad():
             rows = drawn_rows(gaussians, camera, effects)
         gaussians = gaussians[rows]
         projected, feet = _footprints(gaussians, camera, effects)
         degree = min(effects.sh_degree, gaussians.sh_degree)
         rgb = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), degree)
-        least = least_alpha(feet, effects.settings)
-        alphas, room = (feet.alphas, feet.ROOM) if isinstance(feet, WindowIntegral) else (alone(feet.alpha), 1)
+        if settings.max_color is not None:
+            rgb = rgb.clamp_max(settings.max_color)
+        least = least_alpha(feet, settings)
+        one_by_one = alone(feet.alpha, settings.max_alpha, settings.culls)
+        alphas, room = (feet.alphas, feet.ROOM) if isinstance(feet, WindowIntegral) else (one_by_one, 1)
         splats = Splats(projected.means2d, feet.packed(), rgb, least, alphas, room)
-        color, through = composite(splats, feet.extents(least), camera, effects.settings)
+        color, through = composite(splats, feet.extents(least), camera, settings)
         return Rendered(color + through[..., None] * color.new_tensor(effects.background), 1 - through)
 
 
@@ -68,14 +75,17 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
 
 @torch.no_grad()
 def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Tensor:
-    """[N]: the alpha below which each splat is not drawn. A radius of r standard deviations is exp(-r²/2) of its brightest."""
-    packed = feet.packed()
-    if settings.radius is None:
-        return packed.new_full(packed.shape[:1], settings.min_alpha)
-    zero = torch.zeros_like(packed[:, 0])
-    return (feet.alpha(packed, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
+    """[N]: the alpha below which each splat is not drawn. A radius of r standard deviations is exp(-r²/2) of its brightest.
+
+    One that fades is nothing there.
+    """
+    numbers = feet.packed()
+    if settings.radius is None or settings.fades:
+        return numbers.new_full(numbers.shape[:1], settings.min_alpha)
+    zero = torch.zeros_like(numbers[:, 0])
+    return (feet.alpha(numbers, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
 def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral]:
     projected = project(gaussians, camera, effects.near_plane)
-    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d)
+    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings)

@@ -9,10 +9,10 @@ import numpy as np
 from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, integrals, kernel, windows
+from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, windows
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, lowest, maximum, narrow, select, sqrt
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, lowest, maximum, narrow, select, spread, sqrt
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.powers import log2
 from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL
@@ -57,7 +57,7 @@ def project(start, stop, view, splats, table, depths, counts):
             lane = lowest(shown)
             shown &= shown - 1
             i = first + lane
-            if fill_color(i * stride, lane, view.sh_degree, sh, bands, block):
+            if fill_color(i * stride, lane, view, sh, bands, block):
                 depths[i], counts[i] = numbers[lane], int(numbers[WIDTH + lane])
                 for k in range(col.COLUMNS):
                     rows[i * col.COLUMNS + k] = block[k * WIDTH + lane]
@@ -113,7 +113,7 @@ def fill_shape(view, p, flat, opacity, block):
     x, y = view.fx * p[0] * per_z + view.cx, view.fy * p[1] * per_z + view.cy
     dilated, light = ellipses.screen_filter(view, flat)
     if view.seen == SEEN_AT_CENTER:
-        return fill_ellipse(x, y, dilated, opacity * light, block)
+        return fill_point(view, x, y, dilated, opacity, light, block)
     along = integrals.axes(dilated)
     if view.seen == SEEN_IN_PIXEL:
         mass, bound, corner = integrals.mass(along, opacity), integrals.BRIGHTER * opacity, integrals.CORNER
@@ -125,6 +125,27 @@ def fill_shape(view, p, flat, opacity, block):
     drawn = both(drawn, fill_ellipse(x, y, wider, bound, block))
     integrals.fill(along, mass, block)
     return drawn
+
+
+@inner
+def fill_point(view, x, y, shape, opacity, light, block):
+    """`fill_shape` of splats that are seen at the centers of pixels."""
+    shown = opacity * light
+    drawn = shown >= view.min_alpha
+    put(block, col.GATE, spread(1))
+    if view.culls:
+        there = culling.is_drawn(view, shape, opacity)
+        put(block, col.GATE, narrow(select(there, 1.0, opacity * 0)))
+        drawn = drawn if view.felt else both(drawn, there)
+        if view.least_spread > 0:
+            shape, _ = culling.stretched(view, shape, there)
+    # alpha = whole·(w - faded), which ends where it is `end`
+    whole = shown * (1 / (1 - view.faded))
+    floor, end = whole * view.faded, maximum(shown * view.cut, view.min_alpha)
+    gain = (end + floor) / MIN_ALPHA
+    put(block, col.GAIN, narrow(gain))
+    put(block, col.FLOOR, narrow(floor))
+    return both(drawn, fill_ellipse(x, y, shape, whole / gain, block))
 
 
 @inner
@@ -151,16 +172,17 @@ def fill_ellipse(x, y, shape, opacity, block):
 
 
 @inner
-def fill_color(at, lane, degree, sh, bands, block):
+def fill_color(at, lane, view, sh, bands, block):
     """Write a splat's color in this view's direction into its lane; False where it is not finite. Its coefficients begin at sh[at]."""
-    half = np.float32(0.5)
+    half, most = np.float32(0.5), np.float32(view.max_color)
     red, green, blue = half, half, half
-    for j in range((degree + 1) ** 2):
+    for j in range((view.sh_degree + 1) ** 2):
         band = bands[j * WIDTH + lane]
         red += band * sh[at + 3 * j]
         green += band * sh[at + 3 * j + 1]
         blue += band * sh[at + 3 * j + 2]
-    block[col.RED * WIDTH + lane], block[col.GREEN * WIDTH + lane], block[col.BLUE * WIDTH + lane] = max(red, 0), max(green, 0), max(blue, 0)
+    block[col.RED * WIDTH + lane], block[col.GREEN * WIDTH + lane] = min(max(red, 0), most), min(max(green, 0), most)
+    block[col.BLUE * WIDTH + lane] = min(max(blue, 0), most)
     return abs(red) < FAR and abs(green) < FAR and abs(blue) < FAR
 
 

@@ -5,7 +5,7 @@
 
 import math
 
-from mipmap_plugin.backends.compositing import MAX_ALPHA
+from mipmap_plugin.effects import MAX_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, maximum, minimum, select, sqrt
