@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
@@ -42,11 +43,12 @@ OUTPUTS = {
 class Packing:
     """How coarsely a viewer keeps splats in memory. None: exactly. What is kept is the nearest multiple of a step."""
 
-    color: float = 1 / 255  # step of the color of SH degree 0, which is kept within 0..1
     opacity: tuple[float, ...] = (1 / 255,)  # steps, one rounding after the other
-    bands: tuple[float, ...] | None = None  # steps of the coefficients of SH degree 1, 2, ..., kept within -1..1
+    color: float | None = None  # step of the color of SH degree 0, which is kept within 0..1
+    downwards: bool = False  # opacities and colors are kept as the next lower multiple
+    bands: tuple[float, ...] = ()  # steps of the coefficients of SH degree 1, 2, ..., kept within -1..1
     log_scales: tuple[float, float, float] | None = None  # the least, the most, and the step between, of natural logarithms
-    axes: int | None = None  # quaternions as an axis on an octahedron and an angle, each in so many steps
+    quats: Literal["octahedral", "stereographic"] | None = None  # `backends.packing`
     half_means: bool = False  # float16, in the world and again relative to the eye
 
 
@@ -64,6 +66,8 @@ class RenderSettings:
     max_alpha: float = MAX_ALPHA  # a splat covers no more of a pixel
     fades: bool = False  # a splat falls to 0 at `radius`: (w - w_end) / (1 - w_end) of its weight w, instead of an end where it still has w_end
     max_color: float | None = None  # of a splat, in each channel
+    color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are the nearest multiples
+    radial: bool = False  # nearer is what lies nearer to the eye, instead of what lies less deep
     min_variance: float = 0.0  # px², after dilation: a splat is culled whose variance along its longer axis is less,
     boxed: bool = False  # or, where this is set, the larger of those along x and y
     min_contribution: float = 0.0  # px², after dilation: a splat is culled whose opacity · sqrt(det) is less
@@ -81,6 +85,11 @@ class RenderSettings:
     def changed(self) -> list[str]:
         """The names of what is not as usual."""
         return [f.name for f in fields(self) if getattr(self, f.name) != getattr(USUAL, f.name)]
+
+    def of_any_color(self) -> RenderSettings:
+        """The same without what is done to colors, for images whose colors are other numbers."""
+        packing = None if self.packing is None else replace(self.packing, color=None, bands=())
+        return replace(self, max_color=None, color_steps=None, packing=packing)
 
     def finer(self, n: int) -> RenderSettings:
         """The same for an image of n times as many pixels each way: areas in px² keep their size in pixels of the coarse one."""
@@ -182,13 +191,15 @@ def _of_a_viewer(settings: RenderSettings) -> list[Effect]:
     culled = "not drawn is a splat whose"
     stretched = f"variances lie {spread:.3g} px² from their mean at least, and a splat that would end at 0 is not drawn"
     root, limit = "a root and a comparison a splat", settings.max_color
+    rounded = settings.packing is not None or settings.color_steps is not None
     parts = [
         ("edge", settings.radius is not None, ends, f"a splat ends where it is below {settings.min_alpha:.2g}", "an exponential a splat"),
         ("size cull", size > 0, f"{culled} {which} is below {size:.3g} px²", "no splat is too small to be drawn", root),
         ("contribution cull", light > 0, f"{culled} opacity · sqrt(det) is below {light:.3g} px²", "no splat gives too little", root),
         ("stretching", spread > 0, stretched, "round splats stay round", "two roots and four quotients a splat"),
         ("color limit", limit is not None, f"no color is above {limit or 0:g}", "colors have no upper bound", "a comparison a channel and splat"),
-        ("packing", settings.packing is not None, "the viewer keeps splats rounded", "splats are kept exactly", "a rounding for each number of a splat"),
+        ("order by distance", settings.radial, "the nearest to the eye is in front", "the least deep is in front", "a root a splat"),
+        ("packing", rounded, "the viewer keeps splats rounded", "splats are kept exactly", "a rounding for each number of a splat"),
     ]
     return [Effect(name, on, why if on else why_not, cost) for name, on, why, why_not, cost in parts]
 

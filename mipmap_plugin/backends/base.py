@@ -21,6 +21,8 @@ SETTINGS = {
     "max_alpha": "another largest alpha",
     "fades": "splats that fade to 0",
     "max_color": "a largest color",
+    "color_steps": "rounded colors",
+    "radial": "splats in the order of their distance",
     "min_variance": "culling by size",
     "boxed": "culling by size along x and y",
     "min_contribution": "culling by contribution",
@@ -29,7 +31,7 @@ SETTINGS = {
 }
 
 # Of these, what screen filters that integrate have: the others are about a splat's weight at a point.
-OF_INTEGRALS = frozenset({"min_alpha", "min_transmittance", "radius", "tile", "max_color", "packing"})
+OF_INTEGRALS = frozenset({"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "packing"})
 
 # Raised when `Backend.render` or the records below change in a way that an old backend cannot serve.
 API_VERSION = 1

@@ -11,7 +11,7 @@ from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Nee
 from mipmap_plugin.backends.compositing import Splats, alone, composite
 from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
 from mipmap_plugin.backends.harmonics import colors
-from mipmap_plugin.backends.packing import packed
+from mipmap_plugin.backends.packing import in_steps, packed
 from mipmap_plugin.backends.pixel_integral import PixelIntegral
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.backends.window import WindowIntegral
@@ -43,6 +43,8 @@ class ReferenceBackend:
         rgb = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), degree)
         if settings.max_color is not None:
             rgb = rgb.clamp_max(settings.max_color)
+        if settings.color_steps is not None:
+            rgb = in_steps(rgb, rgb.new_tensor(settings.color_steps))
         least = least_alpha(feet, settings)
         one_by_one = alone(feet.alpha, settings.max_alpha, settings.culls)
         alphas, room = (feet.alphas, feet.ROOM) if isinstance(feet, WindowIntegral) else (one_by_one, 1)
@@ -63,7 +65,8 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor
     inside = (high > 0).all(1) & (low < low.new_tensor([camera.width, camera.height])).all(1)
     drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & feet.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
-    return rows[projected.depths[rows].argsort(stable=True)]
+    along = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1) if effects.settings.radial else projected.depths
+    return rows[along[rows].argsort(stable=True)]
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:

@@ -182,10 +182,12 @@ def composite_back(start, stop, integrated, limits, table, lists, frame, d_frame
             splat, pull = row_of(table, members[at]), row_of(pulls, slots[at])
             if integrated:
                 lift_integral(splat, limits, n, box, state, pull)
-            elif splat[col.GATE] > 0:
-                lift(splat, limits, n, box, state, pull)
-            else:
+            elif splat[col.GATE] == 0:
                 lift_culled(splat, n, box, state, pull)
+            elif splat[col.FLOOR] > 0:
+                lift(splat, limits, True, n, box, state, pull)
+            else:
+                lift(splat, limits, False, n, box, state, pull)
 
 
 @inner
@@ -208,8 +210,8 @@ def reopen_tile(box, background, through, stops, d_image, d_alpha, state):
 
 
 @inner
-def lift(splat, limits, n, box, state, pull):
-    """Take a splat, the n-th of its tile, off again and write its pull."""
+def lift(splat, limits, fades, n, box, state, pull):
+    """Take a splat, the n-th of its tile, off again and write its pull. fades: known when this is compiled, so that what does not costs nothing."""
     fall, gain, floor = splat[col.FALL_X], splat[col.GAIN], splat[col.FLOOR]
     color = splat[col.RED], splat[col.GREEN], splat[col.BLUE]
     sum_1 = sum_u = sum_y = sum_uu = sum_uy = sum_yy = sum_red = sum_green = sum_blue = spread(0)
@@ -226,7 +228,8 @@ def lift(splat, limits, n, box, state, pull):
             alpha = fma(exp2(power), gain, 0 - floor)
             s, rate, weight, d_red, d_green, d_blue = uncover(alpha, power >= LOG_MIN_ALPHA, limits, color, n, at, state)
             sum_1 = sum_1 + s
-            s = fma(rate, floor, s)  # of a splat's shape only what falls off has a gradient
+            if fades:
+                s = fma(rate, floor, s)  # a floor depends on no shape
             s_u, s_y = s * u, s * dy
             sum_u, sum_y = sum_u + s_u, sum_y + s_y
             sum_uu, sum_uy, sum_yy = fma(s_u, u, sum_uu), fma(s_u, dy, sum_uy), fma(s_y, dy, sum_yy)

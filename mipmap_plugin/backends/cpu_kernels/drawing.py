@@ -99,6 +99,8 @@ def view_of(camera: Camera, effects: Effects, splats: Splats, gradients: bool) -
         seen=SEEN.get(effects.screen_filter, SEEN_AT_CENTER),
         sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
         max_color=math.inf if settings.max_color is None else settings.max_color,
+        color_steps=settings.color_steps or (0.0, 0.0, 0.0),
+        radial=settings.radial,
         min_alpha=settings.min_alpha,
         cut=0.0 if settings.radius is None or settings.fades else math.exp(-(settings.radius**2) / 2),
         faded=w_end(settings),

@@ -25,6 +25,9 @@ HALF_LOG2E = 0.5 / math.log(2)
 # Sizes (px, px²) and brightnesses beyond this are as good as infinite: float32 could not carry their squares.
 FAR = 1e30
 
+# The least color that is not black, and the share of the largest color that is not the largest, in float32.
+TINY, BELOW = 1e-30, 1 - 1e-7
+
 # A block of what is known of splats in the world, float64: the columns of `Splats`, of which shapes are a covariance or the other two.
 MEAN, OPACITY, COVARIANCE, QUAT, SCALE = 0, 3, 4, 4, 8
 WORLD = 13
@@ -48,7 +51,7 @@ def project(start, stop, view, splats, table, depths, counts):
         axes = ellipses.lens(view, p)
         flat = flatten_matrix(axes, world) if covariances else flatten(axes, world)
         drawn = both(p[2] > view.near, fill_shape(view, p, flat, get(world, OPACITY), block))
-        put(numbers, 0, p[2])
+        put(numbers, 0, sqrt(dot(p, p)) if view.radial else p[2])
         put(numbers, 1, count_tiles(block, drawn, view.width, view.height))
         shown = bits(get(numbers, 1) > 0) & ((1 << size) - 1)
         if shown != 0:
@@ -181,9 +184,19 @@ def fill_color(at, lane, view, sh, bands, block):
         red += band * sh[at + 3 * j]
         green += band * sh[at + 3 * j + 1]
         blue += band * sh[at + 3 * j + 2]
-    block[col.RED * WIDTH + lane], block[col.GREEN * WIDTH + lane] = min(max(red, 0), most), min(max(green, 0), most)
-    block[col.BLUE * WIDTH + lane] = min(max(blue, 0), most)
+    red_step, green_step, blue_step = view.color_steps
+    block[col.RED * WIDTH + lane] = in_steps(min(max(red, 0), most), red_step, most)
+    block[col.GREEN * WIDTH + lane] = in_steps(min(max(green, 0), most), green_step, most)
+    block[col.BLUE * WIDTH + lane] = in_steps(min(max(blue, 0), most), blue_step, most)
     return abs(red) < FAR and abs(green) < FAR and abs(blue) < FAR
+
+
+@inner
+def in_steps(value, step, most):
+    """The nearest multiple of a step; 0: the value as it is. Never quite 0 or `most` but for what is: there a channel's gradient ends."""
+    if step == 0 or value <= 0 or value >= most:
+        return value
+    return np.float32(max(min(round(value / step) * step, most * BELOW), TINY))
 
 
 @inner

@@ -32,6 +32,8 @@ class View(NamedTuple):
     seen: int  # one of the three above
     sh_degree: int
     max_color: float
+    color_steps: tuple  # three; 0: not rounded
+    radial: bool  # whether the order is that of distances
     min_alpha: float
     cut: float  # the weight at which a splat is cut off; 0: none is
     faded: float  # the weight at which a splat has faded to 0; 0: none does
