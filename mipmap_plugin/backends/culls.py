@@ -50,7 +50,7 @@ def stretched(shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least
     As GaussianSplats3D does it (SplatMaterial3D): the direction of the longer axis is (xy, mean + least - xx), which is an eigenvector
     only where the variances are left as they are. A round splat becomes an upright one.
     """
-    xx, xy, yy, det = shape
+    xx, xy, yy, _ = shape
     mean, half = (xx + yy) / 2, (xx - yy) / 2
     changed = drawn & (spread(shape) < least)
     up = torch.where(changed, least - half, 1.0)

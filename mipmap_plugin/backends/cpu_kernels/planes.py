@@ -10,6 +10,7 @@ from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.binning import TILE_COLUMNS, TILE_ROWS
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, minimum, select
 from mipmap_plugin.backends.cpu_kernels.memory import load, store
+
 STRIDE = TILE_COLUMNS + WIDTH
 PLANE = TILE_ROWS * STRIDE
 
@@ -55,8 +56,8 @@ def uncover(alpha, bright, limits, color, n, at, state):
     weight = before * light
     store(state, LIGHT + at, before)
     store(state, BEHIND + at, fma(light, gain, behind))
-    free = both(shown, alpha < most)
-    return select(free, weight * gain, 0), select(free, before * gain, 0), weight, d_red, d_green, d_blue
+    rate = select(both(shown, alpha < most), before * gain, 0)
+    return select(alpha < most, weight * gain, 0), rate, weight, d_red, d_green, d_blue
 
 
 @inner
