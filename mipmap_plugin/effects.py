@@ -73,6 +73,7 @@ class RenderSettings:
     min_contribution: float = 0.0  # px², after dilation: a splat is culled whose opacity · sqrt(det) is less
     least_spread: float = 0.0  # px², after dilation: variances lie at least so far from their mean; a splat whose smaller one is then 0 is culled
     packing: Packing | None = None  # how coarsely splats are kept
+    picture_step: float | None = None  # the picture is rounded to multiples after each splat, back to front; the gradient is of one that is not
 
     def __post_init__(self) -> None:
         if self.fades and self.radius is None:
@@ -89,7 +90,7 @@ class RenderSettings:
     def of_any_color(self) -> RenderSettings:
         """The same without what is done to colors, for images whose colors are other numbers."""
         packing = None if self.packing is None else replace(self.packing, color=None, bands=())
-        return replace(self, max_color=None, color_steps=None, packing=packing)
+        return replace(self, max_color=None, color_steps=None, packing=packing, picture_step=None)
 
     def finer(self, n: int) -> RenderSettings:
         """The same for an image of n times as many pixels each way: areas in px² keep their size in pixels of the coarse one."""
@@ -199,6 +200,7 @@ def _of_a_viewer(settings: RenderSettings) -> list[Effect]:
         ("stretching", spread > 0, stretched, "round splats stay round", "two roots and four quotients a splat"),
         ("color limit", limit is not None, f"no color is above {limit or 0:g}", "colors have no upper bound", "a comparison a channel and splat"),
         ("order by distance", settings.radial, "the nearest to the eye is in front", "the least deep is in front", "a root a splat"),
+        ("rounded picture", settings.picture_step is not None, "8 bits after each splat", "rounded once it is shown", "the image once more"),
         ("packing", rounded, "the viewer keeps splats rounded", "splats are kept exactly", "a rounding for each number of a splat"),
     ]
     return [Effect(name, on, why if on else why_not, cost) for name, on, why, why_not, cost in parts]

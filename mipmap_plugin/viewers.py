@@ -2,12 +2,13 @@
 
 Read in the sources of the versions named, which count variances in other units: where a viewer's focal length is viewport · projection, and
 so twice that of the picture, a variance of v there is v/4 px² here; where its covariances are four times as large besides, v/16. What every
-WebGL viewer has in common is `WEBGL`. What no record has: 8-bit blending, the limit of a splat's size (1024 px or the picture's size), and
-that only INRIA's family freezes the Jacobian at the picture's edge.
+WebGL viewer has in common is `WEBGL`. What no record has: the limit of a splat's size (1024 px or the picture's size), the coarse order of
+depths in which PlayCanvas draws on WebGL, and that only INRIA's family freezes the Jacobian at the picture's edge.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from mipmap_plugin.effects import DILATION, NEAR_PLANE, USUAL, Effects, Packing, RenderSettings
@@ -41,15 +42,16 @@ class Viewer:
 # Standard deviations at which viewers that draw a splat as a square of 2 by 2 with the weight exp(-r²) to r = 2 end it.
 EDGE = 8**0.5
 
-# Pictures of 8 bits: what adds less than half a step to them is not seen. A splat may cover a pixel wholly; the largest alpha is a little
-# less, so that what lies behind keeps a gradient. No viewer stops at a transmittance; here one so small that nobody sees it ends a pixel.
-WEBGL = RenderSettings(min_alpha=0.5 / 255, radius=EDGE, max_alpha=0.999, min_transmittance=1e-6)
+# Pictures of 8 bits, in which each splat is rounded: what adds less than half a step to them is not seen. A splat may cover a pixel wholly;
+# here the largest alpha is a little less, so that what lies behind keeps a gradient. No viewer stops at a transmittance; here one so small
+# that nobody sees it ends a pixel.
+WEBGL = RenderSettings(min_alpha=0.5 / 255, radius=EDGE, max_alpha=0.999, min_transmittance=1e-6, picture_step=1 / 255)
 
 # px²: PlayCanvas and Cesium ask for half-axes of 2 half pixels: 2·sqrt(2·4·v) >= 2, v >= 1/8.
 PIXEL_SIZE = 1 / 8
 
 # px²: PlayCanvas asks for opacity · 2π · sqrt(det) >= 3 in half pixels, where the determinant is 16 times as large.
-CONTRIBUTION = 3 / (2 * 3.14159265358979 * 4)
+CONTRIBUTION = 3 / (2 * math.pi * 4)
 
 PLAYCANVAS = replace(
     WEBGL,
@@ -93,7 +95,7 @@ BUILT_IN = (
     Viewer("playcanvas", "PlayCanvas and SuperSplat, WebGL", PLAYCANVAS_SOURCE, "classic", DILATION / 4, PLAYCANVAS),
     Viewer(
         "playcanvas-webgpu", "PlayCanvas and SuperSplat, WebGPU", "playcanvas 2.23.3, compute-gsplat-common, gsplat-hybrid-renderer",
-        "classic", DILATION / 4, replace(PLAYCANVAS, boxed=True, min_contribution=CONTRIBUTION), unlike="not compared with a picture",
+        "classic", DILATION / 4, replace(PLAYCANVAS, boxed=True, min_contribution=CONTRIBUTION),
     ),
     Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS),
     Viewer(
@@ -117,7 +119,7 @@ BUILT_IN = (
     ),
     Viewer(
         "unity", "UnityGaussianSplatting (aras-p)", "UnityGaussianSplatting 1.1.1 (2c6fed3), RenderGaussianSplats, GaussianSplatting.hlsl",
-        "classic", DILATION, replace(WEBGL, min_alpha=1 / 255),
+        "classic", DILATION, replace(WEBGL, min_alpha=1 / 255, picture_step=None),
         unlike="a splat ends at a square instead of an ellipse, and assets are packed as coarsely as they were asked to be; "
         "not compared with a picture",
     ),

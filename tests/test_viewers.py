@@ -44,7 +44,7 @@ def splat(across: float, down: float, opacity: float = 0.9, color: float = 0.5, 
 def alpha(backend, viewer: str, splats: Gaussians) -> torch.Tensor:
     """[SIZE, SIZE] alpha under a viewer whose packing, which has tests of its own, is left out."""
     effects = find_viewer(viewer).effects(Effects(0))
-    effects = replace(effects, settings=replace(effects.settings, packing=None, color_steps=None))
+    effects = replace(effects, settings=replace(effects.settings, packing=None, color_steps=None, picture_step=None))
     return backend.render(splats, camera(), effects).alpha
 
 
@@ -244,7 +244,7 @@ def test_a_large_splat_does_not_feel_the_cull(backend):
 @BOTH
 def test_spark_clips_colors_and_shows_them_in_steps(backend):
     effects = find_viewer("spark").effects(Effects(0))
-    effects = replace(effects, settings=replace(effects.settings, packing=None))
+    effects = replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
 
     def color(value):
         shown = backend.render(splat(40.0, 40.0, 1.0, value), camera(), effects)
@@ -259,7 +259,7 @@ def test_spark_clips_colors_and_shows_them_in_steps(backend):
 def test_a_color_in_steps_keeps_its_gradient(backend):
     leaves, splats = differentiable(splat(40.0, 40.0, 1.0, 0.2 / 255))  # shown as black, and not black
     effects = find_viewer("spark").effects(Effects(0))
-    effects = replace(effects, settings=replace(effects.settings, packing=None))
+    effects = replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
     shown = backend.render(splats, camera(), effects)
     shown.image[MIDDLE, MIDDLE, 0].backward()
     assert leaves["sh"].grad[0, 0, 0] == pytest.approx(C0 * shown.alpha[MIDDLE, MIDDLE].item(), rel=1e-4)
@@ -273,6 +273,30 @@ def test_spark_sorts_by_distance(backend):
     wide = replace(camera(), width=120, cx=60.0)
     first = {name: backend.render(pair, wide, find_viewer(name).effects(Effects(0))).image[MIDDLE, 82, 0].item() for name in ("spark", "classic")}
     assert first["spark"] > 0.5 > first["classic"]
+
+
+# Pictures of 8 bits
+
+
+@BOTH
+def test_a_picture_is_rounded_after_each_splat_from_the_back(backend):
+    settings = RenderSettings(min_alpha=0.5 / 255, max_alpha=0.999, min_transmittance=1e-6, picture_step=1 / 255)
+    parts = [splat(30.0, 30.0, opacity, color, means=(0.0, 0.0, depth)) for opacity, color, depth in ((0.01, 0.3, 9.0), (0.3, 0.9, 10.0))]
+    both = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(parts[0]) if f.name != "covariances"))
+    shown = backend.render(both, camera(), Effects(0, settings=settings, background=(0.2, 0.2, 0.2)))
+    behind = round(255 * (0.3 * 0.9 + 0.7 * 0.2)) / 255
+    assert shown.image[MIDDLE, MIDDLE, 0].item() == pytest.approx(round(255 * (0.01 * 0.3 + 0.99 * behind)) / 255, abs=1e-6)
+
+
+@BOTH
+def test_a_splat_of_less_than_half_a_step_is_not_seen_and_has_its_gradient(backend):
+    leaves, splats = differentiable(splat(30.0, 30.0, 0.01, 0.5))
+    settings = [RenderSettings(picture_step=step) for step in (1 / 255, None)]
+    images = [backend.render(splats, camera(), Effects(0, settings=each, background=(0.6, 0.6, 0.6))).image for each in settings]
+    assert (images[0] == images[0][0, 0]).all() and not (images[1] == images[1][0, 0]).all()
+    gradients = [torch.autograd.grad(image.sum(), list(leaves.values()), retain_graph=True) for image in images]
+    for rounded, exact in zip(*gradients, strict=True):
+        torch.testing.assert_close(rounded, exact)
 
 
 # Packing
@@ -326,10 +350,10 @@ def test_what_a_viewer_does_is_on_and_the_rest_is_off():
     for viewer in VIEWERS.names():
         told[viewer] = {part.name for part in explain(find_viewer(viewer).effects(Effects(0)), splat(1.0, 1.0)) if part.on}
     assert told["classic"] == {"screen filter"}
-    assert told["spark"] == {"screen filter", "compensation", "edge", "color limit", "order by distance", "packing"}
-    assert told["playcanvas"] == {"screen filter", "edge", "size cull", "color limit", "packing"}
+    assert told["spark"] == {"screen filter", "compensation", "edge", "color limit", "order by distance", "packing", "rounded picture"}
+    assert told["playcanvas"] == {"screen filter", "edge", "size cull", "color limit", "packing", "rounded picture"}
     assert told["playcanvas-webgpu"] == told["playcanvas"] | {"contribution cull"}
-    assert told["gaussian-splats-3d"] == {"screen filter", "edge", "stretching", "packing"}
+    assert told["gaussian-splats-3d"] == {"screen filter", "edge", "stretching", "packing", "rounded picture"}
 
 
 def test_the_usual_viewers_ask_for_nothing_new():

@@ -28,6 +28,7 @@ SETTINGS = {
     "min_contribution": "culling by contribution",
     "least_spread": "stretching of round splats",
     "packing": "packing",
+    "picture_step": "pictures that are rounded after each splat",
 }
 
 # Of these, what screen filters that integrate have: the others are about a splat's weight at a point.

@@ -49,8 +49,8 @@ class ReferenceBackend:
         one_by_one = alone(feet.alpha, settings.max_alpha, settings.culls)
         alphas, room = (feet.alphas, feet.ROOM) if isinstance(feet, WindowIntegral) else (one_by_one, 1)
         splats = Splats(projected.means2d, feet.packed(), rgb, least, alphas, room)
-        color, through = composite(splats, feet.extents(least), camera, settings)
-        return Rendered(color + through[..., None] * color.new_tensor(effects.background), 1 - through)
+        image, through = composite(splats, feet.extents(least), camera, settings, rgb.new_tensor(effects.background))
+        return Rendered(image, 1 - through)
 
 
 def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor:

@@ -79,16 +79,28 @@ def random_scene(seed: int, screen_filter: str, eps2d: float, degree: int = 3) -
 
 
 def seen_in(viewer: Viewer, seed: int) -> HardCase:
-    """Splats from a twentieth of a pixel to some pixels, so that each of a viewer's rules takes some and leaves some."""
+    """Splats from a twentieth of a pixel to some pixels, so that each of a viewer's rules takes some and leaves some.
+
+    The picture is not rounded: in another precision rounding falls to the other side here and there, and a pixel moves by a step.
+    """
     gaussians = crowd(120, 3, seed)
     sizes = 0.02 + 0.4 * torch.rand(120, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 2
     gaussians = replace(gaussians, scales=gaussians.scales * sizes)
-    return HardCase(gaussians, view(40, 32, turned=True), viewer.effects(Effects(3, background=(1.0, 1.0, 1.0))))
+    return HardCase(gaussians, view(40, 32, turned=True), _unrounded(viewer.effects(Effects(3, background=(1.0, 1.0, 1.0)))))
 
 
 def odd_row_seen_in(viewer: Viewer, row: dict[str, Tensor]) -> HardCase:
     case = odd_row(row)
-    return case._replace(effects=viewer.effects(case.effects))
+    return case._replace(effects=_unrounded(viewer.effects(case.effects)))
+
+
+def _unrounded(effects: Effects) -> Effects:
+    return replace(effects, settings=replace(effects.settings, picture_step=None))
+
+
+def in_a_rounded_picture() -> HardCase:
+    settings = RenderSettings(picture_step=1 / 255, min_alpha=0.5 / 255, max_alpha=0.999, min_transmittance=1e-6)
+    return HardCase(crowd(), view(), Effects(1, background=(0.2, 0.5, 0.9), settings=settings))
 
 
 def ruled(rule: RenderSettings, seed: int = 1) -> HardCase:
@@ -232,6 +244,7 @@ CASES: dict[str, Builder] = {
         for name, viewer in product(ODD_IN_VIEWERS, OTHERS)
         if viewer.eps2d or not name.startswith("needle")  # without any dilation its width is lost in float32
     },
+    "rule-rounded-picture": in_a_rounded_picture,
     **{f"rule-{name}": partial(ruled, rule) for name, rule in RULES.items()},
     "nan-in-covariances": partial(covariances_given, "classic", broken=True),
     **{

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import compositing, projection, pulling, sorting, window_tiles
+from mipmap_plugin.backends.cpu_kernels import compositing, projection, pulling, rounding, sorting, window_tiles
 from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW, Frame, Limits, Lists, Splats, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.backends.filters import LEAST_LIGHT, w_end
@@ -38,7 +38,7 @@ class Drawing(NamedTuple):
 def draw(splats: Splats, camera: Camera, effects: Effects, *, gradients: bool = True) -> tuple[np.ndarray, np.ndarray, Drawing]:
     """The image [H, W, 3], alpha [H, W] and what to remember of them. gradients: whether `draw_back` will be asked for."""
     view = view_of(camera, effects, splats, gradients)
-    limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance)
+    limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, effects.settings.picture_step or 0.0)
     count, (height, width) = len(splats.means), camera.size
     table, depths, counts, slots = _empty(count, col.COLUMNS), _empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
     shown = _empty(height, width, 3), _empty(height, width)
@@ -51,6 +51,8 @@ def draw(splats: Splats, camera: Camera, effects: Effects, *, gradients: bool = 
         threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, shown)
     else:
         threads.share(compositing.composite, len(lists.starts) - 1, view.seen == SEEN_IN_PIXEL, limits, table, lists, frame, shown)
+        if limits.picture_step > 0:
+            threads.share(rounding.composite, len(lists.starts) - 1, limits, table, lists, frame, shown)
     return *shown, Drawing(view, splats, table, slots, lists, frame, limits)
 
 

@@ -28,7 +28,7 @@ STATE = BEGIN + 4 * TILE_ROWS
 @inner
 def cover(alpha, bright, limits, color, n, at, state):
     """Lay the n-th splat of a tile over the 16 pixels at `at`, where it is bright enough."""
-    most, least = limits
+    most, least, _ = limits
     alpha = minimum(alpha, most)
     before = load(state, LIGHT + at)
     after = before * (1 - alpha)
@@ -46,7 +46,7 @@ def cover(alpha, bright, limits, color, n, at, state):
 @inner
 def uncover(alpha, bright, limits, color, n, at, state):
     """Take the n-th splat of a tile off the 16 pixels at `at`: alpha · dLoss/dalpha, dLoss/dalpha, its weight there, and dLoss/dimage."""
-    most, _ = limits
+    most, _, _ = limits
     shown = both(bright, n < load(state, ENDS + at))
     light = select(shown, minimum(alpha, most), 0)
     before = load(state, LIGHT + at) / (1 - light)

@@ -61,6 +61,7 @@ class Limits(NamedTuple):
 
     max_alpha: float
     min_transmittance: float
+    picture_step: float  # 0: pictures are not rounded
 
 
 class Lists(NamedTuple):

@@ -19,7 +19,7 @@ from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, END, ENDS, LIGHT, P
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
-USUAL = (MAX_ALPHA, MIN_TRANSMITTANCE)
+USUAL = (MAX_ALPHA, MIN_TRANSMITTANCE, 0.0)
 
 # Where the planes of windows begin in a tile's state: x, y, width, height; in the backward pass their gradients.
 WINDOWS = STATE
