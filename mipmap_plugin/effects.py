@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Literal
@@ -23,6 +24,10 @@ MIN_TRANSMITTANCE = 1e-4  # a pixel this opaque is finished
 # What every 3DGS rasterizer covers at most (diff-gaussian-rasterization, forward.cu): it keeps 1 - alpha away from 0, where the gradient of
 # everything behind the splat vanishes.
 MAX_ALPHA = 0.99
+
+# The share of the half field of view by which a centre may lie outside the image before the Jacobian is frozen there;
+# further out the affine approximation would blow splats up (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
+FRUSTUM_MARGIN = 0.3
 
 TILE = 16  # px
 
@@ -73,6 +78,8 @@ class RenderSettings:
     min_contribution: float = 0.0  # px², after dilation: a splat is culled whose opacity · sqrt(det) is less
     least_spread: float = 0.0  # px², after dilation: variances lie at least so far from their mean; a splat whose smaller one is then 0 is culled
     packing: Packing | None = None  # how coarsely splats are kept
+    frozen_beyond: float = FRUSTUM_MARGIN  # infinity: the Jacobian is frozen nowhere
+    frame: float = math.inf  # halves of the picture from its middle: a splat whose center lies beyond, along x or y, is not drawn
     picture_step: float | None = None  # the picture is rounded to multiples after each splat, back to front; the gradient is of one that is not
 
     def __post_init__(self) -> None:
@@ -198,6 +205,8 @@ def _of_a_viewer(settings: RenderSettings) -> list[Effect]:
         ("size cull", size > 0, f"{culled} {which} is below {size:.3g} px²", "no splat is too small to be drawn", root),
         ("contribution cull", light > 0, f"{culled} opacity · sqrt(det) is below {light:.3g} px²", "no splat gives too little", root),
         ("stretching", spread > 0, stretched, "round splats stay round", "two roots and four quotients a splat"),
+        ("frame", settings.frame < math.inf, f"not drawn is a splat whose center lies {settings.frame:g} half pictures from the middle",
+         "a splat is drawn wherever its center lies", "two comparisons a splat"),
         ("color limit", limit is not None, f"no color is above {limit or 0:g}", "colors have no upper bound", "a comparison a channel and splat"),
         ("order by distance", settings.radial, "the nearest to the eye is in front", "the least deep is in front", "a root a splat"),
         ("rounded picture", settings.picture_step is not None, "8 bits after each splat", "rounded once it is shown", "the image once more"),

@@ -2,8 +2,8 @@
 
 Read in the sources of the versions named, which count variances in other units: where a viewer's focal length is viewport · projection, and
 so twice that of the picture, a variance of v there is v/4 px² here; where its covariances are four times as large besides, v/16. What every
-WebGL viewer has in common is `WEBGL`. What no record has: the limit of a splat's size (1024 px or the picture's size), the coarse order of
-depths in which PlayCanvas draws on WebGL, and that only INRIA's family freezes the Jacobian at the picture's edge.
+WebGL viewer has in common is `WEBGL`. What no record has: the limit of a splat's size (512 px in Spark, 1024 px or the picture's size in others),
+and the coarse order of depths in which PlayCanvas draws on WebGL.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from mipmap_plugin.effects import DILATION, NEAR_PLANE, USUAL, Effects, Packing, RenderSettings
+from mipmap_plugin.effects import DILATION, FRUSTUM_MARGIN, NEAR_PLANE, USUAL, Effects, Packing, RenderSettings
 from mipmap_plugin.errors import PluginError
 from mipmap_plugin.registry import Registry
 
@@ -45,7 +45,7 @@ EDGE = 8**0.5
 # Pictures of 8 bits, in which each splat is rounded: what adds less than half a step to them is not seen. A splat may cover a pixel wholly;
 # here the largest alpha is a little less, so that what lies behind keeps a gradient. No viewer stops at a transmittance; here one so small
 # that nobody sees it ends a pixel.
-WEBGL = RenderSettings(min_alpha=0.5 / 255, radius=EDGE, max_alpha=0.999, min_transmittance=1e-6, picture_step=1 / 255)
+WEBGL = RenderSettings(min_alpha=0.5 / 255, radius=EDGE, max_alpha=0.999, min_transmittance=1e-6, frozen_beyond=math.inf, picture_step=1 / 255)
 
 # px²: PlayCanvas and Cesium ask for half-axes of 2 half pixels: 2·sqrt(2·4·v) >= 2, v >= 1/8.
 PIXEL_SIZE = 1 / 8
@@ -84,13 +84,12 @@ BUILT_IN = (
         "spark", "Spark (three.js)", "@sparkjsdev/spark 2.2.0, SparkRenderer, vertex and fragment shader, packSplatEncoding",
         "mip", DILATION,
         replace(
-            WEBGL, radial=True, max_color=1.0, color_steps=(1 / 255, 1 / 255, 1 / 255),
+            WEBGL, frame=1.4, radial=True, max_color=1.0, color_steps=(1 / 255, 1 / 255, 1 / 255),
             packing=Packing(
                 opacity=(1 / 255, 2 / 255), color=1 / 255, bands=(1 / 63, 1 / 127, 1 / 31),
                 log_scales=(-12.0, 9.0, 21 / 254), quats="octahedral", half_means=True,
             ),
         ),
-        unlike="a splat whose center lies beyond 1.4 times the picture is not drawn",
     ),
     Viewer("playcanvas", "PlayCanvas and SuperSplat, WebGL", PLAYCANVAS_SOURCE, "classic", DILATION / 4, PLAYCANVAS),
     Viewer(
@@ -100,26 +99,26 @@ BUILT_IN = (
     Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS),
     Viewer(
         "gaussian-splats-3d", "GaussianSplats3D", "@mkkellogg/gaussian-splats-3d 0.4.7, SplatMaterial3D",
-        "classic", DILATION, replace(WEBGL, least_spread=0.1**0.5, packing=replace(EIGHT_BITS, downwards=True)), sh_degree=0,
+        "classic", DILATION, replace(WEBGL, frame=1.2, least_spread=0.1**0.5, packing=replace(EIGHT_BITS, downwards=True)), sh_degree=0,
         unlike="degree 0 is its default, and 2 what it can be asked for",
     ),
     Viewer(
         "antimatter15", "antimatter15/splat", "antimatter15/splat ba182b5, main.js", "classic", 0.0,
-        replace(WEBGL, packing=EIGHT_BITS), sh_degree=0, unlike="covariances are kept in float16; not compared with a picture",
+        replace(WEBGL, frame=1.2, packing=EIGHT_BITS), sh_degree=0, unlike="covariances are kept in float16; not compared with a picture",
     ),
     Viewer(
         "cesium", "Cesium", "@cesium/engine 24.0.0, PrimitiveGaussianSplat shaders; cesium-wasm-utils, wasm-splats", "classic", DILATION / 16,
-        replace(WEBGL, min_variance=PIXEL_SIZE, packing=EIGHT_BITS),
+        replace(WEBGL, frame=1.2, min_variance=PIXEL_SIZE, packing=EIGHT_BITS),
         unlike="a splat ends at a square instead of an ellipse, and covariances are kept in float16; not compared with a picture",
     ),
     Viewer(
         "babylon", "Babylon.js", "@babylonjs/core 9.34.0, gaussianSplatting shaders, GaussianSplattingMaterial", "classic", DILATION / 4,
-        replace(WEBGL, packing=EIGHT_BITS),
+        replace(WEBGL, frame=1.2, packing=EIGHT_BITS),
         unlike="covariances are kept in float16 and coefficients in 8 bits; not compared with a picture",
     ),
     Viewer(
         "unity", "UnityGaussianSplatting (aras-p)", "UnityGaussianSplatting 1.1.1 (2c6fed3), RenderGaussianSplats, GaussianSplatting.hlsl",
-        "classic", DILATION, replace(WEBGL, min_alpha=1 / 255, picture_step=None),
+        "classic", DILATION, replace(WEBGL, min_alpha=1 / 255, frozen_beyond=FRUSTUM_MARGIN, picture_step=None),
         unlike="a splat ends at a square instead of an ellipse, and assets are packed as coarsely as they were asked to be; "
         "not compared with a picture",
     ),

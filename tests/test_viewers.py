@@ -299,6 +299,36 @@ def test_a_splat_of_less_than_half_a_step_is_not_seen_and_has_its_gradient(backe
         torch.testing.assert_close(rounded, exact)
 
 
+# Beside the picture
+
+
+@BOTH
+@pytest.mark.parametrize(("viewer", "most"), [("spark", 1.4), ("gaussian-splats-3d", 1.2)])
+def test_a_splat_is_left_out_by_its_center(backend, viewer, most):
+    def seen(halves):
+        return alpha(backend, viewer, splat(900.0, 900.0, means=(halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max()
+
+    assert seen(most - 0.01) > 0.5 and seen(1 - most) > 0.5
+    assert seen(most + 0.01) == seen(-most - 0.01) == 0
+    assert alpha(backend, "playcanvas", splat(900.0, 900.0, means=(1.5 * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max() > 0.5
+
+
+@BOTH
+def test_on_the_web_the_projection_is_frozen_nowhere(backend):
+    """A ball far aside: along x its variance on the picture is f²σ²/z² · (1 + (x/z)²)."""
+    sigma, f = 0.3, 20.0
+    near = replace(camera(), fx=f, fy=f)  # half the picture is 0.525 wide: 1.3 of that is 0.68, and 0.9 lies beyond
+    for slope in (0.5, 0.9):
+        shape = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), sigma)
+        ball = Gaussians(torch.tensor([[slope * 2, 0.0, 2.0]]), *shape, torch.tensor([0.9]), torch.zeros(1, 1, 3))
+        variance = (f * sigma / 2) ** 2 * (1 + slope**2)
+        dx = 20.5 - (SIZE / 2 + f * slope)
+        shown = backend.render(ball, near, Effects(0, eps2d=0.0, settings=RenderSettings(frozen_beyond=math.inf))).alpha
+        assert shown[MIDDLE, 20].item() == pytest.approx(0.9 * math.exp(-(dx**2) / variance / 2), abs=1e-5)
+    frozen = backend.render(ball, near, Effects(0, eps2d=0.0)).alpha
+    assert frozen[MIDDLE, 20] < shown[MIDDLE, 20] - 0.01
+
+
 # Packing
 
 
@@ -350,10 +380,10 @@ def test_what_a_viewer_does_is_on_and_the_rest_is_off():
     for viewer in VIEWERS.names():
         told[viewer] = {part.name for part in explain(find_viewer(viewer).effects(Effects(0)), splat(1.0, 1.0)) if part.on}
     assert told["classic"] == {"screen filter"}
-    assert told["spark"] == {"screen filter", "compensation", "edge", "color limit", "order by distance", "packing", "rounded picture"}
+    assert told["spark"] == {"screen filter", "compensation", "edge", "frame", "color limit", "order by distance", "packing", "rounded picture"}
     assert told["playcanvas"] == {"screen filter", "edge", "size cull", "color limit", "packing", "rounded picture"}
     assert told["playcanvas-webgpu"] == told["playcanvas"] | {"contribution cull"}
-    assert told["gaussian-splats-3d"] == {"screen filter", "edge", "stretching", "packing", "rounded picture"}
+    assert told["gaussian-splats-3d"] == {"screen filter", "edge", "frame", "stretching", "packing", "rounded picture"}
 
 
 def test_the_usual_viewers_ask_for_nothing_new():

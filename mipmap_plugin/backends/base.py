@@ -28,11 +28,15 @@ SETTINGS = {
     "min_contribution": "culling by contribution",
     "least_spread": "stretching of round splats",
     "packing": "packing",
+    "frozen_beyond": "projection that is frozen elsewhere or nowhere",
+    "frame": "leaving out by the center",
     "picture_step": "pictures that are rounded after each splat",
 }
 
 # Of these, what screen filters that integrate have: the others are about a splat's weight at a point.
-OF_INTEGRALS = frozenset({"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "packing"})
+OF_INTEGRALS = frozenset(
+    {"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "frozen_beyond", "frame", "packing"}
+)
 
 # Raised when `Backend.render` or the records below change in a way that an old backend cannot serve.
 API_VERSION = 1

@@ -36,7 +36,8 @@ class CpuBackend:
 
     def lacking(self, needs: Needs) -> list[str]:
         missing = [] if importlib.util.find_spec("numba") else [NO_NUMBA]
-        changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - {"max_color", "color_steps", "radial", "packing"}
+        served = {"max_color", "color_steps", "radial", "frozen_beyond", "packing"}
+        changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - served
         fixed = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
         return missing + self.capabilities.lacking(needs) + fixed
 

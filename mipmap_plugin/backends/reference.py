@@ -63,6 +63,8 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor
     half = feet.extents(least)
     low, high = projected.means2d - half, projected.means2d + half
     inside = (high > 0).all(1) & (low < low.new_tensor([camera.width, camera.height])).all(1)
+    if effects.settings.frame < math.inf:
+        inside &= (2 * projected.means2d / low.new_tensor([camera.width, camera.height]) - 1).abs().amax(1) <= effects.settings.frame
     drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & feet.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
     along = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1) if effects.settings.radial else projected.depths
@@ -90,5 +92,5 @@ def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Te
 
 
 def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral]:
-    projected = project(gaussians, camera, effects.near_plane)
+    projected = project(gaussians, camera, effects.near_plane, effects.settings.frozen_beyond)
     return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings)

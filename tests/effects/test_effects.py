@@ -48,6 +48,7 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
         "size cull": (False, "no splat is too small to be drawn"),
         "contribution cull": (False, "no splat gives too little"),
         "stretching": (False, "round splats stay round"),
+        "frame": (False, "a splat is drawn wherever its center lies"),
         "color limit": (False, "colors have no upper bound"),
         "order by distance": (False, "the least deep is in front"),
         "rounded picture": (False, "rounded once it is shown"),
@@ -65,8 +66,9 @@ def test_everything_on():
     given = Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, torch.eye(3).expand(4, 3, 3))
     of_model = [replace(effect, on=True) for effect in OF_OTHER_MODELS]
     everything = RenderSettings(
-        radius=3.0, min_variance=1.0, min_contribution=1.0, least_spread=1.0, max_color=1.0, radial=True, packing=Packing(), picture_step=0.1
-    )
+        radius=3.0, min_variance=1.0, min_contribution=1.0, least_spread=1.0, max_color=1.0, radial=True, packing=Packing(), picture_step=0.1,
+        frame=1.0,
+    )  # fmt: skip
     asked = Effects(1, "antialiased", 0.1, supersampling=4, settings=everything, outputs=("depth", "normals"))
     effects = explain(asked, given, of_model, recipe("paper", 4), 4)
     assert all(effect.on for effect in effects)

@@ -222,6 +222,7 @@ RULES = {
     "spread": RenderSettings(least_spread=3.0),
     "largest-color": RenderSettings(max_color=0.6),
     "distance": RenderSettings(radial=True),
+    "frame": RenderSettings(frame=0.7, frozen_beyond=math.inf),
 }
 
 CASES: dict[str, Builder] = {

@@ -13,7 +13,6 @@ from mipmap_plugin.backends.cpu_kernels import compositing, projection, pulling,
 from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW, Frame, Limits, Lists, Splats, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.backends.filters import LEAST_LIGHT, w_end
-from mipmap_plugin.backends.projection import FRUSTUM_MARGIN
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 
@@ -79,7 +78,7 @@ def view_of(camera: Camera, effects: Effects, splats: Splats, gradients: bool) -
     settings = effects.settings
     left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
-    across, down = FRUSTUM_MARGIN * (left + right) / 2, FRUSTUM_MARGIN * (top + bottom) / 2
+    across, down = settings.frozen_beyond * (left + right) / 2, settings.frozen_beyond * (top + bottom) / 2
     rotation, translation = camera.viewmat.numpy()[:3, :3], camera.viewmat.numpy()[:3, 3]
     return View(
         rotation=tuple(map(tuple, rotation.tolist())),
@@ -103,6 +102,7 @@ def view_of(camera: Camera, effects: Effects, splats: Splats, gradients: bool) -
         max_color=math.inf if settings.max_color is None else settings.max_color,
         color_steps=settings.color_steps or (0.0, 0.0, 0.0),
         radial=settings.radial,
+        frame=settings.frame,
         min_alpha=settings.min_alpha,
         cut=0.0 if settings.radius is None or settings.fades else math.exp(-(settings.radius**2) / 2),
         faded=w_end(settings),

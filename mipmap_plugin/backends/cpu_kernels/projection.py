@@ -134,7 +134,8 @@ def fill_shape(view, p, flat, opacity, block):
 def fill_point(view, x, y, shape, opacity, light, block):
     """`fill_shape` of splats that are seen at the centers of pixels."""
     shown = opacity * light
-    drawn = shown >= view.min_alpha
+    aside = maximum(abs_of(x * (2 / view.width) - 1), abs_of(y * (2 / view.height) - 1))
+    drawn = both(shown >= view.min_alpha, aside <= view.frame)
     put(block, col.GATE, spread(1))
     if view.culls:
         there = culling.is_drawn(view, shape, opacity)
@@ -149,6 +150,11 @@ def fill_point(view, x, y, shape, opacity, light, block):
     put(block, col.GAIN, narrow(gain))
     put(block, col.FLOOR, narrow(floor))
     return both(drawn, fill_ellipse(x, y, shape, whole / gain, block))
+
+
+@inner
+def abs_of(lanes):
+    return maximum(lanes, 0 - lanes)
 
 
 @inner

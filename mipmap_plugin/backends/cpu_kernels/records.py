@@ -34,6 +34,7 @@ class View(NamedTuple):
     max_color: float
     color_steps: tuple  # three; 0: not rounded
     radial: bool  # whether the order is that of distances
+    frame: float  # half pictures
     min_alpha: float
     cut: float  # the weight at which a splat is cut off; 0: none is
     faded: float  # the weight at which a splat has faded to 0; 0: none does
