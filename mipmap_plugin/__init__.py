@@ -8,6 +8,7 @@ from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model, register_model
 from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.viewers import Viewer, register_viewer
 from mipmap_plugin.wrap import Adapted, Wrapped, wrap_model
 
 __all__ = [
@@ -16,11 +17,13 @@ __all__ = [
     "Effects",
     "Gaussians",
     "MipmapPluginError",
+    "Viewer",
     "Wrapped",
     "load_model",
     "load_scene",
     "register_backend",
     "register_model",
     "register_upsampler",
+    "register_viewer",
     "wrap_model",
 ]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
@@ -18,6 +20,14 @@ NEAR_PLANE = 0.2
 # What every 3DGS rasterizer leaves out (diff-gaussian-rasterization, forward.cu).
 MIN_ALPHA = 1 / 255  # below one 8-bit step a splat cannot change a displayed pixel
 MIN_TRANSMITTANCE = 1e-4  # a pixel this opaque is finished
+
+# What every 3DGS rasterizer covers at most (diff-gaussian-rasterization, forward.cu): it keeps 1 - alpha away from 0, where the gradient of
+# everything behind the splat vanishes.
+MAX_ALPHA = 0.99
+
+# The share of the half field of view by which a centre may lie outside the image before the Jacobian is frozen there;
+# further out the affine approximation would blow splats up (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
+FRUSTUM_MARGIN = 0.3
 
 TILE = 16  # px
 
@@ -35,13 +45,64 @@ OUTPUTS = {
 
 
 @dataclass(frozen=True)
+class Packing:
+    """How coarsely a viewer keeps splats in memory. None: exactly. What is kept is the nearest multiple of a step."""
+
+    opacity: tuple[float, ...] = (1 / 255,)  # steps, one rounding after the other
+    color: float | None = None  # step of the color of SH degree 0, which is kept within 0..1
+    downwards: bool = False  # opacities and colors are kept as the next lower multiple
+    bands: tuple[float, ...] = ()  # steps of the coefficients of SH degree 1, 2, ..., kept within -1..1
+    log_scales: tuple[float, float, float] | None = None  # the least, the most, and the step between, of natural logarithms
+    quats: Literal["octahedral", "stereographic"] | None = None  # `backends.packing`
+    half_means: bool = False  # float16, in the world and again relative to the eye
+
+
+@dataclass(frozen=True)
 class RenderSettings:
-    """What an image may lack so that it is drawn sooner. Only `tile` changes nothing but the time."""
+    """How a splat becomes pixels, and what is left out. `tile` changes nothing but the time. A viewer's own are in `viewers`.
+
+    A splat that is culled (by `min_variance`, `min_contribution` or `least_spread`) is not drawn, but has a gradient (`backends.culls`).
+    """
 
     min_alpha: float = MIN_ALPHA  # below it a splat is not drawn on a pixel
     min_transmittance: float = MIN_TRANSMITTANCE  # a pixel stops before the splat that would leave it less
     radius: float | None = None  # standard deviations at which a splat ends; None: where `min_alpha` ends it
     tile: int = TILE  # px: pixels that share a list of splats
+    max_alpha: float = MAX_ALPHA  # a splat covers no more of a pixel
+    fades: bool = False  # a splat falls to 0 at `radius`: (w - w_end) / (1 - w_end) of its weight w, instead of an end where it still has w_end
+    max_color: float | None = None  # of a splat, in each channel
+    color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are the nearest multiples
+    radial: bool = False  # nearer is what lies nearer to the eye, instead of what lies less deep
+    min_variance: float = 0.0  # px², after dilation: a splat is culled whose variance along its longer axis is less,
+    boxed: bool = False  # or, where this is set, the larger of those along x and y
+    min_contribution: float = 0.0  # px², after dilation: a splat is culled whose opacity · sqrt(det) is less
+    least_spread: float = 0.0  # px², after dilation: variances lie at least so far from their mean; a splat whose smaller one is then 0 is culled
+    packing: Packing | None = None  # how coarsely splats are kept
+    frozen_beyond: float = FRUSTUM_MARGIN  # infinity: the Jacobian is frozen nowhere
+    frame: float = math.inf  # halves of the picture from its middle: a splat whose center lies beyond, along x or y, is not drawn
+    picture_step: float | None = None  # the picture is rounded to multiples after each splat, back to front; the gradient is of one that is not
+
+    def __post_init__(self) -> None:
+        if self.fades and self.radius is None:
+            raise SettingsError("a splat that fades needs the radius at which it is gone; give radius, such as 8**0.5")
+
+    @property
+    def culls(self) -> bool:
+        return max(self.min_variance, self.min_contribution, self.least_spread) > 0
+
+    def changed(self) -> list[str]:
+        """The names of what is not as usual."""
+        return [f.name for f in fields(self) if getattr(self, f.name) != getattr(USUAL, f.name)]
+
+    def of_any_color(self) -> RenderSettings:
+        """The same without what is done to colors, for images whose colors are other numbers."""
+        packing = None if self.packing is None else replace(self.packing, color=None, bands=())
+        return replace(self, max_color=None, color_steps=None, packing=packing, picture_step=None)
+
+    def finer(self, n: int) -> RenderSettings:
+        """The same for an image of n times as many pixels each way: areas in px² keep their size in pixels of the coarse one."""
+        areas = {name: getattr(self, name) * n**2 for name in ("min_variance", "min_contribution", "least_spread")}
+        return replace(self, **areas) if self.culls else self
 
 
 USUAL = RenderSettings()
@@ -124,9 +185,34 @@ def _of_rendering(effects: Effects, gaussians: Gaussians) -> list[Effect]:
         Effect("screen filter", effects.eps2d > 0 or integrates, f"{effects.screen_filter}, {size}", exponentials),
         Effect("compensation", effects.screen_filter in COMPENSATED, f"the screen filter is {effects.screen_filter}", "one root a splat"),
         Effect("supersampling", n > 1, f"{n * n} sample{'s' if n > 1 else ''} a pixel", f"{n * n if n > 1 else 'N x N'} times the pixels"),
+        *_of_a_viewer(effects.settings),
         Effect("covariances", given, "the model gives them" if given else "quaternions and scales suffice", extra),
         *(Effect(name, name in effects.outputs, "asked for" if name in effects.outputs else "not asked for", cost) for name, cost in OUTPUTS.items()),
     ]
+
+
+def _of_a_viewer(settings: RenderSettings) -> list[Effect]:
+    """What a viewer does beside its screen filter."""
+    size, light, spread = settings.min_variance, settings.min_contribution, settings.least_spread
+    ends = f"a splat {'falls to 0' if settings.fades else 'is cut'} at {settings.radius or 0:.3g} standard deviations"
+    which = "larger variance along x and y" if settings.boxed else "variance along its longer axis"
+    culled = "not drawn is a splat whose"
+    stretched = f"variances lie {spread:.3g} px² from their mean at least, and a splat that would end at 0 is not drawn"
+    root, limit = "a root and a comparison a splat", settings.max_color
+    rounded = settings.packing is not None or settings.color_steps is not None
+    parts = [
+        ("edge", settings.radius is not None, ends, f"a splat ends where it is below {settings.min_alpha:.2g}", "an exponential a splat"),
+        ("size cull", size > 0, f"{culled} {which} is below {size:.3g} px²", "no splat is too small to be drawn", root),
+        ("contribution cull", light > 0, f"{culled} opacity · sqrt(det) is below {light:.3g} px²", "no splat gives too little", root),
+        ("stretching", spread > 0, stretched, "round splats stay round", "two roots and four quotients a splat"),
+        ("frame", settings.frame < math.inf, f"not drawn is a splat whose center lies {settings.frame:g} half pictures from the middle",
+         "a splat is drawn wherever its center lies", "two comparisons a splat"),
+        ("color limit", limit is not None, f"no color is above {limit or 0:g}", "colors have no upper bound", "a comparison a channel and splat"),
+        ("order by distance", settings.radial, "the nearest to the eye is in front", "the least deep is in front", "a root a splat"),
+        ("rounded picture", settings.picture_step is not None, "8 bits after each splat", "rounded once it is shown", "the image once more"),
+        ("packing", rounded, "the viewer keeps splats rounded", "splats are kept exactly", "a rounding for each number of a splat"),
+    ]
+    return [Effect(name, on, why if on else why_not, cost) for name, on, why, why_not, cost in parts]
 
 
 def _view_dependent_color(degree: int, gaussians: Gaussians) -> Effect:

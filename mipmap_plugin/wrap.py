@@ -29,6 +29,7 @@ from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
 from mipmap_plugin.scenes import Scene, model_cameras
+from mipmap_plugin.viewers import find_viewer
 
 
 class Wrapped:
@@ -38,15 +39,20 @@ class Wrapped:
         self.model, self.cameras, self._backend, self.trained = model, list(cameras), backend, trained
         self.background = trained.background or (0.0, 0.0, 0.0)
 
-    def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1) -> Effects:
-        """How this model is rendered at `scale`.
+    def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
+        """How this model is rendered at `scale`, or by the viewer of that name (`viewers`).
 
         `screen_filter`: None for what it was trained with, a filter's name, or "scaled" for the training-free filter
         whose dilation keeps its size in the world. The filters that integrate over the pixel see splats so dilated too: a
-        classic model was trained to look right with it.
+        classic model was trained to look right with it. Raises SettingsError for an unknown viewer, and for one and a filter.
         """
         trained = self.trained
         degree = self._needs.sh_degree
+        if viewer is not None:
+            if screen_filter is not None:
+                raise SettingsError(f"viewer {viewer} has a screen filter of its own; leave the screen filter {screen_filter} out")
+            shown = Effects(degree, background=self.background, supersampling=supersampling, near_plane=trained.near_plane)
+            return find_viewer(viewer).effects(shown)
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
@@ -55,9 +61,10 @@ class Wrapped:
             eps2d = trained.eps2d * scale**2
         return Effects(degree, screen_filter, eps2d, self.background, supersampling, trained.near_plane)
 
-    def backend(self, *, gradients: bool = False, screen_filter: str | None = None) -> tuple[Backend, str]:
+    def backend(self, *, gradients: bool = False, screen_filter: str | None = None, viewer: str | None = None) -> tuple[Backend, str]:
         """The backend that serves this model, and why it was taken."""
-        needs = replace(self._needs, gradients=gradients, screen_filter=self.effects(screen_filter=screen_filter).screen_filter)
+        effects = self.effects(screen_filter=screen_filter, viewer=viewer)
+        needs = replace(self._needs, gradients=gradients, screen_filter=effects.screen_filter, settings=effects.settings)
         return choose_backend(self._backend, needs)
 
     def lacks(self, screen_filter: str) -> str:
@@ -78,15 +85,17 @@ class Wrapped:
         *,
         outputs: Sequence[str] = (),
         exposure: bool = False,
+        viewer: str | None = None,
     ) -> Rendered:
         """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did.
 
         `filter_3d`: every splat is smoothed first by what the cameras could see of it at best (Mip-Splatting's 3D filter).
         `outputs`: "depth" and "normals" are drawn beside the image (`Rendered`). `exposure`: the colors become those of the
         photograph that `camera` is named after, as the checkpoint's exposure.json has it. Raises SettingsError where it has none.
+        `viewer`: the view as that viewer draws it, instead of `screen_filter`.
         """
-        effects = replace(self.effects(scale, screen_filter, supersampling), outputs=tuple(outputs), exposure=exposure)
-        backend, _ = self.backend(screen_filter=screen_filter)
+        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(outputs), exposure=exposure)
+        backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if filter_3d else None
         return shown(self.model, backend, camera, effects, form)
 

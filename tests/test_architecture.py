@@ -16,6 +16,7 @@ STOREYS = [
     {"registry", "config", "files", "torchvision_absent"},
     {"gaussians", "camera"},
     {"effects"},
+    {"viewers"},
     {"backends", "models", "scenes"},
     {"adaptation"},
     {"wrap"},

@@ -9,8 +9,34 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import USUAL, Effect, Effects, RenderSettings
+from mipmap_plugin.effects import INTEGRATED, USUAL, Effect, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
+
+# What a backend may have beyond the usual, by the names of RenderSettings, and what it is called.
+SETTINGS = {
+    "min_alpha": "another least alpha",
+    "min_transmittance": "another least transmittance",
+    "radius": "splats that end at a radius",
+    "tile": "other tiles",
+    "max_alpha": "another largest alpha",
+    "fades": "splats that fade to 0",
+    "max_color": "a largest color",
+    "color_steps": "rounded colors",
+    "radial": "splats in the order of their distance",
+    "min_variance": "culling by size",
+    "boxed": "culling by size along x and y",
+    "min_contribution": "culling by contribution",
+    "least_spread": "stretching of round splats",
+    "packing": "packing",
+    "frozen_beyond": "projection that is frozen elsewhere or nowhere",
+    "frame": "leaving out by the center",
+    "picture_step": "pictures that are rounded after each splat",
+}
+
+# Of these, what screen filters that integrate have: the others are about a splat's weight at a point.
+OF_INTEGRALS = frozenset(
+    {"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "frozen_beyond", "frame", "packing"}
+)
 
 # Raised when `Backend.render` or the records below change in a way that an old backend cannot serve.
 API_VERSION = 1
@@ -56,7 +82,7 @@ class Capabilities:
     gradients: bool = True
     max_sh_degree: int = 4
     covariances: bool = True
-    settings: bool = False  # other cut-offs and tiles than the usual ones
+    settings: frozenset[str] = frozenset()  # of SETTINGS, what it has
 
     def lacking(self, needs: Needs) -> list[str]:
         """One sentence for each need that is not met; empty when all are."""
@@ -73,8 +99,14 @@ class Capabilities:
             reasons.append(f"it has the screen filters {', '.join(sorted(self.screen_filters))}, not {needs.screen_filter}")
         if needs.covariances and not self.covariances:
             reasons.append("it takes quaternions and scales, not covariances")
-        if needs.settings != USUAL and not self.settings:
-            reasons.append("its cut-offs and tiles are fixed; the reference backend has others")
+        return reasons + self._settings_lacking(needs)
+
+    def _settings_lacking(self, needs: Needs) -> list[str]:
+        changed = needs.settings.changed()
+        absent = [SETTINGS[name] for name in changed if name not in self.settings]
+        reasons = [f"it does not have {', '.join(absent)}, which the reference backend has"] if absent else []
+        if needs.screen_filter in INTEGRATED and (pointwise := [SETTINGS[name] for name in changed if name not in OF_INTEGRALS]):
+            reasons.append(f"the screen filter {needs.screen_filter} is not drawn with {', '.join(pointwise)}")
         return reasons
 
 

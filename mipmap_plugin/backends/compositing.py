@@ -15,11 +15,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import RenderSettings
-
-# A published constant (diff-gaussian-rasterization, forward.cu): it keeps 1 - alpha away from 0, where the gradient of everything
-# behind the splat vanishes.
-MAX_ALPHA = 0.99
+from mipmap_plugin.effects import MAX_ALPHA, RenderSettings
 
 # (splat, pixel) pairs composited at once: about ten tensors of this many float32 live together, 0.3 GiB.
 BATCH_PAIRS = 1 << 23
@@ -38,18 +34,26 @@ class Splats:
     room: int = 1  # how many times the memory of a Gaussian `alphas` takes
 
 
-def alone(alpha: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
-    """`Splats.alphas` of splats whose alpha does not depend on those in front."""
+def alone(
+    alpha: Callable[[Tensor, Tensor, Tensor], Tensor], most: float = MAX_ALPHA, gated: bool = False
+) -> Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]:
+    """`Splats.alphas` of splats whose alpha does not depend on those in front, and is at most `most`.
+
+    gated: the last of what `alpha` needs is the share of a splat that is drawn, 1, or 0 where it is culled.
+    """
 
     def alphas(feet: Tensor, dx: Tensor, dy: Tensor, least: Tensor) -> Tensor:
-        found = alpha(feet, dx, dy).clamp_max(MAX_ALPHA)
-        return torch.where(found >= least, found, 0.0)
+        found = alpha(feet, dx, dy)
+        drawn = found.clamp_max(most) >= least
+        return torch.where(drawn, (feet[..., -1] * found if gated else found).clamp_max(most), 0.0)
 
     return alphas
 
 
-def composite(splats: Splats, extents: Tensor, camera: Camera, settings: RenderSettings) -> tuple[Tensor, Tensor]:
-    """Front-to-back over black: color [H, W, 3] and transmittance [H, W]. `extents` [M, 2]: half-sizes in px."""
+def composite(
+    splats: Splats, extents: Tensor, camera: Camera, settings: RenderSettings, background: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Front-to-back over `background` [3], black by default: color [H, W, 3] and transmittance [H, W]. `extents` [M, 2]: half-sizes in px."""
     tile = settings.tile
     columns, rows = -(-camera.width // tile), -(-camera.height // tile)
     starts, members = bin_tiles(splats.means2d, extents, columns, rows, tile)
@@ -57,6 +61,8 @@ def composite(splats: Splats, extents: Tensor, camera: Camera, settings: RenderS
     color = splats.colors[:0].sum() + splats.colors.new_zeros(rows * columns, tile**2, 3)
     through = splats.colors.new_ones(rows * columns, tile**2)
     parts = (splats.alphas, splats.means2d, splats.feet, splats.colors, splats.least_alpha, settings.min_transmittance)
+    background = splats.colors.new_zeros(3) if background is None else background
+    picture = background.expand(rows * columns, tile**2, 3)
     for tiles, ids in _batches(starts, members, splats.room * tile**2):
         pixels = _pixel_centers(tiles, columns, tile).to(splats.colors)
         if torch.is_grad_enabled():
@@ -64,6 +70,11 @@ def composite(splats: Splats, extents: Tensor, camera: Camera, settings: RenderS
         else:
             batch = _composite_batch(*parts, ids, pixels)
         color, through = color.index_copy(0, tiles, batch[0]), through.index_copy(0, tiles, batch[1])
+        if settings.picture_step is not None:
+            picture = picture.index_copy(0, tiles, _rounded(*parts[:-1], ids, pixels, background, settings.picture_step))
+    color = color + through[..., None] * background
+    if settings.picture_step is not None:
+        color = color + (picture - color).detach()
     return _untile(color, columns, tile, camera), _untile(through[..., None], columns, tile, camera)[..., 0]
 
 
@@ -102,16 +113,35 @@ def _composite_batch(
     alphas: Callable, means2d: Tensor, feet: Tensor, colors: Tensor, least: Tensor, stop: float, ids: Tensor, pixels: Tensor
 ) -> tuple[Tensor, Tensor]:
     """One batch of tiles: ids [B, K], pixels [B, P, 2] -> color [B, P, 3], transmittance [B, P]."""
-    shown = (ids >= 0)[:, :, None]
-    ids = ids.clamp_min(0)
-    dx, dy = (pixels[:, None] - means2d[ids][:, :, None]).unbind(-1)  # [B, K, P]
-    alpha = torch.where(shown, alphas(feet[ids][:, :, None], dx, dy, least[ids][:, :, None]), 0.0)
+    alpha, ids = _alpha(alphas, means2d, feet, least, ids, pixels)
     after = torch.cumprod(1 - alpha, dim=1)
     open_ = after.detach() >= stop  # a pixel stops before the splat that would finish it
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)
     weights = torch.where(open_, before * alpha, 0.0)
     through = torch.where(open_, 1 - alpha, 1.0).prod(dim=1)
     return torch.einsum("bkp,bkc->bpc", weights, colors[ids]), through
+
+
+def _alpha(alphas: Callable, means2d: Tensor, feet: Tensor, least: Tensor, ids: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Alpha [B, K, P] of the splats `ids` [B, K] at `pixels` [B, P, 2], 0 where there is none (-1); and the ids, 0 in place of none."""
+    shown = (ids >= 0)[:, :, None]
+    ids = ids.clamp_min(0)
+    dx, dy = (pixels[:, None] - means2d[ids][:, :, None]).unbind(-1)  # [B, K, P]
+    return torch.where(shown, alphas(feet[ids][:, :, None], dx, dy, least[ids][:, :, None]), 0.0), ids
+
+
+@torch.no_grad()
+def _rounded(
+    alphas: Callable, means2d: Tensor, feet: Tensor, colors: Tensor, least: Tensor, ids: Tensor, pixels: Tensor, background: Tensor, step: float
+) -> Tensor:
+    """[B, P, 3]: splats laid over `background` back to front, the picture within 0..1 and rounded to multiples of `step` after each."""
+    alpha, ids = _alpha(alphas, means2d, feet, least, ids, pixels)
+    picture = background.expand(*pixels.shape[:2], 3)
+    for k in reversed(range(ids.shape[1])):
+        light = (alpha[:, k, :, None] * colors[ids[:, k]][:, None]).clamp(0, 1)
+        after = ((light + (1 - alpha[:, k, :, None]) * picture) / step).round() * step
+        picture = torch.where(alpha[:, k, :, None] > 0, after.clamp(0, 1), picture)
+    return picture
 
 
 def _pixel_centers(tiles: Tensor, columns: int, tile: int) -> Tensor:

@@ -7,9 +7,10 @@ import importlib.util
 import torch
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.packing import packed
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import INTEGRATED, Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
 
@@ -30,18 +31,23 @@ class CpuBackend:
         devices=frozenset({"cpu"}),
         dtypes=frozenset({torch.float32}),
         screen_filters=frozenset({"classic", "antialiased", "mip", "analytic", "window"}),
+        settings=frozenset(SETTINGS) - {"tile"},
     )
 
     def lacking(self, needs: Needs) -> list[str]:
         missing = [] if importlib.util.find_spec("numba") else [NO_NUMBA]
-        return missing + self.capabilities.lacking(needs)
+        served = {"max_color", "color_steps", "radial", "frozen_beyond", "packing"}
+        changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - served
+        fixed = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
+        return missing + self.capabilities.lacking(needs) + fixed
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, when numba is missing or the request is not for this backend."""
         reasons = self.lacking(Needs.of(gaussians, effects, gradients=True))
         if reasons:
             raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
-        g = gaussians
+        packing = effects.settings.packing
+        g = gaussians if packing is None else packed(gaussians, camera, packing)
         image, alpha = _Draw.apply(camera, effects, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)
         return Rendered(image, alpha)
 
@@ -60,8 +66,8 @@ def _drawing():
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(ctx, camera, effects, *tensors):
-        drawing = _drawing()
-        image, alpha, ctx.drawing = drawing.draw(drawing.splats_of(*tensors), camera, effects)
+        drawing, differentiated = _drawing(), any(ctx.needs_input_grad)
+        image, alpha, ctx.drawing = drawing.draw(drawing.splats_of(*tensors), camera, effects, gradients=differentiated)
         ctx.save_for_backward(*tensors)
         return torch.from_numpy(image), torch.from_numpy(alpha)
 

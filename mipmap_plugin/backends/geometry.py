@@ -57,4 +57,5 @@ def facing(gaussians: Gaussians, camera: Camera) -> Tensor:
 def _blended(backend: Backend, gaussians: Gaussians, colors: Tensor, camera: Camera, effects: Effects) -> Rendered:
     """What the image would be with these colors [N, 3], at least 0, over black."""
     colored = replace(gaussians, sh=(colors - 0.5)[:, None] / C0)
-    return supersample.render(backend, colored, camera, replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0)))
+    plain = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=effects.settings.of_any_color())
+    return supersample.render(backend, colored, camera, plain)

@@ -8,11 +8,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import FRUSTUM_MARGIN
 from mipmap_plugin.gaussians import Gaussians
-
-# The share of the half field of view by which a centre may lie outside the image before the Jacobian is frozen there;
-# further out the affine approximation would blow splats up (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
-FRUSTUM_MARGIN = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +24,7 @@ class Projected:
     det: Tensor  # [N] px⁴, never negative
 
 
-def project(gaussians: Gaussians, camera: Camera, near: float) -> Projected:
+def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: float = FRUSTUM_MARGIN) -> Projected:
     """Means, depths and covariances on the image plane. Splats nearer than `near` get finite values of no meaning."""
     viewmat = camera.viewmat.to(gaussians.means)
     # Eye first: in a world far from its origin the rounding of rotation · mean + translation is larger than a pixel.
@@ -37,7 +34,7 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> Projected:
     slopes = in_camera[:, :2] / safe[:, None]
     focal = slopes.new_tensor([camera.fx, camera.fy])
     means2d = slopes * focal + slopes.new_tensor([camera.cx, camera.cy])
-    to_image = _jacobian(slopes, safe, camera) @ viewmat[:3, :3]
+    to_image = _jacobian(slopes, safe, camera, frozen_beyond) @ viewmat[:3, :3]
     if gaussians.covariances is not None:
         xx, xy, yy, det = _from_covariances(to_image, gaussians.covariances)
     else:
@@ -58,11 +55,11 @@ def rotations(quats: Tensor) -> Tensor:
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
-def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera) -> Tensor:
+def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: float) -> Tensor:
     """The projection's derivative at each centre [N, 2, 3]; slopes are frozen outside the widened frustum."""
     half = slopes.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2
     left = slopes.new_tensor([camera.cx / camera.fx, camera.cy / camera.fy])
-    margin = FRUSTUM_MARGIN * half
+    margin = frozen_beyond * half
     u, v = torch.minimum(torch.maximum(slopes, -left - margin), 2 * half - left + margin).unbind(-1)
     per_x, per_y, zero = camera.fx / depths, camera.fy / depths, torch.zeros_like(depths)
     return torch.stack([per_x, zero, -per_x * u, zero, per_y, -per_y * v], -1).unflatten(-1, (2, 3))

@@ -7,10 +7,11 @@ import math
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
 from mipmap_plugin.backends.compositing import Splats, alone, composite
 from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
 from mipmap_plugin.backends.harmonics import colors
+from mipmap_plugin.backends.packing import in_steps, packed
 from mipmap_plugin.backends.pixel_integral import PixelIntegral
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.backends.window import WindowIntegral
@@ -25,23 +26,31 @@ class ReferenceBackend:
     name = "reference"
     api_version = API_VERSION
     speed = 0
-    capabilities = Capabilities(devices=None, dtypes=frozenset({torch.float32, torch.float64}), screen_filters=SCREEN_FILTERS, settings=True)
+    capabilities = Capabilities(None, frozenset({torch.float32, torch.float64}), SCREEN_FILTERS, settings=frozenset(SETTINGS))
 
     def lacking(self, needs: Needs) -> list[str]:
         return self.capabilities.lacking(needs)
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+        settings = effects.settings
+        if settings.packing is not None:
+            gaussians = packed(gaussians, camera, settings.packing)
         with torch.no_grad():
             rows = drawn_rows(gaussians, camera, effects)
         gaussians = gaussians[rows]
         projected, feet = _footprints(gaussians, camera, effects)
         degree = min(effects.sh_degree, gaussians.sh_degree)
         rgb = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), degree)
-        least = least_alpha(feet, effects.settings)
-        alphas, room = (feet.alphas, feet.ROOM) if isinstance(feet, WindowIntegral) else (alone(feet.alpha), 1)
+        if settings.max_color is not None:
+            rgb = rgb.clamp_max(settings.max_color)
+        if settings.color_steps is not None:
+            rgb = in_steps(rgb, rgb.new_tensor(settings.color_steps))
+        least = least_alpha(feet, settings)
+        one_by_one = alone(feet.alpha, settings.max_alpha, settings.culls)
+        alphas, room = (feet.alphas, feet.ROOM) if isinstance(feet, WindowIntegral) else (one_by_one, 1)
         splats = Splats(projected.means2d, feet.packed(), rgb, least, alphas, room)
-        color, through = composite(splats, feet.extents(least), camera, effects.settings)
-        return Rendered(color + through[..., None] * color.new_tensor(effects.background), 1 - through)
+        image, through = composite(splats, feet.extents(least), camera, settings, rgb.new_tensor(effects.background))
+        return Rendered(image, 1 - through)
 
 
 def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor:
@@ -54,9 +63,12 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor
     half = feet.extents(least)
     low, high = projected.means2d - half, projected.means2d + half
     inside = (high > 0).all(1) & (low < low.new_tensor([camera.width, camera.height])).all(1)
+    if effects.settings.frame < math.inf:
+        inside &= (2 * projected.means2d / low.new_tensor([camera.width, camera.height]) - 1).abs().amax(1) <= effects.settings.frame
     drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & feet.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
-    return rows[projected.depths[rows].argsort(stable=True)]
+    along = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1) if effects.settings.radial else projected.depths
+    return rows[along[rows].argsort(stable=True)]
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:
@@ -68,14 +80,17 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
 
 @torch.no_grad()
 def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Tensor:
-    """[N]: the alpha below which each splat is not drawn. A radius of r standard deviations is exp(-r²/2) of its brightest."""
-    packed = feet.packed()
-    if settings.radius is None:
-        return packed.new_full(packed.shape[:1], settings.min_alpha)
-    zero = torch.zeros_like(packed[:, 0])
-    return (feet.alpha(packed, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
+    """[N]: the alpha below which each splat is not drawn. A radius of r standard deviations is exp(-r²/2) of its brightest.
+
+    One that fades is nothing there.
+    """
+    numbers = feet.packed()
+    if settings.radius is None or settings.fades:
+        return numbers.new_full(numbers.shape[:1], settings.min_alpha)
+    zero = torch.zeros_like(numbers[:, 0])
+    return (feet.alpha(numbers, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
 def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral]:
-    projected = project(gaussians, camera, effects.near_plane)
-    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d)
+    projected = project(gaussians, camera, effects.near_plane, effects.settings.frozen_beyond)
+    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings)

@@ -19,6 +19,7 @@ def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effe
     if n == 1:
         return backend.render(gaussians, camera, effects)
     fine = camera.resized(camera.width * n, camera.height * n)
-    rendered = backend.render(gaussians, fine, replace(effects, supersampling=1, eps2d=effects.eps2d * n**2))
+    finer = replace(effects, supersampling=1, eps2d=effects.eps2d * n**2, settings=effects.settings.finer(n))
+    rendered = backend.render(gaussians, fine, finer)
     blocks = rendered.image.unflatten(1, (-1, n)).unflatten(0, (-1, n))
     return Rendered(blocks.mean(dim=(1, 3)), rendered.alpha.unflatten(1, (-1, n)).unflatten(0, (-1, n)).mean(dim=(1, 3)))

@@ -21,8 +21,8 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.compositing import MAX_ALPHA
 from mipmap_plugin.backends.pixel_integral import PixelIntegral
+from mipmap_plugin.effects import MAX_ALPHA
 
 # px²: the least variance of a window along x or y.
 LEAST_VARIANCE = 1e-3

@@ -25,6 +25,7 @@ def render(
     scale: Scale = 1.0,
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     screen_filter: Literal["trained", "scaled", "classic", "antialiased", "mip", "analytic", "window"] = "trained",
+    viewer: str | None = None,
     supersampling: int = 1,
     filter_3d: bool = False,
     depth: bool = False,
@@ -43,6 +44,8 @@ def render(
         scale: Zoom, relative to the cameras.
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
         screen_filter: trained: what the checkpoint was trained with; scaled: the training-free filter for this scale.
+        viewer: Draw the checkpoint as this viewer does: classic, spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown
+            name lists them all.
         supersampling: N: N x N samples a pixel.
         filter_3d: Smooth every splat by what the cameras could see of it at best, as Mip-Splatting's 3D filter does.
         depth: Also write NAME_depth.npy, [height, width] float32: world units along the optical axis, 0 where nothing is.
@@ -56,6 +59,8 @@ def render(
     wrapped = wrap(checkpoint, cameras, background, backend)
     views = _named(wrapped, view)
     asked = None if screen_filter == "trained" else screen_filter
+    if viewer is not None:
+        wrapped.effects(scale, asked, supersampling, viewer)  # before anything is looked for or written
     outputs = [name for name, wanted in {"depth": depth, "normals": normals}.items() if wanted]
     pictures = [output / name for name in picture_names(views)]
     for camera, picture in zip(views, pictures, strict=True):
@@ -64,7 +69,7 @@ def render(
         if exposure:
             exposures_of(wrapped.model).of(camera)  # before anything is written
     for camera, picture in zip(views, pictures, strict=True):
-        shown = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, filter_3d, outputs=outputs, exposure=exposure)
+        shown = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, filter_3d, outputs=outputs, exposure=exposure, viewer=viewer)
         write_image(picture, shown.image, overwrite=overwrite)
         for name in outputs:
             write_array(_beside(picture, name), getattr(shown, name), overwrite=overwrite)

@@ -16,7 +16,7 @@ from tiny import with_bands
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.config import recipe
-from mipmap_plugin.effects import OF_OTHER_MODELS, Effect, Effects, explain
+from mipmap_plugin.effects import OF_OTHER_MODELS, Effect, Effects, Packing, RenderSettings, explain
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel, load_mip
@@ -44,6 +44,15 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
         "screen filter": (True, "classic, 0.3 px²"),
         "compensation": (False, "the screen filter is classic"),
         "supersampling": (False, "1 sample a pixel"),
+        "edge": (False, "a splat ends where it is below 0.0039"),
+        "size cull": (False, "no splat is too small to be drawn"),
+        "contribution cull": (False, "no splat gives too little"),
+        "stretching": (False, "round splats stay round"),
+        "frame": (False, "a splat is drawn wherever its center lies"),
+        "color limit": (False, "colors have no upper bound"),
+        "order by distance": (False, "the least deep is in front"),
+        "rounded picture": (False, "rounded once it is shown"),
+        "packing": (False, "splats are kept exactly"),
         "covariances": (False, "quaternions and scales suffice"),
         "depth": (False, "not asked for"),
         "normals": (False, "not asked for"),
@@ -56,7 +65,12 @@ def test_everything_on():
     splats = tiny.gaussians(4)
     given = Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, torch.eye(3).expand(4, 3, 3))
     of_model = [replace(effect, on=True) for effect in OF_OTHER_MODELS]
-    effects = explain(Effects(1, "antialiased", 0.1, supersampling=4, outputs=("depth", "normals")), given, of_model, recipe("paper", 4), 4)
+    everything = RenderSettings(
+        radius=3.0, min_variance=1.0, min_contribution=1.0, least_spread=1.0, max_color=1.0, radial=True, packing=Packing(), picture_step=0.1,
+        frame=1.0,
+    )  # fmt: skip
+    asked = Effects(1, "antialiased", 0.1, supersampling=4, settings=everything, outputs=("depth", "normals"))
+    effects = explain(asked, given, of_model, recipe("paper", 4), 4)
     assert all(effect.on for effect in effects)
     reasons = {effect.name: effect.reason for effect in effects}
     assert [reasons[name] for name in ("supersampling", "covariances")] == ["16 samples a pixel", "the model gives them"]

@@ -15,8 +15,9 @@ from torch import Tensor
 from mipmap_plugin.backends.filters import USUAL_EPS2D
 from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, Effects
+from mipmap_plugin.effects import DILATION, USUAL, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.viewers import BUILT_IN, Viewer
 
 NEAR = 0.25  # world units; unlike 0.2 the same number in float32, so that "on the near plane" means one thing
 
@@ -75,6 +76,37 @@ def of_degree(degree: int, evaluated: int) -> HardCase:
 
 def random_scene(seed: int, screen_filter: str, eps2d: float, degree: int = 3) -> HardCase:
     return HardCase(crowd(120, degree, seed), view(40, 32, turned=True), Effects(degree, screen_filter, eps2d, (1.0, 1.0, 1.0)))
+
+
+def seen_in(viewer: Viewer, seed: int) -> HardCase:
+    """Splats from a twentieth of a pixel to some pixels, so that each of a viewer's rules takes some and leaves some.
+
+    The picture is not rounded: in another precision rounding falls to the other side here and there, and a pixel moves by a step.
+    """
+    gaussians = crowd(120, 3, seed)
+    sizes = 0.02 + 0.4 * torch.rand(120, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 2
+    gaussians = replace(gaussians, scales=gaussians.scales * sizes)
+    return HardCase(gaussians, view(40, 32, turned=True), _unrounded(viewer.effects(Effects(3, background=(1.0, 1.0, 1.0)))))
+
+
+def odd_row_seen_in(viewer: Viewer, row: dict[str, Tensor]) -> HardCase:
+    case = odd_row(row)
+    return case._replace(effects=_unrounded(viewer.effects(case.effects)))
+
+
+def _unrounded(effects: Effects) -> Effects:
+    return replace(effects, settings=replace(effects.settings, picture_step=None))
+
+
+def in_a_rounded_picture() -> HardCase:
+    settings = RenderSettings(picture_step=1 / 255, min_alpha=0.5 / 255, max_alpha=0.999, min_transmittance=1e-6)
+    return HardCase(crowd(), view(), Effects(1, background=(0.2, 0.5, 0.9), settings=settings))
+
+
+def ruled(rule: RenderSettings, seed: int = 1) -> HardCase:
+    """One rule alone, hard enough that it takes many splats."""
+    case = random_scene(seed, "classic", DILATION)
+    return case._replace(effects=replace(case.effects, settings=rule))
 
 
 def covariances_given(screen_filter: str, broken: bool = False) -> HardCase:
@@ -161,6 +193,8 @@ ROWS = {
     "negative-color": _row(sh=-1e3),
     "saturated-color": _row(sh=1e3),
 }
+# Of these, what viewers' rules have to bear too.
+ODD_IN_VIEWERS = ("scale-0-on-one-axis", "scale-0-on-three-axes", "scale-1e4", "needle-1e12", "quaternion-0", "opacity-0", "opacity-1")
 CAMERAS = {
     "image-1x1": view(1, 1),
     "image-1xN": view(1, 37),
@@ -176,6 +210,21 @@ BAD = (math.nan, math.inf)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 FILTERS = ("classic", "antialiased", "mip", "analytic", "window")
 
+# Viewers that do more than dilate and compensate.
+OTHERS = tuple(viewer for viewer in BUILT_IN if viewer.settings != USUAL)
+RULES = {
+    "radius": RenderSettings(radius=2.0),
+    "faint-and-transparent": RenderSettings(min_alpha=0.02, min_transmittance=0.1, max_alpha=0.8),
+    "fading": RenderSettings(radius=8**0.5, fades=True),
+    "size": RenderSettings(min_variance=4.0),
+    "size-along-x-and-y": RenderSettings(min_variance=4.0, boxed=True),
+    "contribution": RenderSettings(min_contribution=1.5),
+    "spread": RenderSettings(least_spread=3.0),
+    "largest-color": RenderSettings(max_color=0.6),
+    "distance": RenderSettings(radial=True),
+    "frame": RenderSettings(frame=0.7, frozen_beyond=math.inf),
+}
+
 CASES: dict[str, Builder] = {
     **{f"{name}-{kind}": partial(odd_row, row, kind) for (name, row), kind in product(ROWS.items(), FILTERS)},
     **{f"{bad}-in-{field}-{kind}": partial(odd_row, _row(**{field: bad}), kind) for field, bad, kind in product(FIELDS, BAD, FILTERS)},
@@ -190,6 +239,14 @@ CASES: dict[str, Builder] = {
     **{f"sh-degree-{degree}": partial(of_degree, degree, degree) for degree in range(5)},
     "sh-bands-left-out": partial(of_degree, 3, 1),
     **{f"covariances-{kind}": partial(covariances_given, kind) for kind in FILTERS},
+    **{f"{viewer.name}-{seed}": partial(seen_in, viewer, seed) for viewer, seed in product(BUILT_IN, (1, 2))},
+    **{
+        f"{name}-{viewer.name}": partial(odd_row_seen_in, viewer, ROWS[name])
+        for name, viewer in product(ODD_IN_VIEWERS, OTHERS)
+        if viewer.eps2d or not name.startswith("needle")  # without any dilation its width is lost in float32
+    },
+    "rule-rounded-picture": in_a_rounded_picture,
+    **{f"rule-{name}": partial(ruled, rule) for name, rule in RULES.items()},
     "nan-in-covariances": partial(covariances_given, "classic", broken=True),
     **{
         f"random-{seed}-{kind}-{eps2d:.2g}": partial(random_scene, seed, kind, eps2d)

@@ -1,13 +1,17 @@
 """Which number is where: the columns of the splat table and of the gradient table."""
 
 # The splat table [N, COLUMNS] float32. With dy = y - Y and u = x - X - SHEAR·dy, in px:
-# log2 alpha = PEAK - FALL_Y·dy² - FALL_X·u². A sum of squares, accurate for needles too.
+# log2 alpha = PEAK - FALL_Y·dy² - FALL_X·u², as usual. A sum of squares, accurate for needles too.
 X, Y, SHEAR, FALL_Y, FALL_X, PEAK = range(6)
 REACH_Y = 6  # px from Y to the last row where alpha reaches 1/255
 TIP = 7  # px from Y to the row where the splat reaches furthest right; as far the other way, furthest left
 SPREAD = 8  # 1 / FALL_X
 OUTLINE = 9  # columns so far: which tiles a splat touches is told by them alone
 RED, GREEN, BLUE = 9, 10, 11
+# Of a splat that is seen at the centers of pixels, what alpha is made of: GAIN · 2^(that logarithm) - FLOOR. The logarithm is so chosen
+# that it ends at 1/255, where the splat ends. As usual they are 1 and 0.
+GAIN, FLOOR = 12, 13
+GATE = 14  # 1, or 0 of a splat that is culled
 # Of a splat that is integrated over pixels (`integrals`), those are of an ellipse around it, and it is itself in
 MASS = FALL_X  # opacity · 2π · both standard deviations, px²
 OPACITY = FALL_X  # instead, where it is seen through windows

@@ -13,7 +13,7 @@ from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, SLACK, TILE_COLUMNS, TILE_ROWS, tile_grid
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, floor, fma, lowest, maximum, minimum, ramp, spread, sqrt, total
 from mipmap_plugin.backends.cpu_kernels.memory import load, prefetch, row_of, scratch, store
-from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, BEHIND, CREST, END, ENDS, LIGHT, PLANE, RIDGE, STATE, STRIDE, cover, uncover
+from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, BEHIND, CREST, END, ENDS, LIGHT, PLANE, RIDGE, STATE, STRIDE, cover, feel, uncover
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MIN_ALPHA
@@ -53,7 +53,7 @@ def trace(splat, box, state):
 
 
 @kernel
-def composite(start, stop, integrated, table, lists, frame, shown):
+def composite(start, stop, integrated, limits, table, lists, frame, shown):
     """Render the tiles start..stop: fill the frame, and the image [H, W, 3] and alpha [H, W] that are shown.
 
     integrated: splats are, over each pixel's square.
@@ -74,9 +74,9 @@ def composite(start, stop, integrated, table, lists, frame, shown):
             prefetch(table, members[min(at + AHEAD, starts[stop] - 1)])
             splat = row_of(table, members[at])
             if integrated:
-                lay_integral(splat, n, box, state)
-            else:
-                lay(splat, n, box, state)
+                lay_integral(splat, limits, n, box, state)
+            elif splat[col.GATE] > 0:
+                lay(splat, limits, n, box, state)
         close_tile(box, state, frame, shown)
 
 
@@ -107,9 +107,10 @@ def finished(state):
 
 
 @inner
-def lay(splat, n, box, state):
+def lay(splat, limits, n, box, state):
     """Lay a splat, the n-th of its tile, behind what is there."""
-    fall, color = splat[col.FALL_X], (splat[col.RED], splat[col.GREEN], splat[col.BLUE])
+    fall, gain, floor = splat[col.FALL_X], splat[col.GAIN], splat[col.FLOOR]
+    color = splat[col.RED], splat[col.GREEN], splat[col.BLUE]
     rows = trace(splat, box, state)
     while rows != 0:
         r = lowest(rows)
@@ -119,13 +120,13 @@ def lay(splat, n, box, state):
         while column <= end:
             u = ramp(column - ridge)
             power = fma(u * u, -fall, peak)
-            cover(exp2(power), power >= LOG_MIN_ALPHA, color, n, at, state)
+            cover(fma(exp2(power), gain, 0 - floor), power >= LOG_MIN_ALPHA, limits, color, n, at, state)
             column += WIDTH
             at += WIDTH
 
 
 @inner
-def lay_integral(splat, n, box, state):
+def lay_integral(splat, limits, n, box, state):
     """As `lay`, of a splat that is integrated over pixels; what `trace` finds is an ellipse around it."""
     color = splat[col.RED], splat[col.GREEN], splat[col.BLUE]
     rows = trace(splat, box, state)
@@ -137,7 +138,7 @@ def lay_integral(splat, n, box, state):
         center, dy = splat[col.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[col.Y]
         while column <= end:
             alpha = integrals.alpha(splat, ramp(column - center), dy)
-            cover(alpha, alpha >= MIN_ALPHA, color, n, at, state)
+            cover(alpha, alpha >= MIN_ALPHA, limits, color, n, at, state)
             column += WIDTH
             at += WIDTH
 
@@ -159,7 +160,7 @@ def close_tile(box, state, frame, shown):
 
 
 @kernel
-def composite_back(start, stop, integrated, table, lists, frame, d_frame, pulls):
+def composite_back(start, stop, integrated, limits, table, lists, frame, d_frame, pulls):
     """Walk the lists of the tiles start..stop back to front and write each splat's pull in each tile into its slot.
 
     d_frame: the gradients of the image [H, W, 3] and of its alpha [H, W].
@@ -180,9 +181,13 @@ def composite_back(start, stop, integrated, table, lists, frame, d_frame, pulls)
             prefetch(table, members[max(at - AHEAD, 0)])
             splat, pull = row_of(table, members[at]), row_of(pulls, slots[at])
             if integrated:
-                lift_integral(splat, n, box, state, pull)
+                lift_integral(splat, limits, n, box, state, pull)
+            elif splat[col.GATE] == 0:
+                lift_culled(splat, n, box, state, pull)
+            elif splat[col.FLOOR] > 0:
+                lift(splat, limits, True, n, box, state, pull)
             else:
-                lift(splat, n, box, state, pull)
+                lift(splat, limits, False, n, box, state, pull)
 
 
 @inner
@@ -205,9 +210,10 @@ def reopen_tile(box, background, through, stops, d_image, d_alpha, state):
 
 
 @inner
-def lift(splat, n, box, state, pull):
-    """Take a splat, the n-th of its tile, off again and write its pull."""
-    fall, color = splat[col.FALL_X], (splat[col.RED], splat[col.GREEN], splat[col.BLUE])
+def lift(splat, limits, fades, n, box, state, pull):
+    """Take a splat, the n-th of its tile, off again and write its pull. fades: known when this is compiled, so that what does not costs nothing."""
+    fall, gain, floor = splat[col.FALL_X], splat[col.GAIN], splat[col.FLOOR]
+    color = splat[col.RED], splat[col.GREEN], splat[col.BLUE]
     sum_1 = sum_u = sum_y = sum_uu = sum_uy = sum_yy = sum_red = sum_green = sum_blue = spread(0)
     rows = trace(splat, box, state)
     while rows != 0:
@@ -219,9 +225,13 @@ def lift(splat, n, box, state, pull):
         while column <= end:
             u = ramp(column - ridge)
             power = fma(u * u, -fall, peak)
-            s, weight, d_red, d_green, d_blue = uncover(exp2(power), power >= LOG_MIN_ALPHA, color, n, at, state)
+            alpha = fma(exp2(power), gain, 0 - floor)
+            s, rate, weight, d_red, d_green, d_blue = uncover(alpha, power >= LOG_MIN_ALPHA, limits, color, n, at, state)
+            sum_1 = sum_1 + s
+            if fades:
+                s = fma(rate, floor, s)  # a floor depends on no shape
             s_u, s_y = s * u, s * dy
-            sum_1, sum_u, sum_y = sum_1 + s, sum_u + s_u, sum_y + s_y
+            sum_u, sum_y = sum_u + s_u, sum_y + s_y
             sum_uu, sum_uy, sum_yy = fma(s_u, u, sum_uu), fma(s_u, dy, sum_uy), fma(s_y, dy, sum_yy)
             sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
             column += WIDTH
@@ -232,7 +242,29 @@ def lift(splat, n, box, state, pull):
 
 
 @inner
-def lift_integral(splat, n, box, state, pull):
+def lift_culled(splat, n, box, state, pull):
+    """Write the pull of a splat that is not drawn, on its gate alone."""
+    fall, gain, floor = splat[col.FALL_X], splat[col.GAIN], splat[col.FLOOR]
+    color, sum_1 = (splat[col.RED], splat[col.GREEN], splat[col.BLUE]), spread(0)
+    rows = trace(splat, box, state)
+    while rows != 0:
+        r = lowest(rows)
+        rows &= rows - 1
+        column, end, ridge, peak = state[BEGIN + r], state[END + r], state[RIDGE + r], state[CREST + r]
+        at = r * STRIDE + int(column)
+        while column <= end:
+            u = ramp(column - ridge)
+            power = fma(u * u, -fall, peak)
+            sum_1 = sum_1 + feel(fma(exp2(power), gain, 0 - floor), power >= LOG_MIN_ALPHA, color, n, at, state)
+            column += WIDTH
+            at += WIDTH
+    for k in range(col.PULLS):
+        pull[k] = 0
+    pull[col.SUM] = total(sum_1)
+
+
+@inner
+def lift_integral(splat, limits, n, box, state, pull):
     """As `lift`, of a splat that is integrated over pixels."""
     color = splat[col.RED], splat[col.GREEN], splat[col.BLUE]
     sum_1 = sum_long = sum_short = sum_grow_long = sum_grow_short = sum_turn = sum_red = sum_green = sum_blue = spread(0)
@@ -245,7 +277,7 @@ def lift_integral(splat, n, box, state, pull):
         center, dy = splat[col.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[col.Y]
         while column <= end:
             alpha, by_long, by_short, grow_long, grow_short, turn = integrals.slopes(splat, ramp(column - center), dy)
-            s, weight, d_red, d_green, d_blue = uncover(alpha, alpha >= MIN_ALPHA, color, n, at, state)
+            s, _, weight, d_red, d_green, d_blue = uncover(alpha, alpha >= MIN_ALPHA, limits, color, n, at, state)
             sum_1, sum_long, sum_short = sum_1 + s, fma(s, by_long, sum_long), fma(s, by_short, sum_short)
             sum_grow_long, sum_grow_short = fma(s, grow_long, sum_grow_long), fma(s, grow_short, sum_grow_short)
             sum_turn = fma(s, turn, sum_turn)

@@ -9,11 +9,10 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import compositing, projection, pulling, sorting, window_tiles
-from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW, Frame, Lists, Splats, View
+from mipmap_plugin.backends.cpu_kernels import compositing, projection, pulling, rounding, sorting, window_tiles
+from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW, Frame, Limits, Lists, Splats, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
-from mipmap_plugin.backends.filters import LEAST_LIGHT
-from mipmap_plugin.backends.projection import FRUSTUM_MARGIN
+from mipmap_plugin.backends.filters import LEAST_LIGHT, w_end
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 
@@ -32,11 +31,13 @@ class Drawing(NamedTuple):
     slots: np.ndarray  # [N + 1] where each splat's tiles begin
     lists: Lists
     frame: Frame
+    limits: Limits
 
 
-def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, np.ndarray, Drawing]:
-    """The image [H, W, 3], alpha [H, W] and what to remember of them."""
-    view = view_of(camera, effects, splats)
+def draw(splats: Splats, camera: Camera, effects: Effects, *, gradients: bool = True) -> tuple[np.ndarray, np.ndarray, Drawing]:
+    """The image [H, W, 3], alpha [H, W] and what to remember of them. gradients: whether `draw_back` will be asked for."""
+    view = view_of(camera, effects, splats, gradients)
+    limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, effects.settings.picture_step or 0.0)
     count, (height, width) = len(splats.means), camera.size
     table, depths, counts, slots = _empty(count, col.COLUMNS), _empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
     shown = _empty(height, width, 3), _empty(height, width)
@@ -48,8 +49,10 @@ def draw(splats: Splats, camera: Camera, effects: Effects) -> tuple[np.ndarray, 
     if view.seen == SEEN_IN_WINDOW:
         threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, shown)
     else:
-        threads.share(compositing.composite, len(lists.starts) - 1, view.seen == SEEN_IN_PIXEL, table, lists, frame, shown)
-    return *shown, Drawing(view, splats, table, slots, lists, frame)
+        threads.share(compositing.composite, len(lists.starts) - 1, view.seen == SEEN_IN_PIXEL, limits, table, lists, frame, shown)
+        if limits.picture_step > 0:
+            threads.share(rounding.composite, len(lists.starts) - 1, limits, table, lists, frame, shown)
+    return *shown, Drawing(view, splats, table, slots, lists, frame, limits)
 
 
 def draw_back(drawing: Drawing, d_image: np.ndarray, d_alpha: np.ndarray, *, harmonics: bool = True) -> Splats:
@@ -57,7 +60,7 @@ def draw_back(drawing: Drawing, d_image: np.ndarray, d_alpha: np.ndarray, *, har
 
     harmonics: whether those of the coefficients are wanted, which are most of all numbers; else they have no rows.
     """
-    view, splats, table, slots, lists, frame = drawing
+    view, splats, table, slots, lists, frame, limits = drawing
     pulls, grads = _empty(len(lists.members), col.PULLS), Splats(*(_empty(*array.shape) for array in splats))
     if not harmonics:
         grads = grads._replace(sh=grads.sh[:0])
@@ -66,15 +69,16 @@ def draw_back(drawing: Drawing, d_image: np.ndarray, d_alpha: np.ndarray, *, har
         threads.share(window_tiles.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), pulls)
     else:
         integrated = view.seen == SEEN_IN_PIXEL
-        threads.share(compositing.composite_back, len(lists.starts) - 1, integrated, table, lists, frame, (d_image, d_alpha), pulls)
+        threads.share(compositing.composite_back, len(lists.starts) - 1, integrated, limits, table, lists, frame, (d_image, d_alpha), pulls)
     threads.share(pulling.project_back, len(splats.means), view, splats, table, slots, pulls, grads)
     return grads
 
 
-def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
+def view_of(camera: Camera, effects: Effects, splats: Splats, gradients: bool) -> View:
+    settings = effects.settings
     left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
-    across, down = FRUSTUM_MARGIN * (left + right) / 2, FRUSTUM_MARGIN * (top + bottom) / 2
+    across, down = settings.frozen_beyond * (left + right) / 2, settings.frozen_beyond * (top + bottom) / 2
     rotation, translation = camera.viewmat.numpy()[:3, :3], camera.viewmat.numpy()[:3, 3]
     return View(
         rotation=tuple(map(tuple, rotation.tolist())),
@@ -95,6 +99,19 @@ def view_of(camera: Camera, effects: Effects, splats: Splats) -> View:
         least_light=LEAST_LIGHT.get(effects.screen_filter, 1.0),
         seen=SEEN.get(effects.screen_filter, SEEN_AT_CENTER),
         sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
+        max_color=math.inf if settings.max_color is None else settings.max_color,
+        color_steps=settings.color_steps or (0.0, 0.0, 0.0),
+        radial=settings.radial,
+        frame=settings.frame,
+        min_alpha=settings.min_alpha,
+        cut=0.0 if settings.radius is None or settings.fades else math.exp(-(settings.radius**2) / 2),
+        faded=w_end(settings),
+        culls=settings.culls,
+        min_variance=float(settings.min_variance),
+        boxed=settings.boxed,
+        min_contribution=float(settings.min_contribution),
+        least_spread=float(settings.least_spread),
+        felt=gradients,
     )
 
 

@@ -6,12 +6,10 @@ Pixels lie in planes of TILE_ROWS rows, each WIDTH longer than the tile, so that
 # numba gives calls and operators a meaning of its own.
 # mypy: ignore-errors
 
-from mipmap_plugin.backends.compositing import MAX_ALPHA
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.binning import TILE_COLUMNS, TILE_ROWS
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, minimum, select
 from mipmap_plugin.backends.cpu_kernels.memory import load, store
-from mipmap_plugin.effects import MIN_TRANSMITTANCE
 
 STRIDE = TILE_COLUMNS + WIDTH
 PLANE = TILE_ROWS * STRIDE
@@ -28,13 +26,14 @@ STATE = BEGIN + 4 * TILE_ROWS
 
 
 @inner
-def cover(alpha, bright, color, n, at, state):
+def cover(alpha, bright, limits, color, n, at, state):
     """Lay the n-th splat of a tile over the 16 pixels at `at`, where it is bright enough."""
-    alpha = minimum(alpha, MAX_ALPHA)
+    most, least, _ = limits
+    alpha = minimum(alpha, most)
     before = load(state, LIGHT + at)
     after = before * (1 - alpha)
-    shown = both(bright, after >= MIN_TRANSMITTANCE)
-    stopping = both(both(bright, before >= MIN_TRANSMITTANCE), after < MIN_TRANSMITTANCE)
+    shown = both(bright, after >= least)
+    stopping = both(both(bright, before >= least), after < least)
     weight = select(shown, before * alpha, 0)
     store(state, at, fma(weight, color[0], load(state, at)))
     store(state, PLANE + at, fma(weight, color[1], load(state, PLANE + at)))
@@ -45,10 +44,11 @@ def cover(alpha, bright, color, n, at, state):
 
 
 @inner
-def uncover(alpha, bright, color, n, at, state):
-    """Take the n-th splat of a tile off the 16 pixels at `at`: alpha · dLoss/dalpha, its weight there, and dLoss/dimage."""
+def uncover(alpha, bright, limits, color, n, at, state):
+    """Take the n-th splat of a tile off the 16 pixels at `at`: alpha · dLoss/dalpha, dLoss/dalpha, its weight there, and dLoss/dimage."""
+    most, _, _ = limits
     shown = both(bright, n < load(state, ENDS + at))
-    light = select(shown, minimum(alpha, MAX_ALPHA), 0)
+    light = select(shown, minimum(alpha, most), 0)
     before = load(state, LIGHT + at) / (1 - light)
     d_red, d_green, d_blue = load(state, at), load(state, PLANE + at), load(state, 2 * PLANE + at)
     behind = load(state, BEHIND + at)
@@ -56,4 +56,14 @@ def uncover(alpha, bright, color, n, at, state):
     weight = before * light
     store(state, LIGHT + at, before)
     store(state, BEHIND + at, fma(light, gain, behind))
-    return select(alpha < MAX_ALPHA, weight * gain, 0), weight, d_red, d_green, d_blue
+    rate = select(both(shown, alpha < most), before * gain, 0)
+    return select(alpha < most, weight * gain, 0), rate, weight, d_red, d_green, d_blue
+
+
+@inner
+def feel(alpha, bright, color, n, at, state):
+    """alpha · dLoss/dalpha of the n-th splat of a tile, which was culled, at the 16 pixels at `at`: as if it were faintly there."""
+    shown = both(bright, n < load(state, ENDS + at))
+    d_red, d_green, d_blue = load(state, at), load(state, PLANE + at), load(state, 2 * PLANE + at)
+    gain = fma(d_red, color[0], fma(d_green, color[1], d_blue * color[2])) - load(state, BEHIND + at)
+    return select(shown, load(state, LIGHT + at) * alpha * gain, 0)

@@ -9,10 +9,10 @@ import numpy as np
 from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, integrals, kernel, windows
+from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, windows
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, lowest, maximum, narrow, select, sqrt
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, lowest, maximum, narrow, select, spread, sqrt
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.powers import log2
 from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL
@@ -24,6 +24,9 @@ HALF_LOG2E = 0.5 / math.log(2)
 
 # Sizes (px, px²) and brightnesses beyond this are as good as infinite: float32 could not carry their squares.
 FAR = 1e30
+
+# The least color that is not black, and the share of the largest color that is not the largest, in float32.
+TINY, BELOW = 1e-30, 1 - 1e-7
 
 # A block of what is known of splats in the world, float64: the columns of `Splats`, of which shapes are a covariance or the other two.
 MEAN, OPACITY, COVARIANCE, QUAT, SCALE = 0, 3, 4, 4, 8
@@ -48,7 +51,7 @@ def project(start, stop, view, splats, table, depths, counts):
         axes = ellipses.lens(view, p)
         flat = flatten_matrix(axes, world) if covariances else flatten(axes, world)
         drawn = both(p[2] > view.near, fill_shape(view, p, flat, get(world, OPACITY), block))
-        put(numbers, 0, p[2])
+        put(numbers, 0, sqrt(dot(p, p)) if view.radial else p[2])
         put(numbers, 1, count_tiles(block, drawn, view.width, view.height))
         shown = bits(get(numbers, 1) > 0) & ((1 << size) - 1)
         if shown != 0:
@@ -57,7 +60,7 @@ def project(start, stop, view, splats, table, depths, counts):
             lane = lowest(shown)
             shown &= shown - 1
             i = first + lane
-            if fill_color(i * stride, lane, view.sh_degree, sh, bands, block):
+            if fill_color(i * stride, lane, view, sh, bands, block):
                 depths[i], counts[i] = numbers[lane], int(numbers[WIDTH + lane])
                 for k in range(col.COLUMNS):
                     rows[i * col.COLUMNS + k] = block[k * WIDTH + lane]
@@ -113,7 +116,7 @@ def fill_shape(view, p, flat, opacity, block):
     x, y = view.fx * p[0] * per_z + view.cx, view.fy * p[1] * per_z + view.cy
     dilated, light = ellipses.screen_filter(view, flat)
     if view.seen == SEEN_AT_CENTER:
-        return fill_ellipse(x, y, dilated, opacity * light, block)
+        return fill_point(view, x, y, dilated, opacity, light, block)
     along = integrals.axes(dilated)
     if view.seen == SEEN_IN_PIXEL:
         mass, bound, corner = integrals.mass(along, opacity), integrals.BRIGHTER * opacity, integrals.CORNER
@@ -125,6 +128,33 @@ def fill_shape(view, p, flat, opacity, block):
     drawn = both(drawn, fill_ellipse(x, y, wider, bound, block))
     integrals.fill(along, mass, block)
     return drawn
+
+
+@inner
+def fill_point(view, x, y, shape, opacity, light, block):
+    """`fill_shape` of splats that are seen at the centers of pixels."""
+    shown = opacity * light
+    aside = maximum(abs_of(x * (2 / view.width) - 1), abs_of(y * (2 / view.height) - 1))
+    drawn = both(shown >= view.min_alpha, aside <= view.frame)
+    put(block, col.GATE, spread(1))
+    if view.culls:
+        there = culling.is_drawn(view, shape, opacity)
+        put(block, col.GATE, narrow(select(there, 1.0, opacity * 0)))
+        drawn = drawn if view.felt else both(drawn, there)
+        if view.least_spread > 0:
+            shape, _ = culling.stretched(view, shape, there)
+    # alpha = whole·(w - faded), which ends where it is `end`
+    whole = shown * (1 / (1 - view.faded))
+    floor, end = whole * view.faded, maximum(shown * view.cut, view.min_alpha)
+    gain = (end + floor) / MIN_ALPHA
+    put(block, col.GAIN, narrow(gain))
+    put(block, col.FLOOR, narrow(floor))
+    return both(drawn, fill_ellipse(x, y, shape, whole / gain, block))
+
+
+@inner
+def abs_of(lanes):
+    return maximum(lanes, 0 - lanes)
 
 
 @inner
@@ -151,17 +181,28 @@ def fill_ellipse(x, y, shape, opacity, block):
 
 
 @inner
-def fill_color(at, lane, degree, sh, bands, block):
+def fill_color(at, lane, view, sh, bands, block):
     """Write a splat's color in this view's direction into its lane; False where it is not finite. Its coefficients begin at sh[at]."""
-    half = np.float32(0.5)
+    half, most = np.float32(0.5), np.float32(view.max_color)
     red, green, blue = half, half, half
-    for j in range((degree + 1) ** 2):
+    for j in range((view.sh_degree + 1) ** 2):
         band = bands[j * WIDTH + lane]
         red += band * sh[at + 3 * j]
         green += band * sh[at + 3 * j + 1]
         blue += band * sh[at + 3 * j + 2]
-    block[col.RED * WIDTH + lane], block[col.GREEN * WIDTH + lane], block[col.BLUE * WIDTH + lane] = max(red, 0), max(green, 0), max(blue, 0)
+    red_step, green_step, blue_step = view.color_steps
+    block[col.RED * WIDTH + lane] = in_steps(min(max(red, 0), most), red_step, most)
+    block[col.GREEN * WIDTH + lane] = in_steps(min(max(green, 0), most), green_step, most)
+    block[col.BLUE * WIDTH + lane] = in_steps(min(max(blue, 0), most), blue_step, most)
     return abs(red) < FAR and abs(green) < FAR and abs(blue) < FAR
+
+
+@inner
+def in_steps(value, step, most):
+    """The nearest multiple of a step; 0: the value as it is. Never quite 0 or `most` but for what is: there a channel's gradient ends."""
+    if step == 0 or value <= 0 or value >= most:
+        return value
+    return np.float32(max(min(round(value / step) * step, most * BELOW), TINY))
 
 
 @inner

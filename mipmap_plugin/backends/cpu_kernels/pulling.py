@@ -7,7 +7,7 @@ import numpy as np
 from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import ellipses, harmonics, inner, integrals, kernel
+from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, select, wide
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
@@ -134,7 +134,35 @@ def pull_shape(view, flat, opacity, pull):
     dilated, light = ellipses.screen_filter(view, flat)
     if view.seen != SEEN_AT_CENTER:
         return pull_integral(view, flat, dilated, opacity, pull)
-    _, xy, yy, det = dilated
+    if view.culls:
+        return pull_culled(view, flat, dilated, light, opacity, pull)
+    d_dilated, d_x, d_y = pull_ellipse(dilated, pull)
+    light_pull = get(pull, col.SUM)
+    d_flat = ellipses.pull_screen_filter(view, flat, dilated, light, d_dilated, light_pull / light)
+    return d_flat, light_pull / opacity, d_x, d_y
+
+
+@inner
+def pull_culled(view, flat, dilated, light, opacity, pull):
+    """`pull_shape` where splats are culled or stretched."""
+    gate_pull, drawn = get(pull, col.SUM), culling.is_drawn(view, dilated, opacity)
+    light_pull = select(drawn, gate_pull, 0.0)
+    if view.least_spread > 0:
+        shape, changed = culling.stretched(view, dilated, drawn)
+        d_shape, d_x, d_y = pull_ellipse(shape, pull)
+        d_dilated = culling.pull_stretched(view, dilated, changed, d_shape)
+    else:
+        d_dilated, d_x, d_y = pull_ellipse(dilated, pull)
+    d_gated, d_opacity = culling.pull_gate(view, dilated, opacity, gate_pull)
+    d_dilated = d_dilated[0] + d_gated[0], d_dilated[1] + d_gated[1], d_dilated[2] + d_gated[2], d_dilated[3] + d_gated[3]
+    d_flat = ellipses.pull_screen_filter(view, flat, dilated, light, d_dilated, light_pull / light)
+    return d_flat, light_pull / opacity + d_opacity, d_x, d_y
+
+
+@inner
+def pull_ellipse(shape, pull):
+    """Gradients of ellipses and of their places on the image."""
+    _, xy, yy, det = shape
     per_yy, per_det = 1 / yy, 1 / det
     shear, per_across = xy * per_yy, yy * per_det
 
@@ -144,10 +172,7 @@ def pull_shape(view, flat, opacity, pull):
     d_per_yy, d_per_across = -0.5 * get(pull, col.SUM_YY), -0.5 * get(pull, col.SUM_UU)
 
     d_yy = d_per_across * per_det - per_yy * (d_per_yy * per_yy + d_shear * shear)
-    d_dilated = d_yy * 0, d_shear * per_yy, d_yy, -d_per_across * per_across * per_det
-    light_pull = get(pull, col.SUM)
-    d_flat = ellipses.pull_screen_filter(view, flat, dilated, light, d_dilated, light_pull / light)
-    return d_flat, light_pull / opacity, d_x, d_y
+    return (d_yy * 0, d_shear * per_yy, d_yy, -d_per_across * per_across * per_det), d_x, d_y
 
 
 @inner
@@ -166,7 +191,7 @@ def pull_colors(view, rows, size, world, pull, colors, bands, along, d_world):
     direction, length = sight(view, get_vector(world, MEAN))
     harmonics.basis(narrowed(direction), view.sh_degree, bands)
     for lane in range(size):
-        pull_color(rows[lane], lane, view.sh_degree, colors, pull, bands, along)
+        pull_color(rows[lane], lane, view, colors, pull, bands, along)
     if view.sh_degree > 0:
         d_x, d_y, d_z = harmonics.slope(narrowed(direction), view.sh_degree, along)
         d_direction = wide(d_x), wide(d_y), wide(d_z)
@@ -176,15 +201,15 @@ def pull_colors(view, rows, size, world, pull, colors, bands, along, d_world):
 
 
 @inner
-def pull_color(i, lane, degree, colors, pull, bands, along):
+def pull_color(i, lane, view, colors, pull, bands, along):
     """The gradients of splat i's coefficients, and into its lane those of its bands."""
     sh, d_sh, table, stride, wanted = colors
-    at, row, zero = i * stride, i * col.COLUMNS, np.float32(0)
-    # A channel that was cut off at black has no gradient.
-    d_red = np.float32(pull[col.PULL_RED * WIDTH + lane]) if table[row + col.RED] > 0 else zero
-    d_green = np.float32(pull[col.PULL_GREEN * WIDTH + lane]) if table[row + col.GREEN] > 0 else zero
-    d_blue = np.float32(pull[col.PULL_BLUE * WIDTH + lane]) if table[row + col.BLUE] > 0 else zero
-    used = (degree + 1) ** 2
+    at, row, zero, most = i * stride, i * col.COLUMNS, np.float32(0), np.float32(view.max_color)
+    # A channel that was cut off at black, or at the largest color, has no gradient.
+    d_red = np.float32(pull[col.PULL_RED * WIDTH + lane]) if 0 < table[row + col.RED] < most else zero
+    d_green = np.float32(pull[col.PULL_GREEN * WIDTH + lane]) if 0 < table[row + col.GREEN] < most else zero
+    d_blue = np.float32(pull[col.PULL_BLUE * WIDTH + lane]) if 0 < table[row + col.BLUE] < most else zero
+    used = (view.sh_degree + 1) ** 2
     for j in range(used):
         along[j * WIDTH + lane] = d_red * sh[at + 3 * j] + d_green * sh[at + 3 * j + 1] + d_blue * sh[at + 3 * j + 2]
     if wanted:

@@ -31,6 +31,19 @@ class View(NamedTuple):
     least_light: float  # the share of its opacity that compensation leaves at least; 1: there is no compensation
     seen: int  # one of the three above
     sh_degree: int
+    max_color: float
+    color_steps: tuple  # three; 0: not rounded
+    radial: bool  # whether the order is that of distances
+    frame: float  # half pictures
+    min_alpha: float
+    cut: float  # the weight at which a splat is cut off; 0: none is
+    faded: float  # the weight at which a splat has faded to 0; 0: none does
+    culls: bool  # whether any of the next four is asked for
+    min_variance: float  # px²
+    boxed: bool
+    min_contribution: float  # px²
+    least_spread: float  # px²
+    felt: bool  # whether splats that are culled are listed, for their gradient
 
 
 class Splats(NamedTuple):
@@ -42,6 +55,14 @@ class Splats(NamedTuple):
     opacities: np.ndarray  # [N]
     sh: np.ndarray  # [N, K, 3]
     covariances: np.ndarray  # [N, 3, 3] or [0, 3, 3]
+
+
+class Limits(NamedTuple):
+    """What ends a splat and a pixel."""
+
+    max_alpha: float
+    min_transmittance: float
+    picture_step: float  # 0: pictures are not rounded
 
 
 class Lists(NamedTuple):

@@ -17,7 +17,9 @@ from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, low
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, prefetch, row_of, scratch, store
 from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, END, ENDS, LIGHT, PLANE, STATE, STRIDE, cover, uncover
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
-from mipmap_plugin.effects import MIN_ALPHA
+from mipmap_plugin.effects import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+
+USUAL = (MAX_ALPHA, MIN_TRANSMITTANCE, 0.0)
 
 # Where the planes of windows begin in a tile's state: x, y, width, height; in the backward pass their gradients.
 WINDOWS = STATE
@@ -92,7 +94,7 @@ def look(shape, room, dx, dy, unfinished, color, n, at, state, memory, visits):
     if keep:
         store_windows(kept, visits * KEPT, WIDTH, window)
         places[visits] = at
-    cover(alpha, bright, color, n, at, state)
+    cover(alpha, bright, USUAL, color, n, at, state)
     after = windows.kept(windows.behind(shape, window, alpha, seen)[0])
     store_windows(state, WINDOWS + at, PLANE, choose(bright, after, window))
     return 1
@@ -171,7 +173,7 @@ def lift(splat, n, box, state, memory, visits, pull):
         alpha, seen = windows.look(shape, dx, dy, window)
         bright = alpha >= MIN_ALPHA
         shown = both(bright, n < load(state, ENDS + at))
-        s, weight, d_red, d_green, d_blue = uncover(alpha, bright, color, n, at, state)
+        s, _, weight, d_red, d_green, d_blue = uncover(alpha, bright, USUAL, color, n, at, state)
         after, outcome = windows.behind(shape, window, alpha, seen)
         d_window = load_windows(state, WINDOWS + at, PLANE)
         d_before, s, slopes = windows.pull_behind(shape, alpha, s, seen, outcome, windows.pull_kept(after, d_window))

@@ -5,12 +5,12 @@
 
 import math
 
-from mipmap_plugin.backends.compositing import MAX_ALPHA
 from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, maximum, minimum, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.window import FARTHEST, LEAST_VARIANCE, POINTS, WEIGHTS, WIDE
+from mipmap_plugin.effects import MAX_ALPHA
 
 HALF_LOG2E = 0.5 / math.log(2)
 ALL = (1 << WIDTH) - 1

@@ -9,11 +9,11 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from mipmap_plugin.backends import compositing
+from mipmap_plugin import effects
 from mipmap_plugin.backends.triton_kernels import views
 from mipmap_plugin.backends.triton_kernels.records import RECORD
 
-MAX_ALPHA = tl.constexpr(compositing.MAX_ALPHA)
+MAX_ALPHA = tl.constexpr(effects.MAX_ALPHA)
 MIN_ALPHA, MIN_THROUGH = views.MIN_ALPHA, views.MIN_THROUGH
 RED, GREEN, BLUE = views.RED, views.GREEN, views.BLUE
 

@@ -1,0 +1,480 @@
+"""Viewers: each rule against what its shader says, worked out by hand for one splat in the middle of a picture."""
+
+import math
+from dataclasses import fields, replace
+
+import pytest
+import samples
+import tiny
+import torch
+
+from mipmap_plugin import cli, register_viewer, wrap_model
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.cpu import CpuBackend
+from mipmap_plugin.backends.gsplat import GsplatBackend
+from mipmap_plugin.backends.inria import InriaBackend
+from mipmap_plugin.backends.packing import packed
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.backends.triton import TritonBackend
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import USUAL, Effects, RenderSettings, explain
+from mipmap_plugin.errors import PluginError, SettingsError
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.viewers import BUILT_IN, EDGE, VIEWERS, Viewer, find_viewer
+from mipmap_plugin.wrap import Wrapped
+
+C0 = 0.28209479177387814
+SIZE, FOCAL, DEPTH = 21, 100.0, 10.0  # px, px, world units: 0.1 world units are a pixel
+MIDDLE = SIZE // 2
+BACKENDS = [ReferenceBackend(), CpuBackend()]
+BOTH = pytest.mark.parametrize("backend", BACKENDS, ids=["reference", "cpu"])
+
+
+def camera() -> Camera:
+    return Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, torch.eye(4))
+
+
+def splat(across: float, down: float, opacity: float = 0.9, color: float = 0.5, turn: float = 0.0, means=(0.0, 0.0, DEPTH)) -> Gaussians:
+    """One gray splat of variances `across` and `down` px² at the center of the middle pixel, flat along the axis of view, turned by `turn`."""
+    scales = torch.tensor([[math.sqrt(across), math.sqrt(down), 1e-6]]) * DEPTH / FOCAL
+    quats = torch.tensor([[math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]])
+    return Gaussians(torch.tensor([means]), quats, scales, torch.tensor([opacity]), torch.full((1, 1, 3), (color - 0.5) / C0))
+
+
+def alpha(backend, viewer: str, splats: Gaussians) -> torch.Tensor:
+    """[SIZE, SIZE] alpha under a viewer whose packing, which has tests of its own, is left out."""
+    effects = find_viewer(viewer).effects(Effects(0))
+    effects = replace(effects, settings=replace(effects.settings, packing=None, color_steps=None, picture_step=None))
+    return backend.render(splats, camera(), effects).alpha
+
+
+def differentiable(splats: Gaussians) -> tuple[dict[str, torch.Tensor], Gaussians]:
+    leaves = {name: getattr(splats, name).clone().requires_grad_() for name in ("means", "quats", "scales", "opacities", "sh")}
+    return leaves, Gaussians(**leaves)
+
+
+# Left out by size
+
+
+@BOTH
+def test_playcanvas_drops_a_splat_whose_longer_axis_is_less_than_two_half_pixels(backend):
+    # 2·sqrt(2·(4v + 0.3)) >= 2 in half pixels: v >= 0.05 px².
+    assert alpha(backend, "playcanvas", splat(0.049, 0.01)).max() == 0
+    assert alpha(backend, "playcanvas", splat(0.051, 0.01))[MIDDLE, MIDDLE] == pytest.approx(0.9, abs=1e-6)
+    assert alpha(backend, "playcanvas", splat(0.01, 0.051)).max() > 0
+
+
+@BOTH
+def test_webgpu_asks_for_the_size_along_x_and_y(backend):
+    slanted = splat(0.06, 0.0001, turn=math.pi / 4)  # 0.03 px² along x and along y
+    assert alpha(backend, "playcanvas", slanted).max() > 0
+    assert alpha(backend, "playcanvas-webgpu", slanted).max() == 0
+
+
+@BOTH
+def test_webgpu_drops_a_splat_that_contributes_less_than_three(backend):
+    # opacity · 2π · sqrt(det) in half pixels, with variances 4·(0.1 + 0.075) and 4·(0.2 + 0.075)
+    least = 3 / (2 * math.pi * math.sqrt(0.7 * 1.1))
+    assert alpha(backend, "playcanvas-webgpu", splat(0.1, 0.2, least * 0.999)).max() == 0
+    assert alpha(backend, "playcanvas-webgpu", splat(0.1, 0.2, least * 1.001)).max() > 0
+    assert alpha(backend, "playcanvas", splat(0.1, 0.2, least * 0.999)).max() > 0
+
+
+@BOTH
+def test_cesium_drops_what_is_smaller_than_two_pixels_of_its_own(backend):
+    # sqrt(2·(16v + 0.3)) >= 2: v >= 0.10625 px²
+    assert alpha(backend, "cesium", splat(0.106, 0.01)).max() == 0
+    assert alpha(backend, "cesium", splat(0.107, 0.01)).max() > 0
+
+
+# The screen filter and the edge
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("viewer", "more"), [("playcanvas", 0.075), ("gaussian-splats-3d", 0.3), ("cesium", 0.01875), ("babylon", 0.075), ("antimatter15", 0.0)]
+)
+def test_a_viewer_dilates_by_its_own_variance(backend, viewer, more):
+    shown = alpha(backend, viewer, splat(4.0, 1.0, 0.8))
+    end = math.exp(-4) if viewer == "playcanvas" else 0.0
+    for x in (1, 3):
+        weight = math.exp(-(x**2) / 2 / (4.0 + more))
+        assert shown[MIDDLE, MIDDLE + x] == pytest.approx(0.8 * (weight - end) / (1 - end), abs=2e-5)
+
+
+@BOTH
+def test_playcanvas_fades_and_others_cut_at_the_root_of_eight(backend):
+    # Dilated to 1 px²: pixels at 2 and 3 lie this side and that of 2.83 standard deviations.
+    faded = alpha(backend, "playcanvas", splat(0.925, 0.925, 0.9))
+    end = math.exp(-4)
+    assert faded[MIDDLE, MIDDLE + 2] == pytest.approx(0.9 * (math.exp(-2) - end) / (1 - end), abs=1e-5)
+    assert faded[MIDDLE + 2, MIDDLE + 2] == 0  # just at the edge: A = 1
+    cut = alpha(backend, "antimatter15", splat(1.0, 1.0, 0.9))
+    assert cut[MIDDLE, MIDDLE + 2] == pytest.approx(0.9 * math.exp(-2), abs=1e-5)
+    assert cut[MIDDLE, MIDDLE + 3] == 0 < 0.9 * math.exp(-4.5) - 0.5 / 255
+
+
+@BOTH
+def test_spark_looks_at_alpha_after_compensation(backend):
+    # A needle of 2 by v px² keeps sqrt(2v / (2.3·(v + 0.3))) of its opacity.
+    def share(v):
+        return math.sqrt(2 * v / (2.3 * (v + 0.3)))
+
+    least = 0.5 / 255
+    bright, faint = splat(2.0, 1e-4, 1.1 * least / share(1e-4)), splat(2.0, 1e-4, 0.9 * least / share(1e-4))
+    assert faint.opacities.item() > 10 * least  # before compensation it is bright
+    assert alpha(backend, "spark", faint).max() == 0
+    assert alpha(backend, "spark", bright)[MIDDLE, MIDDLE] == pytest.approx(1.1 * least, rel=1e-3)
+
+
+@BOTH
+def test_antialiasing_makes_playcanvas_keep_the_light(backend):
+    whole, kept = (alpha(backend, viewer, splat(0.2, 0.1))[MIDDLE, MIDDLE] for viewer in ("playcanvas", "playcanvas-aa"))
+    assert kept / whole == pytest.approx(math.sqrt(0.2 * 0.1 / (0.275 * 0.175)), rel=1e-5)
+
+
+@BOTH
+def test_an_opaque_splat_covers_more_than_in_training(backend):
+    assert alpha(backend, "playcanvas", splat(4.0, 4.0, 1.0))[MIDDLE, MIDDLE] == pytest.approx(0.999)
+    assert alpha(backend, "classic", splat(4.0, 4.0, 1.0))[MIDDLE, MIDDLE] == pytest.approx(0.99)
+
+
+# GaussianSplats3D's eigenvalues
+
+
+@BOTH
+def test_gaussian_splats_3d_drops_small_round_splats(backend):
+    # mean + 0.3 - sqrt(0.1) > 0: a mean of 0.0162 px²
+    assert alpha(backend, "gaussian-splats-3d", splat(0.0161, 0.0161)).max() == 0
+    assert alpha(backend, "gaussian-splats-3d", splat(0.0163, 0.0163)).max() > 0
+    assert alpha(backend, "gaussian-splats-3d", splat(0.0324, 0.0001)).max() > 0
+
+
+@BOTH
+def test_gaussian_splats_3d_draws_a_round_splat_upright(backend):
+    shown = alpha(backend, "gaussian-splats-3d", splat(1.0, 1.0, 0.8))
+    for step in (1, 2):
+        down, across = (0.8 * math.exp(-(step**2) / 2 / (1.3 + sign * math.sqrt(0.1))) for sign in (1, -1))
+        assert shown[MIDDLE + step, MIDDLE] == pytest.approx(down, abs=1e-5)
+        assert shown[MIDDLE, MIDDLE + step] == pytest.approx(across, abs=1e-5)
+
+
+@BOTH
+def test_gaussian_splats_3d_turns_a_nearly_round_splat(backend):
+    """The shader's own steps: eigenvalues, an eigenvector that is none, and the weight in that basis."""
+    a, b, d = 1.15 + 0.3, 0.15, 1.15 + 0.3  # of variances 1.3 and 1.0, turned by 45 degrees
+    middle, spread = (a + d) / 2, math.sqrt(max(0.1, ((a + d) / 2) ** 2 - (a * d - b * b)))
+    x, y = b / math.hypot(b, middle + spread - a), (middle + spread - a) / math.hypot(b, middle + spread - a)
+    shown = alpha(backend, "gaussian-splats-3d", splat(1.3, 1.0, 0.8, turn=math.pi / 4))
+    for dx, dy in ((1, 1), (1, -1), (2, 0), (0, 2)):
+        along, across = dx * x + dy * y, dx * y - dy * x
+        weight = math.exp(-(along**2 / (middle + spread) + across**2 / (middle - spread)) / 2)
+        assert shown[MIDDLE + dy, MIDDLE + dx] == pytest.approx(0.8 * weight, abs=2e-5)
+
+
+@BOTH
+def test_a_long_splat_keeps_its_shape(backend):
+    stretching, plain = find_viewer("gaussian-splats-3d").effects(Effects(0)), replace(find_viewer("gaussian-splats-3d"), settings=USUAL)
+    long = splat(4.0, 1.0, turn=0.5)
+    drawn = backend.render(long, camera(), replace(stretching, settings=RenderSettings(least_spread=0.1**0.5))).alpha
+    torch.testing.assert_close(drawn, backend.render(long, camera(), plain.effects(Effects(0))).alpha, atol=1e-6, rtol=0)
+
+
+# What a culled splat feels
+
+
+CULLED = [("playcanvas", splat(0.04, 0.02)), ("playcanvas-webgpu", splat(0.1, 0.2, 0.4)), ("gaussian-splats-3d", splat(0.015, 0.014))]
+
+
+@BOTH
+@pytest.mark.parametrize(("viewer", "culled"), CULLED, ids=[name for name, _ in CULLED])
+def test_a_culled_splat_is_not_drawn_and_grows_where_it_is_missed(backend, viewer, culled):
+    leaves, splats = differentiable(culled)
+    shown = alpha(backend, viewer, splats)
+    assert (shown == 0).all()
+    (shown.sum() * -1).backward()  # the loss falls as the splat appears
+    assert all(leaf.grad.isfinite().all() for leaf in leaves.values() if leaf.grad is not None)
+    assert leaves["scales"].grad[0, :2].min() <= 0 and leaves["scales"].grad[0, 0] < 0
+    assert leaves["scales"].grad[0, :2].abs().max() > 1e-3
+
+
+@BOTH
+@pytest.mark.parametrize(("viewer", "culled"), CULLED, ids=[name for name, _ in CULLED])
+def test_a_culled_splat_that_is_in_the_way_does_not_grow(backend, viewer, culled):
+    leaves, splats = differentiable(culled)
+    alpha(backend, viewer, splats).sum().backward()
+    assert leaves["scales"].grad[0, 0] > 0
+
+
+def test_only_a_contribution_that_is_too_little_feels_its_opacity():
+    (_, small), (_, faint) = CULLED[0], CULLED[1]
+    felt = []
+    for viewer, culled in (("playcanvas", small), ("playcanvas-webgpu", faint)):
+        leaves, splats = differentiable(culled)
+        alpha(BACKENDS[0], viewer, splats).sum().backward()
+        felt.append(leaves["opacities"].grad.item())
+    assert felt[0] == 0 < felt[1]
+
+
+def test_steps_along_the_gradient_bring_a_splat_back():
+    scales = splat(0.03, 0.03).scales.log().requires_grad_()
+    optimizer = torch.optim.Adam([scales], lr=0.02)
+    for _ in range(60):
+        shown = alpha(BACKENDS[1], "playcanvas", replace(splat(0.03, 0.03), scales=scales.exp()))
+        optimizer.zero_grad()
+        (shown[MIDDLE, MIDDLE] - 0.9).square().backward()
+        optimizer.step()
+    assert shown[MIDDLE, MIDDLE].item() == pytest.approx(0.9, abs=0.02)
+
+
+@BOTH
+def test_a_large_splat_does_not_feel_the_cull(backend):
+    gradients = []
+    for settings in (find_viewer("playcanvas").settings, replace(find_viewer("playcanvas").settings, min_variance=0.0)):
+        leaves, splats = differentiable(splat(4.0, 3.0))
+        effects = Effects(0, "classic", 0.075, settings=replace(settings, packing=None, color_steps=None))
+        backend.render(splats, camera(), effects).alpha[MIDDLE, MIDDLE + 1].backward()
+        gradients.append(leaves["scales"].grad)
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=0)
+
+
+# Colors and order
+
+
+@BOTH
+def test_spark_clips_colors_and_shows_them_in_steps(backend):
+    effects = find_viewer("spark").effects(Effects(0))
+    effects = replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
+
+    def color(value):
+        shown = backend.render(splat(40.0, 40.0, 1.0, value), camera(), effects)
+        return (shown.image[MIDDLE, MIDDLE, 0] / shown.alpha[MIDDLE, MIDDLE]).item()
+
+    assert color(1.7) == pytest.approx(1.0, abs=1e-6)
+    assert color(100.4 / 255) == pytest.approx(100 / 255, abs=1e-6)
+    assert color(100.6 / 255) == pytest.approx(101 / 255, abs=1e-6)
+
+
+@BOTH
+def test_a_color_in_steps_keeps_its_gradient(backend):
+    leaves, splats = differentiable(splat(40.0, 40.0, 1.0, 0.2 / 255))  # shown as black, and not black
+    effects = find_viewer("spark").effects(Effects(0))
+    effects = replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
+    shown = backend.render(splats, camera(), effects)
+    shown.image[MIDDLE, MIDDLE, 0].backward()
+    assert leaves["sh"].grad[0, 0, 0] == pytest.approx(C0 * shown.alpha[MIDDLE, MIDDLE].item(), rel=1e-4)
+
+
+@BOTH
+def test_spark_sorts_by_distance(backend):
+    """Of two splats the one that lies less deep may lie further from the eye, where it lies aside."""
+    near, far = splat(900.0, 900.0, 1.0, 1.0, means=(0.0, 0.0, 10.0)), splat(900.0, 900.0, 1.0, 0.0, means=(4.6, 0.0, 9.9))
+    pair = Gaussians(*(torch.cat([getattr(near, f.name), getattr(far, f.name)]) for f in fields(near) if f.name != "covariances"))
+    wide = replace(camera(), width=120, cx=60.0)
+    first = {name: backend.render(pair, wide, find_viewer(name).effects(Effects(0))).image[MIDDLE, 82, 0].item() for name in ("spark", "classic")}
+    assert first["spark"] > 0.5 > first["classic"]
+
+
+# Pictures of 8 bits
+
+
+@BOTH
+def test_a_picture_is_rounded_after_each_splat_from_the_back(backend):
+    settings = RenderSettings(min_alpha=0.5 / 255, max_alpha=0.999, min_transmittance=1e-6, picture_step=1 / 255)
+    parts = [splat(30.0, 30.0, opacity, color, means=(0.0, 0.0, depth)) for opacity, color, depth in ((0.01, 0.3, 9.0), (0.3, 0.9, 10.0))]
+    both = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(parts[0]) if f.name != "covariances"))
+    shown = backend.render(both, camera(), Effects(0, settings=settings, background=(0.2, 0.2, 0.2)))
+    behind = round(255 * (0.3 * 0.9 + 0.7 * 0.2)) / 255
+    assert shown.image[MIDDLE, MIDDLE, 0].item() == pytest.approx(round(255 * (0.01 * 0.3 + 0.99 * behind)) / 255, abs=1e-6)
+
+
+@BOTH
+def test_a_splat_of_less_than_half_a_step_is_not_seen_and_has_its_gradient(backend):
+    leaves, splats = differentiable(splat(30.0, 30.0, 0.01, 0.5))
+    settings = [RenderSettings(picture_step=step) for step in (1 / 255, None)]
+    images = [backend.render(splats, camera(), Effects(0, settings=each, background=(0.6, 0.6, 0.6))).image for each in settings]
+    assert (images[0] == images[0][0, 0]).all() and not (images[1] == images[1][0, 0]).all()
+    gradients = [torch.autograd.grad(image.sum(), list(leaves.values()), retain_graph=True) for image in images]
+    for rounded, exact in zip(*gradients, strict=True):
+        torch.testing.assert_close(rounded, exact)
+
+
+# Beside the picture
+
+
+@BOTH
+@pytest.mark.parametrize(("viewer", "most"), [("spark", 1.4), ("gaussian-splats-3d", 1.2)])
+def test_a_splat_is_left_out_by_its_center(backend, viewer, most):
+    def seen(halves):
+        return alpha(backend, viewer, splat(900.0, 900.0, means=(halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max()
+
+    assert seen(most - 0.01) > 0.5 and seen(1 - most) > 0.5
+    assert seen(most + 0.01) == seen(-most - 0.01) == 0
+    assert alpha(backend, "playcanvas", splat(900.0, 900.0, means=(1.5 * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max() > 0.5
+
+
+@BOTH
+def test_on_the_web_the_projection_is_frozen_nowhere(backend):
+    """A ball far aside: along x its variance on the picture is f²σ²/z² · (1 + (x/z)²)."""
+    sigma, f = 0.3, 20.0
+    near = replace(camera(), fx=f, fy=f)  # half the picture is 0.525 wide: 1.3 of that is 0.68, and 0.9 lies beyond
+    for slope in (0.5, 0.9):
+        shape = torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), sigma)
+        ball = Gaussians(torch.tensor([[slope * 2, 0.0, 2.0]]), *shape, torch.tensor([0.9]), torch.zeros(1, 1, 3))
+        variance = (f * sigma / 2) ** 2 * (1 + slope**2)
+        dx = 20.5 - (SIZE / 2 + f * slope)
+        shown = backend.render(ball, near, Effects(0, eps2d=0.0, settings=RenderSettings(frozen_beyond=math.inf))).alpha
+        assert shown[MIDDLE, 20].item() == pytest.approx(0.9 * math.exp(-(dx**2) / variance / 2), abs=1e-5)
+    frozen = backend.render(ball, near, Effects(0, eps2d=0.0)).alpha
+    assert frozen[MIDDLE, 20] < shown[MIDDLE, 20] - 0.01
+
+
+# Packing
+
+
+def test_spark_packs_scales_in_254_steps_and_opacities_in_steps_of_two():
+    packing = find_viewer("spark").settings.packing
+    splats = samples.gaussians(200)
+    kept = packed(splats, samples.camera(), packing)
+    code = (kept.scales.log() + 12) * 254 / 21
+    assert (code - code.round()).abs().max() < 1e-9
+    assert (kept.scales.log() - splats.scales.log()).abs().max() <= 21 / 254 / 2 + 1e-9
+    code = kept.opacities * 255 / 2
+    assert (code - code.round()).abs().max() < 1e-9 and (kept.opacities - splats.opacities).abs().max() < 1.6 / 255
+
+
+@pytest.mark.parametrize(("viewer", "most"), [("spark", 2.0), ("playcanvas", 0.3)])
+def test_packed_rotations_are_nearly_what_they_were(viewer, most):
+    splats = samples.gaussians(500)
+    kept = packed(splats, samples.camera(), find_viewer(viewer).settings.packing)
+    dots = (torch.nn.functional.normalize(kept.quats) * torch.nn.functional.normalize(splats.quats)).sum(1).abs()
+    degrees = torch.rad2deg(2 * dots.clamp(max=1).acos())
+    assert 0.01 < degrees.max() < most
+    assert torch.allclose(kept.quats.norm(dim=1), splats.quats.norm(dim=1))
+
+
+def test_packed_twice_is_packed():
+    packing = replace(find_viewer("spark").settings.packing, half_means=False)
+    once = packed(samples.gaussians(100), samples.camera(), packing)
+    twice = packed(once, samples.camera(), packing)
+    assert torch.allclose(once.scales, twice.scales) and torch.allclose(once.opacities, twice.opacities) and torch.allclose(once.sh, twice.sh)
+
+
+def test_colors_that_are_kept_downwards():
+    kept = packed(splat(1.0, 1.0, 100.9 / 255, 100.9 / 255), camera(), find_viewer("gaussian-splats-3d").settings.packing)
+    assert kept.opacities.item() * 255 == pytest.approx(100, abs=1e-3) and (0.5 + C0 * kept.sh[0, 0, 0].item()) * 255 == pytest.approx(100, abs=1e-3)
+
+
+def test_gradients_pass_packing_as_they_are():
+    leaves, splats = differentiable(samples.gaussians(20))
+    kept = packed(splats, samples.camera(), find_viewer("spark").settings.packing)
+    sum((index + 1) * getattr(kept, name).sum() for index, name in enumerate(leaves)).backward()
+    assert all((leaf.grad == index + 1).all() for index, leaf in enumerate(leaves.values()))
+
+
+# Records
+
+
+def test_what_a_viewer_does_is_on_and_the_rest_is_off():
+    told = {}
+    for viewer in VIEWERS.names():
+        told[viewer] = {part.name for part in explain(find_viewer(viewer).effects(Effects(0)), splat(1.0, 1.0)) if part.on}
+    assert told["classic"] == {"screen filter"}
+    assert told["spark"] == {"screen filter", "compensation", "edge", "frame", "color limit", "order by distance", "packing", "rounded picture"}
+    assert told["playcanvas"] == {"screen filter", "edge", "size cull", "color limit", "packing", "rounded picture"}
+    assert told["playcanvas-webgpu"] == told["playcanvas"] | {"contribution cull"}
+    assert told["gaussian-splats-3d"] == {"screen filter", "edge", "frame", "stretching", "packing", "rounded picture"}
+
+
+def test_the_usual_viewers_ask_for_nothing_new():
+    assert all(find_viewer(name).settings == USUAL for name in ("classic", "antialiased", "mip"))
+    assert find_viewer("classic").effects(Effects(2)) == Effects(2)
+
+
+def test_supersplat_is_playcanvas_and_every_record_is_under_its_name():
+    assert find_viewer("supersplat") is find_viewer("playcanvas")
+    assert all(find_viewer(viewer.name) is viewer and viewer.source and viewer.title for viewer in BUILT_IN)
+
+
+def test_an_unknown_viewer_is_told_the_known_ones():
+    with pytest.raises(SettingsError, match=r"there is no 'sparks'; known are antialiased, .*, spark, supersplat"):
+        find_viewer("sparks")
+
+
+def test_a_new_viewer_is_one_record(monkeypatch):
+    monkeypatch.setattr(VIEWERS, "_targets", dict(VIEWERS._targets))
+    register_viewer("blurry", Viewer("blurry", "A blurry one", "nowhere", "classic", 2.0))
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(1), backend="reference")
+    shown = model.render(tiny.cameras(1)[0], viewer="blurry").image
+    expected = model.render(tiny.cameras(1)[0]).image
+    assert not torch.allclose(shown, expected)
+    register_viewer("wrong", 3)
+    with pytest.raises(PluginError, match="viewer 'wrong' is a int"):
+        find_viewer("wrong")
+
+
+def test_a_viewer_draws_no_more_bands_than_it_has():
+    effects = find_viewer("gaussian-splats-3d").effects(Effects(3, background=(1.0, 1.0, 1.0), near_plane=0.5))
+    assert (effects.sh_degree, effects.background, effects.near_plane) == (0, (1.0, 1.0, 1.0), 0.5)
+    assert find_viewer("spark").effects(Effects(2)).sh_degree == 2
+
+
+@pytest.mark.parametrize("backend", [GsplatBackend(), InriaBackend(), TritonBackend()], ids=lambda backend: backend.name)
+def test_backends_on_a_gpu_say_what_they_do_not_have(backend):
+    needs = Needs.of(splat(1.0, 1.0), find_viewer("gaussian-splats-3d").effects(Effects(0)), gradients=True)
+    [reason] = [reason for reason in backend.lacking(needs) if "reference backend has" in reason]
+    assert "stretching of round splats" in reason and "packing" in reason and "splats that end at a radius" in reason
+    assert not [reason for reason in backend.lacking(replace(needs, settings=USUAL)) if "reference backend has" in reason]
+
+
+def test_filters_that_integrate_are_no_viewers():
+    needs = Needs.of(splat(1.0, 1.0), Effects(0, "analytic", settings=RenderSettings(min_variance=1.0)), gradients=True)
+    for backend in BACKENDS:
+        assert "the screen filter analytic is not drawn with culling by size" in backend.lacking(needs)
+
+
+def test_a_splat_that_fades_needs_an_end():
+    with pytest.raises(SettingsError, match="give radius"):
+        RenderSettings(fades=True)
+
+
+def test_sizes_keep_their_meaning_under_supersampling():
+    usual, culled = Effects(0, supersampling=3), find_viewer("playcanvas").effects(Effects(0, supersampling=3))
+    assert culled.settings.finer(3).min_variance == pytest.approx(9 / 8)
+    assert usual.settings.finer(3) is usual.settings
+    assert culled.settings.radius == EDGE
+
+
+# A model, and the command
+
+
+def wrapped() -> Wrapped:
+    return wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="reference")
+
+
+def test_a_model_is_drawn_as_the_viewer_does():
+    model, view = wrapped(), tiny.cameras(1)[0]
+    shown = model.render(view, viewer="playcanvas")
+    expected = ReferenceBackend().render(model.model.gaussians(view), view, find_viewer("playcanvas").effects(model.effects()))
+    assert torch.equal(shown.image, expected.image)
+    assert not torch.allclose(shown.image, model.render(view).image)
+
+
+def test_depth_is_no_color():
+    model, view = wrapped(), tiny.cameras(1)[0]
+    assert model.render(view, outputs=("depth",), viewer="spark").depth.max() > 1.5
+
+
+def test_a_viewer_has_its_own_screen_filter():
+    with pytest.raises(SettingsError, match="viewer spark has a screen filter of its own"):
+        wrapped().render(tiny.cameras(1)[0], screen_filter="mip", viewer="spark")
+
+
+def test_the_command_draws_as_a_viewer(tmp_path, capsys):
+    folder = tiny.folder(tmp_path / "model")
+    words = ["render", str(folder), "--output", str(tmp_path / "out"), "--viewer", "supersplat"]
+    assert cli.main(words) == 0
+    assert list((tmp_path / "out").glob("*.png"))
+    words[-1] = "superspalt"
+    assert cli.main([*words, "--overwrite"]) == 2
+    assert "there is no 'superspalt'; known are" in capsys.readouterr().err
