@@ -1,0 +1,43 @@
+// What every page of a viewer needs. A view is {width, height, projection, viewmat, background}: matrices are OpenGL's, 16 numbers by columns.
+
+// Frames that a page may take until its picture is settled: half a minute of slow ones.
+const MOST_FRAMES = 300
+
+export const canvas = document.querySelector('canvas')
+
+export const nextFrame = () => new Promise((resolve) => requestAnimationFrame(resolve))
+
+// Draws frame after frame until `settled()`; the last frame has begun after it was.
+export async function drawUntil(settled, frame) {
+  for (let i = 0; i < MOST_FRAMES; i++) {
+    const isLast = settled()
+    frame()
+    if (isLast) return
+    await nextFrame()
+  }
+  throw new Error(`the viewer was still sorting after ${MOST_FRAMES} frames`)
+}
+
+// The canvas' pixels as base64 of RGBA bytes, the bottom row first; to be asked for in the task that drew them.
+export function readPixels(gl, { width, height }) {
+  const bytes = new Uint8Array(width * height * 4)
+  gl.bindFramebuffer(gl.FRAMEBUFFER, null)
+  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes)
+  let text = ''
+  for (let i = 0; i < bytes.length; i += 32768) text += String.fromCharCode(...bytes.subarray(i, i + 32768))
+  return btoa(text)
+}
+
+// A three.js camera with exactly this view, which nothing recomputes.
+export function pose(camera, view) {
+  camera.matrixAutoUpdate = false
+  camera.matrixWorldAutoUpdate = false
+  camera.projectionMatrix.fromArray(view.projection)
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert()
+  camera.matrixWorldInverse.fromArray(view.viewmat)
+  camera.matrixWorld.copy(camera.matrixWorldInverse).invert()
+  camera.matrix.copy(camera.matrixWorld)
+  camera.matrix.decompose(camera.position, camera.quaternion, camera.scale)
+  camera.fov = (2 * Math.atan(1 / view.projection[5]) * 180) / Math.PI
+  camera.aspect = view.width / view.height
+}

@@ -1,0 +1,67 @@
+import * as pc from 'playcanvas'
+import { canvas, nextFrame, readPixels } from './common.js'
+
+// `settings`: of the engine's `scene.gsplat`, such as antiAlias; its defaults are what its users see.
+export async function start(settings) {
+  const device = await pc.createGraphicsDevice(canvas, { deviceTypes: ['webgl2'], antialias: false })
+  device.maxPixelRatio = 1
+  const options = new pc.AppOptions()
+  options.graphicsDevice = device
+  options.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem]
+  options.resourceHandlers = [pc.GSplatHandler]
+  const app = new pc.AppBase(canvas)
+  app.init(options)
+  app.setCanvasFillMode(pc.FILLMODE_NONE)
+  app.autoRender = false
+  // Colors follow the view exactly: a viewer in motion reuses them within ten degrees.
+  Object.assign(app.scene.gsplat, { colorUpdateAngle: 0, ...settings })
+  app.start()
+
+  const eye = new pc.Entity('eye')
+  eye.addComponent('camera', { nearClip: 0.01, farClip: 1000, toneMapping: pc.TONEMAP_NONE, gammaCorrection: pc.GAMMA_SRGB })
+  app.root.addChild(eye)
+  let shown = null
+
+  const frame = async () => {
+    app.renderNextFrame = true
+    await new Promise((resolve) => app.once('frameend', resolve))
+  }
+
+  return {
+    async open(url) {
+      if (shown) {
+        shown.entity.destroy()
+        app.assets.remove(shown.asset)
+        shown.asset.unload()
+      }
+      const asset = new pc.Asset('splats', 'gsplat', { url })
+      await new Promise((resolve, reject) => {
+        asset.once('load', resolve)
+        asset.once('error', (message) => reject(new Error(message)))
+        app.assets.add(asset)
+        app.assets.load(asset)
+      })
+      const entity = new pc.Entity('splats')
+      entity.addComponent('gsplat', { asset })
+      app.root.addChild(entity)
+      shown = { asset, entity }
+    },
+
+    async draw(view) {
+      device.setResolution(view.width, view.height)
+      const world = new pc.Mat4().set(view.viewmat).invert()
+      eye.setPosition(world.getTranslation())
+      eye.setRotation(new pc.Quat().setFromMat4(world))
+      eye.camera.clearColor = new pc.Color(...view.background, 1)
+      eye.camera.fov = (2 * Math.atan(1 / view.projection[5]) * 180) / Math.PI
+      eye.camera.calculateProjection = (matrix) => matrix.set(view.projection)
+      // A sort is asked for in one frame, done by a worker, and taken over in a later one.
+      let sorted = 0
+      const count = () => sorted++
+      app.scene.on('gsplat:sorted', count)
+      for (let i = 0; i < 6; i++) await frame()
+      app.scene.off('gsplat:sorted', count)
+      return readPixels(device.gl, view)
+    },
+  }
+}
