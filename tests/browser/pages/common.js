@@ -7,11 +7,11 @@ export const canvas = document.querySelector('canvas')
 
 export const nextFrame = () => new Promise((resolve) => requestAnimationFrame(resolve))
 
-// Draws frame after frame until `settled()`; the last frame has begun after it was.
+// Draws frame after frame until one has begun that was `settled()` before.
 export async function drawUntil(settled, frame) {
   for (let i = 0; i < MOST_FRAMES; i++) {
     const isLast = settled()
-    frame()
+    await frame()
     if (isLast) return
     await nextFrame()
   }

@@ -1,5 +1,8 @@
 import * as pc from 'playcanvas'
-import { canvas, nextFrame, readPixels } from './common.js'
+import { canvas, drawUntil, readPixels } from './common.js'
+
+// 1 - cosine of the milliradian that the engine lets a camera turn before it sorts again.
+const SORT_TURN = 1e-6
 
 // `settings`: of the engine's `scene.gsplat`, such as antiAlias; its defaults are what its users see.
 export async function start(settings) {
@@ -22,9 +25,9 @@ export async function start(settings) {
   app.root.addChild(eye)
   let shown = null
 
-  const frame = async () => {
+  const frame = () => {
     app.renderNextFrame = true
-    await new Promise((resolve) => app.once('frameend', resolve))
+    return new Promise((resolve) => app.once('frameend', resolve))
   }
 
   return {
@@ -55,13 +58,22 @@ export async function start(settings) {
       eye.camera.clearColor = new pc.Color(...view.background, 1)
       eye.camera.fov = (2 * Math.atan(1 / view.projection[5]) * 180) / Math.PI
       eye.camera.calculateProjection = (matrix) => matrix.set(view.projection)
-      // A sort is asked for in one frame, done by a worker, and taken over in a later one.
-      let sorted = 0
-      const count = () => sorted++
-      app.scene.on('gsplat:sorted', count)
-      for (let i = 0; i < 6; i++) await frame()
-      app.scene.off('gsplat:sorted', count)
+      // A sort is asked for in one frame, done by a worker, and taken over in a later one, whose picture is the first in order.
+      await drawUntil(() => isSorted(app, eye), frame)
       return readPixels(device.gl, view)
     },
   }
+}
+
+// Whether the order that is drawn is that of this camera, and none is on its way.
+function isSorted(app, eye) {
+  const layers = app.renderer.gsplatDirector.camerasMap.get(eye.camera.camera)?.layersMap.values() ?? []
+  const managers = [...layers].map((layer) => layer.gsplatManager).filter(Boolean)
+  const settled = ({ cpuSorter, world, sortNeeded, lastSortCameraFwd }) =>
+    !sortNeeded &&
+    !cpuSorter.jobsInFlight &&
+    !cpuSorter.pendingSorted &&
+    world.currentVersion === world.lastWorldStateVersion &&
+    lastSortCameraFwd.dot(eye.forward) > 1 - SORT_TURN
+  return managers.length > 0 && managers.every(settled)
 }
