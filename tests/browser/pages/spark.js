@@ -27,10 +27,11 @@ export async function start(settings) {
       renderer.setSize(view.width, view.height, false)
       renderer.setClearColor(new THREE.Color(...view.background), 1)
       pose(camera, view)
-      const draw = () => renderer.render(scene, camera)
-      draw()
       await spark.update({ scene, camera })
-      await drawUntil(() => !spark.sorting && !spark.sortDirty && spark.display === spark.current, draw)
+      await drawUntil(
+        () => !spark.sorting && !spark.sortDirty && spark.display === spark.current,
+        () => renderer.render(scene, camera),
+      )
       return readPixels(renderer.getContext(), view)
     },
   }
