@@ -27,8 +27,11 @@ from mipmap_plugin import Camera
 
 HERE = Path(__file__).parent
 
-# Software WebGL, as on a machine without a GPU.
-FLAGS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--force-color-profile=srgb")
+# Software WebGL and WebGPU, as on a machine without a GPU.
+FLAGS = (
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--force-color-profile=srgb"),
+    *("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"),
+)
 
 # Milliseconds that one view may take: tens of thousands of splats on a processor, beside other work.
 PATIENCE = 60_000
@@ -40,6 +43,7 @@ NEAR, FAR = 0.01, 1000.0
 VIEWERS: dict[str, tuple[str, dict[str, Any]]] = {
     "spark": ("spark", {}),
     "playcanvas": ("playcanvas", {}),
+    "playcanvas-webgpu": ("playcanvas", {"device": "webgpu"}),
     "playcanvas-aa": ("playcanvas", {"antiAlias": True}),
     "gaussian-splats-3d": ("gaussian-splats-3d", {}),
 }

@@ -1,12 +1,14 @@
 import * as pc from 'playcanvas'
-import { canvas, drawUntil, readPixels } from './common.js'
+import { canvas, drawToTexture, drawUntil, readPixels, readTexture } from './common.js'
 
 // 1 - cosine of the milliradian that the engine lets a camera turn before it sorts again.
 const SORT_TURN = 1e-6
 
-// `settings`: of the engine's `scene.gsplat`, such as antiAlias; its defaults are what its users see.
-export async function start(settings) {
-  const device = await pc.createGraphicsDevice(canvas, { deviceTypes: ['webgl2'], antialias: false })
+// `device`: webgl2 or webgpu. `settings`: of the engine's `scene.gsplat`, such as antiAlias; its defaults are what its users see.
+export async function start({ device: type = 'webgl2', ...settings }) {
+  const target = type === 'webgpu' && drawToTexture()
+  const device = await pc.createGraphicsDevice(canvas, { deviceTypes: [type], antialias: false })
+  if (device.deviceType !== type) throw new Error(`this browser has no ${type}`)
   device.maxPixelRatio = 1
   const options = new pc.AppOptions()
   options.graphicsDevice = device
@@ -60,7 +62,7 @@ export async function start(settings) {
       eye.camera.calculateProjection = (matrix) => matrix.set(view.projection)
       // A sort is asked for in one frame, done by a worker, and taken over in a later one, whose picture is the first in order.
       await drawUntil(() => isSorted(app, eye), frame)
-      return readPixels(device.gl, view)
+      return target ? readTexture(target) : readPixels(device.gl, view)
     },
   }
 }
@@ -71,8 +73,8 @@ function isSorted(app, eye) {
   const managers = [...layers].map((layer) => layer.gsplatManager).filter(Boolean)
   const settled = ({ cpuSorter, world, sortNeeded, lastSortCameraFwd }) =>
     !sortNeeded &&
-    !cpuSorter.jobsInFlight &&
-    !cpuSorter.pendingSorted &&
+    !cpuSorter?.jobsInFlight &&
+    !cpuSorter?.pendingSorted &&
     world.currentVersion === world.lastWorldStateVersion &&
     lastSortCameraFwd.dot(eye.forward) > 1 - SORT_TURN
   return managers.length > 0 && managers.every(settled)
