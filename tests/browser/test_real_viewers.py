@@ -37,10 +37,12 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def blob(tmp_path: Path) -> Path:
-    """One red, opaque, round splat at (0.3, -0.2, 0.5), 0.05 wide."""
+    """Red, opaque, round splats around (0.3, -0.2, 0.5), 0.05 wide: twenty, for GaussianSplats3D draws nothing of a file with one or two."""
     row = dict(x=0.3, y=-0.2, z=0.5, f_dc_0=1.7, f_dc_1=-1.7, f_dc_2=-1.7, opacity=6.0, rot_0=1.0, rot_1=0.0, rot_2=0.0, rot_3=0.0)
     row |= {f"scale_{axis}": float(np.log(0.05)) for axis in range(3)}
-    return write_ply(tmp_path / "blob.ply", {name: np.array([value], np.float32) for name, value in row.items()})
+    columns = {name: np.full(20, value, np.float32) for name, value in row.items()}
+    columns["x"] += np.linspace(-0.01, 0.01, 20, dtype=np.float32)
+    return write_ply(tmp_path / "blob.ply", columns)
 
 
 def off_axis() -> Camera:
@@ -51,7 +53,7 @@ def off_axis() -> Camera:
 
 
 def psnr(image: np.ndarray, other: np.ndarray) -> float:
-    return float(-10 * np.log10(np.square(image - other).mean()))
+    return float(-10 * np.log10(max(np.square(image - other).mean(), 1e-12)))
 
 
 @pytest.mark.parametrize("viewer", VIEWERS)
@@ -74,12 +76,12 @@ def test_the_background_is_the_one_asked_for(browser: Browser, blob: Path, viewe
 
 @pytest.mark.parametrize("viewer", VIEWERS)
 def test_a_view_is_the_same_after_another(browser: Browser, viewer: str) -> None:
-    """Nothing of the view before is left: neither its order, nor its colors, nor its size."""
+    """Nothing of the view before is left: neither its order, nor its colors, nor its size. WebGPU orders equal depths by chance."""
     base = embedded()
     first, second = base.cameras[0].zoomed(1 / 2), base.cameras[len(base.cameras) // 2].zoomed(1 / 4)
     page = browser.open(viewer, base.model.source)
     once, _, again = page.draw([first, second, first], WHITE)
-    assert np.array_equal(once, again)
+    assert psnr(once, again) > 50
 
 
 def test_what_is_no_splat_file_is_refused_in_a_sentence(browser: Browser, tmp_path: Path) -> None:
