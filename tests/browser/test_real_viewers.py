@@ -26,6 +26,9 @@ ALIKE = 45.0
 # Base, scale, dB. At x1/4 a pixel of lego has hundreds of splats so faint, once compensated, that most leave 8 bits as they were.
 BASES = [("lego_200", 1.0, ALIKE), ("lego_200", 1 / 4, 42.0), ("chair_400", 1 / 2, ALIKE)]
 
+# dB, amid splats larger than the picture and beside it: PlayCanvas shrinks the ones, and puts the others' neighbors in a coarser order.
+SURROUNDED = 39.0
+
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
@@ -115,7 +118,7 @@ def test_a_real_base_looks_as_we_say(browser: Browser, shared_data: Path, viewer
 def test_a_real_capture_looks_as_we_say(browser: Browser, shared_data: Path, viewer: str) -> None:
     capture = wrap_model(shared_data / "checkpoints" / "yashica-t4" / "yashica-t4-top8192.ply", background=WHITE)
     cameras = [camera.resized(160, 120) for camera in capture.views()[:2]]
-    assert likeness(browser, viewer, capture, cameras) > ALIKE
+    assert likeness(browser, viewer, capture, cameras) > SURROUNDED
 
 
 def at(cameras: Sequence[Camera], scale: float) -> list[Camera]:
