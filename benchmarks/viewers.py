@@ -50,7 +50,7 @@ INTRO = """# What real viewers show
 
 Made by `python benchmarks/viewers.py DATA`: pictures of the viewers themselves, in Chromium with software WebGL and WebGPU and with exact cameras,
 against photographs (protocol P3); dB, mean of 8 test views. *base*: as it is. *classic*: adapted for classic dilation of 0.3 px². *viewer*: adapted
-for the viewer that shows it. *splat-transform*: the base decimated by version 3.7.0 to as many splats as the classic file has, uniformly or adaptively.
+for the viewer that shows it. *splat-transform*: the base decimated by version 3.7.0 to the count of the classic file, uniformly or adaptively.
 """
 
 
