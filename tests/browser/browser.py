@@ -146,7 +146,7 @@ def _told(viewer: str, shown: Any, script: str, argument: Any) -> Any:
     """What a script on a page answers. Raises BrowserError when it throws, or has not answered after PATIENCE."""
     bounded = f"""argument => Promise.race([
         Promise.resolve(argument).then({script}),
-        new Promise((_, reject) => setTimeout(() => reject(new Error('no picture after {PATIENCE // 1000} s')), {PATIENCE})),
+        new Promise((_, reject) => setTimeout(() => reject(new Error('no picture after {PATIENCE / 1000:g} s')), {PATIENCE})),
     ])"""
     from playwright.sync_api import Error
 

@@ -93,6 +93,14 @@ def test_what_is_no_splat_file_is_refused_in_a_sentence(browser: Browser, tmp_pa
         browser.open("playcanvas", tmp_path / "text.ply")
 
 
+def test_a_view_that_takes_too_long_is_given_up_in_a_sentence(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    base = embedded()
+    page = browser.open("playcanvas", base.model.source, minPixelSize=1.0)  # a page of its own, for it goes on drawing
+    monkeypatch.setattr("browser.PATIENCE", 1)
+    with pytest.raises(BrowserError, match=r"^playcanvas: .*no picture after 0\.001 s"):
+        page.draw(base.cameras[:1])
+
+
 @pytest.mark.parametrize("viewer", VIEWERS)
 def test_the_demo_looks_as_we_say(browser: Browser, viewer: str) -> None:
     base = embedded()
