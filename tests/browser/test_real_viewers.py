@@ -1,0 +1,138 @@
+"""What our renderer says a viewer shows, and what it shows. One browser for all: starting it and compiling shaders cost more than a view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+import pytest
+import torch
+from browser import VIEWERS, Browser, BrowserError, missing
+
+from mipmap_plugin import Camera, wrap_model
+from mipmap_plugin.demo.run import embedded
+from mipmap_plugin.models.ply import write_ply
+from mipmap_plugin.wrap import Wrapped
+
+pytestmark = pytest.mark.browser
+
+WHITE = (1.0, 1.0, 1.0)
+
+# dB. What is left is rounding, and in PlayCanvas the coarse order of splats.
+ALIKE = 45.0
+
+# dB, amid splats larger than the picture and beside it: PlayCanvas shrinks the ones, and puts the others' neighbors in a coarser order.
+SURROUNDED = 39.0
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    if lacking := missing():
+        pytest.skip(lacking)
+    with Browser() as started:
+        yield started
+
+
+@pytest.fixture
+def blob(tmp_path: Path) -> Path:
+    """Red, opaque, round splats around (0.3, -0.2, 0.5), 0.05 wide: twenty, for GaussianSplats3D draws nothing of a file with one or two."""
+    row = dict(x=0.3, y=-0.2, z=0.5, f_dc_0=1.7, f_dc_1=-1.7, f_dc_2=-1.7, opacity=6.0, rot_0=1.0, rot_1=0.0, rot_2=0.0, rot_3=0.0)
+    row |= {f"scale_{axis}": float(np.log(0.05)) for axis in range(3)}
+    columns = {name: np.full(20, value, np.float32) for name, value in row.items()}
+    columns["x"] += np.linspace(-0.01, 0.01, 20, dtype=np.float32)
+    return write_ply(tmp_path / "blob.ply", columns)
+
+
+def off_axis() -> Camera:
+    """A wide picture with two focal lengths, whose principal point lies far from its middle."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, 3] = torch.tensor([0.1, 0.2, 2.0])
+    return Camera(160, 90, 150.0, 120.0, 60.0, 50.0, viewmat)
+
+
+def psnr(image: np.ndarray, other: np.ndarray) -> float:
+    return float(-10 * np.log10(max(np.square(image - other).mean(), 1e-12)))
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_a_splat_lies_where_the_camera_projects_it(browser: Browser, blob: Path, viewer: str) -> None:
+    camera = off_axis()
+    (image,) = browser.open(viewer, blob).draw([camera], WHITE)
+    weight = 1 - image[:, :, 1]
+    rows, columns = np.indices(weight.shape) + 0.5
+    seen = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+    x, y, z = (camera.viewmat @ torch.tensor([0.3, -0.2, 0.5, 1.0], dtype=torch.float64))[:3]
+    assert seen == pytest.approx([float(camera.fx * x / z) + camera.cx, float(camera.fy * y / z) + camera.cy], abs=0.05)
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_the_background_is_the_one_asked_for(browser: Browser, blob: Path, viewer: str) -> None:
+    page = browser.open(viewer, blob)
+    corners = [page.draw([off_axis()], color)[0][0, 0].tolist() for color in (WHITE, (0.0, 0.0, 0.0))]
+    assert corners == [[1, 1, 1], [0, 0, 0]]
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_a_view_is_the_same_after_another(browser: Browser, viewer: str) -> None:
+    """Nothing of the view before is left: neither its order, nor its colors, nor its size. WebGPU orders equal depths by chance."""
+    base = embedded()
+    first, second = base.cameras[0].zoomed(1 / 2), base.cameras[len(base.cameras) // 2].zoomed(1 / 4)
+    page = browser.open(viewer, base.model.source)
+    once, _, again = page.draw([first, second, first], WHITE)
+    assert psnr(once, again) > 50
+
+
+def test_what_is_no_splat_file_is_refused_in_a_sentence(browser: Browser, tmp_path: Path) -> None:
+    (tmp_path / "text.ply").write_text("no splats")
+    with pytest.raises(BrowserError, match=r"^playcanvas: "):
+        browser.open("playcanvas", tmp_path / "text.ply")
+
+
+def test_a_view_that_takes_too_long_is_given_up_in_a_sentence(browser: Browser, monkeypatch: pytest.MonkeyPatch) -> None:
+    base = embedded()
+    page = browser.open("playcanvas", base.model.source, minPixelSize=1.0)  # a page of its own, for it goes on drawing
+    monkeypatch.setattr("browser.PATIENCE", 1)
+    with pytest.raises(BrowserError, match=r"^playcanvas: .*no picture after 0\.001 s"):
+        page.draw(base.cameras[:1])
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_the_demo_looks_as_we_say(browser: Browser, viewer: str) -> None:
+    base = embedded()
+    assert likeness(browser, viewer, base, at(base.cameras[:2], 1 / 2)) > ALIKE
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_an_adapted_file_looks_as_we_say(browser: Browser, viewer: str, tmp_path: Path) -> None:
+    base = embedded()
+    base.adapt(1 / 4, recipe="instant").save(tmp_path / "adapted.ply")
+    adapted = wrap_model(tmp_path / "adapted.ply", background=WHITE)
+    assert likeness(browser, viewer, adapted, at(base.cameras[:2], 1 / 4)) > ALIKE
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+@pytest.mark.parametrize(("name", "scale"), [("lego_200", 1.0), ("lego_200", 1 / 4), ("chair_400", 1 / 2)])
+def test_a_real_base_looks_as_we_say(browser: Browser, shared_data: Path, viewer: str, name: str, scale: float) -> None:
+    base = wrap_model(shared_data / "checkpoints" / "bases" / name)
+    assert likeness(browser, viewer, base, at(base.cameras[0:200:80], scale)) > ALIKE
+
+
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_a_real_capture_looks_as_we_say(browser: Browser, shared_data: Path, viewer: str) -> None:
+    capture = wrap_model(shared_data / "checkpoints" / "yashica-t4" / "yashica-t4-top8192.ply", background=WHITE)
+    cameras = [camera.resized(160, 120) for camera in capture.views()[:2]]
+    assert likeness(browser, viewer, capture, cameras) > SURROUNDED
+
+
+def at(cameras: Sequence[Camera], scale: float) -> list[Camera]:
+    return [camera.zoomed(scale) for camera in cameras]
+
+
+def likeness(browser: Browser, viewer: str, model: Wrapped, cameras: Sequence[Camera]) -> float:
+    """dB between our render under a viewer's convention and the viewer's own picture, both of 8 bits; the mean of the views."""
+    pytest.importorskip("mipmap_plugin.viewers")
+    real = browser.open(viewer, model.model.source).draw(cameras, model.background)
+    ours = [model.render(camera, viewer=viewer).image.detach().clamp(0, 1).mul(255).round().div(255).numpy() for camera in cameras]
+    return fmean(psnr(image, picture) for image, picture in zip(ours, real, strict=True))

@@ -1,0 +1,28 @@
+"""The table of what real viewers show: what was measured before stays, and what was not measured is not made up."""
+
+import json
+import sys
+from pathlib import Path
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
+
+from viewers import Row, count_of, keep, page  # noqa: E402
+
+
+def test_what_is_not_measured_again_is_kept(tmp_path):
+    file = tmp_path / "lego.json"
+    keep(file, [Row("lego", 0.25, "spark", "base", 9, 20.0), Row("lego", 0.25, "spark", "classic", 9, 13.0)])
+    keep(file, [Row("lego", 0.25, "spark", "classic", 9, 14.0)])
+    assert [(row["file"], row["psnr_db"]) for row in json.loads(file.read_text())] == [("base", 20.0), ("classic", 14.0)]
+
+
+def test_a_file_that_was_not_measured_is_a_dash():
+    rows = [Row("lego", 1.0, "spark", "base", 9, 20.0), Row("lego", 0.5, "spark", "base", 9, 21.0), Row("lego", 0.5, "spark", "classic", 9, 13.0)]
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page(rows).splitlines() if line.startswith("| x")]
+    assert lines == [["x1", "spark", "20.0", "–"], ["x0.5", "spark", "21.0", "13.0"]]
+
+
+def test_splats_are_counted_in_the_header(tmp_path):
+    (tmp_path / "three.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n")
+    assert count_of(tmp_path / "three.ply") == 3
