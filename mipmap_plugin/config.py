@@ -60,13 +60,16 @@ class AdaptConfig(BaseModel):
 
     closed_form: bool = Field(True, description="Start from the closed form instead of from the base.")
     merge_to: float = Field(1.0, gt=0, le=1, description="Share of the splats that is left when like ones that share pixels are merged.")
+    merging_costs: float = Field(0.3, ge=0, description="dB on validation views that merging may cost before the first step; else fewer are merged.")
     rates: LearningRates = LearningRates()
-    loss: Literal["l2", "l1"] = Field("l2", description="Of an image against the truth: mean square or mean absolute difference.")
+    loss: Literal["psnr", "l2", "l1"] = Field("l2", description="Of an image: log of the mean square difference, that itself, or the mean absolute.")
     decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's: how long it remembers gradients and their squares.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
-    warm_up: float = Field(0.0, ge=0, le=1, description="Share of the steps over which views per step and the rate of bands above 0 rise.")
-    gathering: float = Field(0.0, ge=0, le=1, description="Share of the run over which new views come in: each costs a render of the base.")
+    warm_up: float = Field(0.0, ge=0, le=1, description="Share of the steps over which rates rise, as far as validation views allow.")
+    gathering: float = Field(0.0, ge=0, le=1, description="Fraction of the run during which new views are introduced; each costs a render.")
+    validation_views: int = Field(16, ge=2, description="Views not adapted to: half steer the run, half choose what it returns.")
+    returns: Literal["best", "last"] = Field("best", description="The best state on validation views, base and start included, or the last.")
     prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")
     densify_gradient: float | None = Field(None, gt=0, description="Screen gradient, NDC units, above which a splat is cloned or split; None: never.")
@@ -84,7 +87,7 @@ class AdaptConfig(BaseModel):
 # rate's factor at 0; its zoom-out target is a bilinear resize without a prefilter, stored in 8 bits; on white it resets
 # all opacities at step 2; its zoom-in and zoom-out both take 1000 steps.
 _PAPER = dict(
-    views="given", steps=1000, resize="bilinear", upsampler="bicubic", quantize_truth=True, closed_form=False, rates=LearningRates(),
+    returns="last", views="given", steps=1000, resize="bilinear", upsampler="bicubic", quantize_truth=True, closed_form=False, rates=LearningRates(),
     densify_gradient=2e-4, reset_opacity_at=2,
 )  # fmt: skip
 
@@ -96,7 +99,7 @@ _INSTANT = dict(steps=0)
 # knee to stop at before they have fallen. The first steps need few views to know where to go, and too many to know what a direction
 # shows: warming up, a tenth of `paper`'s time has 0.8 dB more (lego at x1/2 and x1/4), and the end is the same.
 _DEFAULT_OUT = dict(
-    steps=400, decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=4, gathering=0.5, warm_up=0.25, extra_views=200,
+    steps=600, loss="psnr", decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=3, gathering=0.5, warm_up=0.1, extra_views=250,
 )  # fmt: skip
 _RATES_OUT = LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4)
 

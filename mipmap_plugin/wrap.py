@@ -24,7 +24,7 @@ from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import SplatModel, TrainedScale, exposures_of
+from mipmap_plugin.models.base import SplatModel, TrainedScale, exposures_of, same_for_all_views
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
@@ -113,6 +113,7 @@ class Wrapped:
         scale: float,
         *,
         recipe: Recipe = "default",
+        viewer: str | None = None,
         cameras: Sequence[Camera] | None = None,
         resume: str | Path | None = None,
         observe: Observer | None = None,
@@ -121,6 +122,7 @@ class Wrapped:
     ) -> Adapted:
         """A new model for `scale` (target focal length in px over base focal length in px); the base stays as it is.
 
+        `viewer`: what the file is to be opened in (`viewers`); by default what draws it as its training did, but without compensation.
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override the recipe's, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` sees the model before
@@ -138,9 +140,19 @@ class Wrapped:
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = real.cameras if real else self.cameras
-        backend, why = self.backend(gradients=config.steps > 0 or config.merge_to < 1)
-        base = Base(self.model, self.effects(), self.trained.keeps_filter, backend, why)
+        target = self._target(viewer)
+        needs = replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings)
+        backend, why = choose_backend(self._backend, replace(needs, gradients=config.steps > 0 or config.merge_to < 1))
+        base = Base(self.model, self.effects(), target, viewer, backend, why, not backend.lacking(needs))
         return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
+
+    def _target(self, viewer: str | None) -> Effects:
+        """How the adapted file is rendered. Raises SettingsError for a viewer that does not open the files of this family."""
+        if viewer is not None:
+            if self.trained.keeps_filter or not same_for_all_views(self.model):
+                raise SettingsError(f"{self.model.family}: its files are opened by its own project alone; leave the viewer {viewer} out")
+            return self.effects(viewer=viewer)
+        return self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)
 
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit where it came without any."""

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import signal
 import threading
 from dataclasses import replace
@@ -57,7 +58,9 @@ def test_every_recipe_runs_and_its_report_is_whole(recipe, settings, scale):
     assert (report["scale"], report["settings"]["recipe"], report["ended_by"]) == (scale, recipe, f"{steps} steps")
     assert report["backend"] == "reference: asked for"
     assert (report["gaussians_before"], report["gaussians_after"]) == (40, len(adapted.model))
-    assert [point["step"] for point in report["curve"]] == list(range(2, steps + 1, 2))
+    assert [point["step"] for point in report["curve"]] == [*range(0, steps, 2), *([steps] if steps else [0])]
+    assert all(math.isfinite(point["validation_db"]) for point in report["curve"])
+    assert report["returned"].startswith(tuple(report["validation"]))
     assert report["seconds"]["total"] >= report["seconds"]["optimization"] >= 0
     assert ("closed form" in report["seconds"]) == (recipe != "paper")
     assert {"torch", "mipmap_plugin"} <= report["versions"].keys()
@@ -75,8 +78,8 @@ def test_zooming_in_comes_closer_to_what_the_base_shows_at_its_own_scale():
 
 def test_optimising_comes_closer_to_the_pseudo_truth():
     curve = wrapped().adapt(1 / 4, views="given", steps=24, check_every=8).report.curve
-    assert curve[0].psnr_db < curve[1].psnr_db < curve[2].psnr_db
-    assert curve[0].seconds < curve[2].seconds
+    assert curve[0].psnr_db is None and curve[1].psnr_db < curve[2].psnr_db < curve[3].psnr_db
+    assert curve[0].seconds < curve[3].seconds
 
 
 @pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
@@ -88,7 +91,7 @@ def test_zoomed_out_views_that_nobody_adapted_to_are_closer_to_the_supersampled_
         truth = model.render(small, 1 / 4, "scaled", supersampling=4).image
         images = model.render(small, 1 / 4, "classic").image, started.render(small).image, adapted.render(small).image
         naive, first, final = (psnr(image, truth) for image in images)
-        assert naive + 6 < first + 3 < final
+        assert naive + 5 < first + 0.5 < final
 
 
 def test_the_paper_leaves_the_centers_bit_for_bit():
@@ -111,7 +114,7 @@ def test_the_paper_resets_opacities_on_white_only():
 
 def test_densifying_adds_splats_and_pruning_takes_them_away():
     assert wrapped().adapt(1 / 4, recipe="paper", **BRIEF_PAPER).report.gaussians_after > 40
-    assert 0 < wrapped().adapt(1 / 4, **BRIEF).report.gaussians_after < 40
+    assert 0 < wrapped().adapt(1 / 4, returns="last", **BRIEF).report.gaussians_after < 40
 
 
 def test_the_file_is_classic_whatever_the_base_was_trained_with():
@@ -161,7 +164,7 @@ def ctrl_c(monkeypatch):
     render, waiting = ReferenceBackend.render, []
 
     def interrupting(self, gaussians, camera, effects):
-        if gaussians.means.requires_grad and waiting:
+        if gaussians.means.requires_grad and torch.is_grad_enabled() and camera.width > 1 and waiting:  # in a step
             waiting[0] -= 1
             if waiting[0] == 0:
                 waiting.clear()
@@ -322,7 +325,7 @@ def test_no_gradient_at_all_leaves_finite_splats(recipe):
     assert is_finite(adapted.model) and len(adapted.model) == 5
 
 
-@pytest.mark.parametrize("settings", [dict(min_opacity=0.99), dict(min_opacity=0.99, recipe="paper", densify_gradient=1e-9)])
+@pytest.mark.parametrize("settings", [dict(min_opacity=0.99, returns="last"), dict(min_opacity=0.99, recipe="paper", densify_gradient=1e-9)])
 def test_everything_pruned_leaves_one_splat(settings):
     adapted = wrapped().adapt(1 / 4, **{"views": "given", "steps": 5, "prune_every": 1, **settings})
     assert is_finite(adapted.model) and adapted.report.gaussians_after == 1

@@ -13,13 +13,13 @@ from mipmap_plugin.adaptation.density import (
     clone_and_split,
     halve,
     prune,
-    put_back,
     reset_opacities,
     strongest,
 )
 from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.loop import adapt as optimise
-from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
+from mipmap_plugin.adaptation.optimizer import make_optimizer, put_back, set_rates
+from mipmap_plugin.adaptation.validation import Validation
 from mipmap_plugin.backends.projection import project, rotations
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -268,7 +268,9 @@ def test_two_views_in_one_step_count_as_two_views_each_with_its_own_gradient():
         for each in pull.values():
             each.abs_()
     config = AdaptConfig(steps=1, views_per_step=2, densify_gradient=1.0, rates=LearningRates())
-    task = Task(views, 1.0, lambda view: torch.zeros(1, 1, 1), render, white_background=False)
+    black = lambda view: torch.zeros(1, 1, 1)  # noqa: E731
+    validation = Validation(views, views, 1.0, black, lambda gaussians, camera: torch.zeros(1, 1, 1), "area")
+    task = Task(views, 1.0, black, render, white_background=False, validation=validation)
     run = Run.start(student, task, config)
     optimise(run, task, config, lambda run: None)
     expected = ScreenGradients(COUNT, torch.device("cpu"))
@@ -285,18 +287,15 @@ def test_rates_fall_to_their_share_and_the_means_are_in_pixels(student):
     adam = make_optimizer(student, config, pixel=3.0)
     rate = lambda name: next(group["lr"] for group in adam.param_groups if group["name"] == name)  # noqa: E731
     assert (rate("means"), rate("sh0"), rate("quats")) == (pytest.approx(0.3), 0.5, 0)
-    set_rates(adam, config, 0.5, step=5)
+    set_rates(adam, config, 0.5, 1.0)
     assert (rate("means"), rate("sh0")) == (pytest.approx(0.3 * 0.505), pytest.approx(0.5 * 0.505))
-    set_rates(adam, config, 1.0, step=10)
+    set_rates(adam, config, 1.0, 1.0)
     assert rate("sh0") == pytest.approx(0.005)
 
 
-def test_bands_above_the_first_rise_to_their_rate(student):
-    config = AdaptConfig(steps=16, warm_up=0.25, rates=LearningRates(sh0=0.5, shN=0.2))
+def test_every_rate_is_as_bold_as_the_run_may_be(student):
+    config = AdaptConfig(steps=16, rates=LearningRates(sh0=0.5, shN=0.2))
     adam = make_optimizer(student, config, pixel=1.0)
-    told = []
-    for step in (0, 1, 3, 9):
-        set_rates(adam, config, 0.0, step)
-        told.append({group["name"]: group["lr"] for group in adam.param_groups})
-    assert [rates["shN"] for rates in told] == pytest.approx([0.05, 0.1, 0.2, 0.2])
-    assert {rates["sh0"] for rates in told} == {0.5}
+    set_rates(adam, config, 0.0, 0.25)
+    rates = {group["name"]: group["lr"] for group in adam.param_groups}
+    assert (rates["sh0"], rates["shN"], rates["scales"]) == pytest.approx((0.125, 0.05, config.rates.scales / 4))

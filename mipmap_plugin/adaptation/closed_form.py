@@ -36,36 +36,47 @@ from mipmap_plugin.gaussians import Gaussians
 # Target pixels: how thin an axis may become. It is 1/50 of the classic dilation's width, so nobody sees it, and its log is finite.
 THINNEST = 0.01
 
-# How much faster than its area a splat's opacity falls. One splat alone asks for 1, but the tails of many overlap and cover more
-# together than each adds: measured best between 1.15 and 1.3 on lego and chair at x1/2, x1/4 and x1/8.
+# How much faster than its area a splat's opacity falls where blend weights are not matched afterwards (`matching`). One splat alone asks
+# for 1, but the tails of many overlap and cover more together than each adds: best between 1.15 and 1.3 on lego and chair at x1/2 to x1/8.
 AREA_POWER = 1.25
 
 # Views that the distance and the area of a splat are taken from; more change a result of this accuracy by nothing.
 ENOUGH_VIEWS = 12
 
 
-def closed_form(gaussians: Gaussians, views: Sequence[Camera], scale: float, base: Effects, target: Effects) -> tuple[Tensor, Tensor]:
+def closed_form(
+    gaussians: Gaussians, views: Sequence[Camera], scale: float, base: Effects, target: Effects, area_power: float = AREA_POWER
+) -> tuple[Tensor, Tensor]:
     """Scales [N, 3] and opacities [N] that look right at `scale`.
 
-    `views` are cameras of the base scale, `base` is how the base was trained, `target` how the result is rendered.
+    `views` are cameras of the base scale, `base` is how the base was trained, `target` how the result is rendered. `area_power`: how
+    much faster than its area an opacity falls at zoom-out.
     """
-    if keeps_light(target.screen_filter) and (scale <= 1 or keeps_light(base.screen_filter)):
+    if needs_nothing(scale, base, target):
         return gaussians.scales, gaussians.opacities
     views = views[:: -(-len(views) // ENOUGH_VIEWS)]
     base_pixel = pixel_size(gaussians.means, views)
     target_pixel = base_pixel / scale
     averaged = min(SQUARE_VARIANCE, _width(base)) if scale > 1 else 0.0  # px²
-    change = (_width(base) - averaged) * base_pixel**2 - (_width(target) - averaged) * target_pixel**2
-    thinnest = (THINNEST * target_pixel)[:, None]
-    scales = (gaussians.scales.square() + change[:, None]).clamp_min(0).sqrt().maximum(thinnest)
+    wide = gaussians.scales.square() + ((_width(base) - averaged) * base_pixel**2)[:, None]
+    narrow = (wide - ((_width(target) - averaged) * target_pixel**2)[:, None]).clamp_min(0)
+    if keeps_light(target.screen_filter):  # an area may become smaller by as much as the opacity can rise
+        narrow = narrow.maximum(gaussians.opacities[:, None] * wide)
+    scales = narrow.sqrt().maximum((THINNEST * target_pixel)[:, None])
     new = replace(gaussians, scales=scales)
     opacities = gaussians.opacities * _light(gaussians, views, base)
     # A splat of no size of its own rises most; a view from afar, in which every splat has none, must not raise it further.
-    most = _width(base) / (_width(base) - averaged + averaged / scale**2) if averaged else 1.0
+    most = _width(base) / (_width(base) - averaged + averaged / scale**2) if averaged else torch.inf if keeps_light(target.screen_filter) else 1.0
     areas = _area_ratio(gaussians, new, views, scale, (base, target), most)
-    opacities = opacities * areas ** (AREA_POWER if scale <= 1 else 1.0)
+    opacities = opacities * areas ** (area_power if scale <= 1 and not keeps_light(target.screen_filter) else 1.0)
     # What the target's renderer takes off by itself is added before.
     return scales, (opacities / _light(new, [view.zoomed(scale) for view in views], target)).clamp_max(1)
+
+
+def needs_nothing(scale: float, base: Effects, target: Effects) -> bool:
+    """Whether the target's own filter does what the scale asks for: it is the base's, and keeps each splat's light."""
+    same = (base.screen_filter, base.eps2d) == (target.screen_filter, target.eps2d)
+    return keeps_light(target.screen_filter) and keeps_light(base.screen_filter) and (same or target.screen_filter in INTEGRALS)
 
 
 def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -66,12 +66,6 @@ def prune(model: SplatModel, optimizer: torch.optim.Adam, keep: Tensor) -> None:
         keep = keep.clone()
         keep[0] = True
     change_rows(model, optimizer, lambda _, old: old[keep], lambda old: old[keep])
-
-
-def put_back(model: SplatModel, optimizer: torch.optim.Adam, before: Mapping[str, Tensor]) -> None:
-    """Let the model hold the parameters that it had `before`; their moments begin at 0."""
-    rows = len(before["means"])
-    change_rows(model, optimizer, lambda name, _: before[name], lambda old: old.new_zeros(rows, *old.shape[1:]))
 
 
 def strongest(gradients: Tensor, least: float, most: int) -> Tensor:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation import density
 from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.optimizer import put_back
 from mipmap_plugin.adaptation.resize import difference_from
 from mipmap_plugin.adaptation.views import evenly, extent
 from mipmap_plugin.config import AdaptConfig
@@ -67,7 +68,7 @@ def judge(run: Run, task: Task, config: AdaptConfig) -> None:
     if _agreement(run.student, task, config) >= trial.least_db:
         run.trial = replace(trial, before=None, passed=True)
         return
-    density.put_back(run.student, run.optimizer, trial.before)
+    put_back(run.student, run.optimizer, trial.before)
     run.trial = replace(trial, before=None, undone_at=run.step)
     run.gradients, run.rows_changed = None, True
 

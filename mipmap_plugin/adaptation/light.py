@@ -22,8 +22,9 @@ def light(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effec
     with gradients.
     """
     color = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_()
+    plain = replace(effects, sh_degree=0, settings=effects.settings.of_any_color())
     with torch.enable_grad():
         for view in views:
-            backend.render(replace(gaussians, sh=color), view, replace(effects, sh_degree=0)).image.sum().backward()
+            backend.render(replace(gaussians, sh=color), view, plain).image.sum().backward()
     assert color.grad is not None
     return color.grad[:, 0].mean(dim=1) / (C0 * len(views))

@@ -16,13 +16,20 @@ from mipmap_plugin.adaptation.closed_form import pixel_size
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress, reason_to_stop
 from mipmap_plugin.adaptation.growing import Trial, control_density, judge, still
 from mipmap_plugin.adaptation.interrupt import interruptible
-from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates
+from mipmap_plugin.adaptation.optimizer import make_optimizer, set_rates, take_back
 from mipmap_plugin.adaptation.resize import difference_from
+from mipmap_plugin.adaptation.validation import Steering, Validation
 from mipmap_plugin.adaptation.views import Order
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
+
+# Of a mean square difference: half a step of an 8-bit image, squared. What is closer than a display can show counts no more.
+UNSEEN = (0.5 / 255) ** 2
+
+# While rates rise, a run is looked at so many times.
+CHECKS_RISING = 10
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,7 @@ class Task:
     truth: Callable[[Camera], Tensor]  # a view of the base scale -> [h, w, 3] at the new scale
     render: Callable[[Gaussians, Camera], Tensor]  # what a camera of the new scale sees, and it -> [h, w, 3]
     white_background: bool
+    validation: Validation
     detail: Callable[[Camera, Tensor], Tensor] | None = None  # what a view's image adds to the loss besides
     most_splats: int = sys.maxsize  # where growing ends
 
@@ -50,19 +58,25 @@ class Run:
     optimizer: torch.optim.Adam
     watch: Stopwatch
     gradients: density.ScreenGradients | None  # None: nothing is cloned or split (any more), so nobody asks for them
+    steering: Steering
     trial: Trial | None = None  # None: whatever grows stays
     step: int = 0
     curve: list[CurvePoint] = field(default_factory=list)
-    square_error: Tensor | float = 0.0  # summed over the views since the last point of the curve, where the images are: no step waits for it
+    square_error: Tensor | float = 0.0  # summed over the steps since the last point of the curve, where the images are: no step waits for it
     rows_changed: bool = False  # splats were added or removed
 
     @classmethod
-    def start(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
+    def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
+        """Before the first step; `spent`: the seconds that came before."""
         means = student.parameters()["means"]
-        optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch()
+        optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch(seconds=spent)
         with watch:
-            trial = Trial.begin(student, task, config)
-        return cls(student, optimizer, watch, density.ScreenGradients.of(means, config), trial)
+            trial, steering = Trial.begin(student, task, config), Steering.begin(student, task.validation)
+        first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=steering.start_db, gaussians=len(means))
+        return cls(student, optimizer, watch, density.ScreenGradients.of(means, config), steering, trial, curve=[first])
+
+    def progress(self, config: AdaptConfig) -> float:
+        return progress(self.step, self.watch.seconds, config)
 
 
 def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], None] = lambda run: None) -> str:
@@ -75,29 +89,35 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     bar = tqdm(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step")
     with bar, interruptible() as interrupted:
         observe(run)
-        reason = None
-        while run.step < config.steps and reason is None:
+        while (reason := reason_to_stop(run.curve, run.watch.seconds, config)) is None and run.step < config.steps:
             with run.watch:
-                _step(run, task, config, order(run.step, progress(run.step, run.watch.seconds, config)), cameras)
-                if run.step % config.check_every == 0 or run.step == config.steps:
-                    run.square_error = float(run.square_error)  # here a GPU is waited for, so that the clock counts its work
+                _step(run, task, config, order(run.step, run.progress(config)), cameras)
+                if is_checked(run.step, config):
+                    _check(run, task, config)
             bar.update()
-            if run.step % config.check_every == 0:
-                _mark(run, config)
-                bar.set_postfix_str(f"{run.curve[-1].psnr_db:.2f} dB, {run.curve[-1].gaussians} splats")
+            if run.curve[-1].step == run.step:
+                bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
             observe(run)
             if interrupted():
                 on_interrupt(run)
-            reason = reason_to_stop(run.curve, run.watch.seconds, config)
         with run.watch:
             judge(run, task, config)
+            if run.curve[-1].step < run.step:
+                _check(run, task, config)
     return reason or f"{config.steps} steps"
+
+
+def is_checked(step: int, config: AdaptConfig) -> bool:
+    """Whether the run is looked at after this step: more often while the rates rise."""
+    rising = config.warm_up_steps
+    return step % (config.check_every if step >= rising else max(1, min(config.check_every, rising // CHECKS_RISING))) == 0 or step == config.steps
 
 
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
-    set_rates(run.optimizer, config, progress(run.step, run.watch.seconds, config), run.step, still=still(run))
+    now = run.progress(config)
+    set_rates(run.optimizer, config, now, run.steering.boldness(now, config), still=still(run))
     splats = Activation(run.student, share=len(views) > 1)
     before: Tensor | float = 0.0  # the gradient of the means from the views before this one
     for view in views:
@@ -105,7 +125,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         target = task.truth(view)  # r(x̂): the frozen base, resized
         image = task.render(splats(camera), camera)  # x: the student at the new scale
         difference = difference_from(target, image, config.resize)
-        loss = difference.square().mean() if config.loss == "l2" else difference.abs().mean()
+        loss = _loss(difference, config.loss)
         (loss if task.detail is None else loss + task.detail(view, image)).backward()
         run.square_error = run.square_error + difference.detach().square().mean().double() / len(views)
         if run.gradients is not None and splats.means.grad is not None:
@@ -119,8 +139,28 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         control_density(run, task, config)
 
 
-def _mark(run: Run, config: AdaptConfig) -> None:
-    """A new point of the curve, from the losses of the steps since the last one."""
-    mean = float(run.square_error) / config.check_every
-    run.curve.append(CurvePoint(step=run.step, seconds=run.watch.seconds, psnr_db=decibel(mean), gaussians=len(run.student.parameters()["means"])))
+def _loss(difference: Tensor, name: str) -> Tensor:
+    """Of one image. `psnr` is in nepers what PSNR is in decibels, so that no view that is far off outweighs the others."""
+    if name == "l1":
+        return difference.abs().mean()
+    square = difference.square().mean()
+    return (square + UNSEEN).log() if name == "psnr" else square
+
+
+def _check(run: Run, task: Task, config: AdaptConfig) -> None:
+    """Look at the run on validation views: keep its state or take it back, and note a point of the curve."""
+    steering, steps = run.steering, run.step - run.curve[-1].step
+    found = task.validation.steer(run.student)
+    growing = run.trial is not None and run.trial.before is not None  # what grew is judged when it had time
+    harmed = config.returns == "best" and not growing and steering.harms(found)
+    if harmed:
+        steering.take_back(steering.boldness(run.progress(config), config))
+        run.rows_changed |= len(steering.best.rows["means"]) != len(run.student.parameters()["means"])
+        take_back(run.student, run.optimizer, steering.best)
+        run.gradients = None if run.gradients is None else density.ScreenGradients.of(run.student.parameters()["means"], config)
+    else:
+        steering.keep(found, run.step, run.student)
+    mean = float(run.square_error) / max(1, steps)  # here a GPU is waited for, so that the clock counts its work
+    facts = dict(psnr_db=decibel(mean) if steps else None, validation_db=steering.best_db if harmed else found, taken_back=harmed)
+    run.curve.append(CurvePoint(step=run.step, seconds=run.watch.read(), gaussians=len(run.student.parameters()["means"]), **facts))
     run.square_error = 0.0

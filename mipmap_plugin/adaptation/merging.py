@@ -49,13 +49,14 @@ SPREADS = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00
 MOST_OPAQUE = 0.999
 
 
-def merge(gaussians: Gaussians, pixel: Tensor, light: Tensor, share: float) -> Gaussians:
-    """Splats merged until `share` (0..1) of them is left, or hardly any lie within `FARTHEST` of each other and cost less than `DEAREST`.
+def merge(gaussians: Gaussians, pixel: Tensor, light: Tensor, share: float) -> tuple[Gaussians, Tensor]:
+    """Splats merged until `share` (0..1) of them is left, or hardly any lie within `FARTHEST` of each other and cost less than `DEAREST`;
+    and how many target pixels each of them fills.
 
     `pixel` [N]: the size of a target pixel at each splat, world units. `light` [N]: how many target pixels each fills in a view.
     """
     splats, wanted = _Splats.of(gaussians, pixel, light), max(1, math.floor(share * len(gaussians)))
-    rows, light = torch.arange(len(gaussians), device=light.device), splats.light
+    rows, before = torch.arange(len(gaussians), device=light.device), splats.light
     generator = torch.Generator().manual_seed(0)
     while (surplus := len(splats.light) - wanted) > 0:
         first, second = splats.pairs(torch.rand(3, generator=generator))
@@ -64,7 +65,7 @@ def merge(gaussians: Gaussians, pixel: Tensor, light: Tensor, share: float) -> G
         most = min(surplus, math.ceil(AT_ONCE * len(first)))
         splats, now = splats.merged(first[:most], second[:most])
         rows = now[rows]
-    return splats.gaussians(gaussians, rows, light)
+    return splats.gaussians(gaussians, rows, before), splats.light
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import CARRIED, SplatModel
 
@@ -25,15 +26,29 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torc
     return torch.optim.Adam(groups, betas=config.betas, eps=ADAM_EPS, fused=True)
 
 
-def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float, step: int, still: Collection[str] = ()) -> None:
-    """Each rate at `progress` (0..1) of its fall, which is half a cosine (Loshchilov and Hutter 2017, SGDR, equation 5).
+def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float, boldness: float, still: Collection[str] = ()) -> None:
+    """Each rate at `progress` (0..1) of its fall, which is half a cosine (Loshchilov and Hutter 2017, SGDR, equation 5), times `boldness`.
 
-    Bands above 0 first rise to it: what a direction shows is not known before many views were seen. The groups in `still` stand.
+    The groups in `still` stand.
     """
-    share = config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2
+    share = boldness * (config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2)
     for group in optimizer.param_groups:
-        risen = min(1.0, (step + 1) / max(1, config.warm_up_steps)) if group["name"] == "shN" else 1.0
-        group["lr"] = 0.0 if group["name"] in still else group["base_lr"] * share * risen
+        group["lr"] = 0.0 if group["name"] in still else group["base_lr"] * share
+
+
+def take_back(model: SplatModel, optimizer: torch.optim.Adam, snapshot: Snapshot) -> None:
+    """Let the model hold the snapshot; its moments begin at 0."""
+    put_back(model, optimizer, snapshot.rows)
+    with torch.no_grad():
+        for name, tensor in model.shared_parameters().items():
+            tensor.copy_(snapshot.shared[name])
+            optimizer.state.pop(tensor, None)
+
+
+def put_back(model: SplatModel, optimizer: torch.optim.Adam, before: Mapping[str, Tensor]) -> None:
+    """Let the model hold the parameters that it had `before`; their moments begin at 0."""
+    rows = len(before["means"])
+    change_rows(model, optimizer, lambda name, _: before[name], lambda old: old.new_zeros(rows, *old.shape[1:]))
 
 
 def change_rows(

@@ -23,19 +23,22 @@ class Report(BaseModel):
     settings: AdaptConfig
     backend: str  # which, and why
     views: str  # which, in a sentence
+    viewer: str | None = None  # what the file is for; None: any that draws splats as 3DGS does
     filters: str  # of the pseudo truth, the base and the adapted file
     effects: list[Effect]  # what adapting and rendering simulate, what they do not, and why
     gaussians_before: int
     gaussians_after: int
-    seconds: dict[str, float]  # "closed form", "optimization" (pseudo truth included), "total"
+    seconds: dict[str, float]  # by phase; "optimization" includes pseudo truth and steering, "total" everything
     ended_by: str
+    returned: str  # which of the run's states the file holds, and why where it is not the last
+    validation: dict[str, float]  # dB of each state on views that nothing was adapted to and that did not steer the run
     peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without one
     curve: list[CurvePoint]
     versions: dict[str, str]
 
     def provenance(self) -> dict[str, Any]:
         """What fits into a file's header: base, scale, settings, versions. Nothing in it depends on the clock."""
-        return {"scale": self.scale, "base": self.base, "settings": self.settings.model_dump(), "versions": self.versions}
+        return {"scale": self.scale, "viewer": self.viewer, "base": self.base, "settings": self.settings.model_dump(), "versions": self.versions}
 
 
 class Peak:

@@ -15,6 +15,8 @@ from mipmap_plugin.adaptation.density import ScreenGradients
 from mipmap_plugin.adaptation.growing import Trial
 from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.optimizer import make_optimizer
+from mipmap_plugin.adaptation.snapshot import Snapshot
+from mipmap_plugin.adaptation.validation import Steering
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.models.base import SplatModel
@@ -36,10 +38,10 @@ class Keeper:
         self._path, self._fingerprint = path, fingerprint
         self._kept = time.monotonic()
 
-    def begin(self, student: SplatModel, task: Task, config: AdaptConfig) -> Run:
-        """A new run, or the one in the file. Raises SettingsError (`load_run`)."""
+    def begin(self, student: SplatModel, task: Task, config: AdaptConfig, spent: float) -> Run:
+        """A new run, `spent` seconds after it was asked for, or the one in the file. Raises SettingsError (`load_run`)."""
         if self._path is None or not self._path.exists():
-            return Run.start(student, task, config)
+            return Run.start(student, task, config, spent)
         return load_run(self._path, student, task, config, self._fingerprint)
 
     def now_and_then(self, run: Run) -> None:
@@ -73,6 +75,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
         "optimizer": run.optimizer.state_dict(),
         "gradients": None if run.gradients is None else (run.gradients.total, run.gradients.seen),
+        "steering": {field.name: getattr(run.steering, field.name) for field in fields(run.steering)} | {"best": vars(run.steering.best)},
         "trial": None if run.trial is None else {field.name: getattr(run.trial, field.name) for field in fields(run.trial)},
     }
     save_torch(path, state, overwrite=True)
@@ -99,8 +102,9 @@ def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, f
     gradients = ScreenGradients.of(student.parameters()["means"], config) if state["gradients"] else None
     if gradients is not None:
         gradients.total, gradients.seen = (tensor.to(device) for tensor in state["gradients"])
+    steering = Steering(**{**state["steering"], "best": Snapshot(**state["steering"]["best"]).to(device)})
     return Run(
-        student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, _trial(state["trial"], device), state["step"],
+        student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, steering, _trial(state["trial"], device), state["step"],
         [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"],
     )  # fmt: skip
 

@@ -6,30 +6,30 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.closed_form import closed_form, pixel_size
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.detail import Detail
 from mipmap_plugin.adaptation.growing import verdict
-from mipmap_plugin.adaptation.light import light
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
-from mipmap_plugin.adaptation.merging import merge
 from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
 from mipmap_plugin.adaptation.resume import Keeper
+from mipmap_plugin.adaptation.start import Start, warm
+from mipmap_plugin.adaptation.validation import HARM, Validation, hold_back
 from mipmap_plugin.adaptation.views import choose_views, evenly, with_times
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import DILATION, Effects, explain
+from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.files import write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of, exposures_of
@@ -38,8 +38,8 @@ from mipmap_plugin.models.exposure import exposed
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
 
-# Views that tell how much of the base's images each splat makes up.
-LIT_VIEWS = 5
+# What a zoom-in is validated against: the base's own image, whatever it is adapted to.
+AS_THE_BASE = {"compare_at": "base", "quantize_truth": False}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,21 +72,28 @@ class Base:
 
     model: SplatModel
     effects: Effects
-    keeps_filter: bool  # an adapted file keeps the filter of training
+    target: Effects  # how the adapted file is rendered
+    viewer: str | None  # that renders it so; None: none in particular
     backend: Backend
     why: str  # this backend was taken
+    differentiates: bool  # whether it has gradients for what is asked
 
 
 class Session:
     """One call of adapt: the pieces, made once, and the order they run in."""
 
     def __init__(self, base: Base, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
-        self.base, self.backend, self.why, self.trained = base.model, base.backend, base.why, base.effects
-        self.scale, self.config = scale, config
-        self.effects = self.trained if base.keeps_filter else replace(self.trained, screen_filter="classic", eps2d=DILATION)
-        self.views, self.which = choose_views(cameras, self.base.parameters()["means"], config)
+        self.base, self.backend, self.why, self.trained, self.effects = base.model, base.backend, base.why, base.effects, base.target
+        self.differentiates = base.differentiates
+        self._smooth = replace(self.effects, settings=replace(self.effects.settings, packing=None, picture_step=None))
+        self.scale, self.config, self.viewer = scale, config, base.viewer
+        self.seconds, self.peak = {"optimization": 0.0}, Peak(self.base.parameters()["means"].device)
+        views, self.which = choose_views(cameras, self.base.parameters()["means"], config)
+        self.views, validation = hold_back(cameras, views, self.base.parameters()["means"], config)
+        self.which += f", {len(views) - len(self.views)} of them kept for validation" if len(self.views) < len(views) else ""
         if getattr(self.base, "moves", False):
             self.views, when = with_times(self.views, config.seed)
+            validation, _ = with_times(validation, config.seed)
             self.which += f", {when}"
         self.which += f", {len(real.cameras)} of them real images" if real else ""
         self.truth = PseudoTruth(self.base, self.backend, self.trained, scale, config, real)
@@ -94,71 +101,93 @@ class Session:
         if self.detail is not None:
             self.views = evenly(self.views, config.upsampled_views)
             self.which += f", {len(self.views)} of them upsampled"
-        self.seconds = {"optimization": 0.0}
-        self.peak = Peak(self.base.parameters()["means"].device)
+        asked = PseudoTruth(self.base, self.backend, self.trained, scale, config.model_copy(update=AS_THE_BASE if scale > 1 else {}))
+        self.validation = Validation(validation[::2], validation[1::2], scale, asked, self._show, config.resize)
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         began = time.perf_counter()
-        student = self.base.copy()
-        student.trained = replace(student.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
-        nothing_to_do = self.scale == 1 and self.effects == self.trained
-        if self.config.merge_to < 1:
-            self._merge(student)
-        if self.config.closed_form and not nothing_to_do:
-            self._closed_form(student)
-        self.seconds["total"] = time.perf_counter() - began
+        with self.phase("compilation"):
+            warm(self.backend, self.base.gaussians(self.views[0]), (self.trained, self.effects), gradients=self.config.steps > 0)
+        as_it_is = self.fresh()
+        student, start = Start(self).best()
+        states = {"the base as it is": as_it_is, f"the start, {start}": student.copy()}
         curve: list[CurvePoint] = []
-        ended_by = "scale 1, at which the base is right as it is" if nothing_to_do else "0 steps"
-        if self.config.steps and not nothing_to_do:
-            curve, ended_by = self._optimize(student, resume, observe)
+        ended_by = "scale 1, at which the base is right as it is" if self.nothing_to_do else "0 steps"
+        self.seconds["total"] = time.perf_counter() - began
+        if self.config.steps and not self.nothing_to_do:
+            run, ended_by = self._optimize(student, resume, observe)
+            curve, best = run.curve, self.fresh()
+            run.steering.best.put_into(best)
+            states |= {f"the state after step {run.steering.best_step}": best, "the last state": student}
         else:
             resume = None  # whatever run it is of
-        return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects, resume, self.views)
+        return self._returned(states, curve, ended_by, resume)
 
-    def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[list[CurvePoint], str]:
-        """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""
-        most = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * len(student.parameters()["means"]))
-        task = Task(self.views, self.scale, self.truth, self._render, self._white, self.detail, most)
+    def _returned(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str, resume: Path | None) -> Adapted:
+        """The best of the states on views that have not steered the run, or the last where that is asked for."""
+        began, last = time.perf_counter(), next(reversed(states))
+        with self.phase("validation"):
+            best, found = self.validation.choose(states)
+        self.seconds["total"] += time.perf_counter() - began
+        if self.config.returns == "last":
+            best = last
+        elif self.detail is not None and found[last] >= max(found[name] for name in list(states)[:2]) - HARM:
+            best = last  # what the base's own image cannot tell is what a network is asked for
+        why = "" if best == last else f", for {last} shows {found[last]:.2f} dB where it shows {found[best]:.2f}"
+        curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=found[last], gaussians=_rows(states[last]))]
+        report = self._report(states[best], curve, ended_by, f"{best}{why}", found)
+        return Adapted(states[best], report, self.backend, self.effects, resume, self.views)
+
+    def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
+        """Algorithm 1 on `student`, or the rest of it where `resume` exists, and what ended it."""
+        most = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
+        task = Task(self.views, self.scale, self.truth, self._render, self._white, self.validation, self.detail, most)
         keeper = Keeper(resume, self._fingerprint())
-        run = keeper.begin(student, task, self.config)
         if self.effects.sh_degree == 0 and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no color follows the direction: its coefficients stay out of the gradient
         if self.detail is not None:
-            began = time.perf_counter()
-            self.detail.prepare(self.views)
-            self.seconds["upsampling"] = time.perf_counter() - began
+            with self.phase("upsampling"):
+                self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
-        before = self.seconds["total"]
+        run = keeper.begin(student, task, self.config, self.seconds["total"])
+        before = run.watch.seconds if run.step == 0 else self.seconds["total"]
 
         def look(run: Run) -> None:
             keeper.now_and_then(run)
             if observe is not None:
-                observe(run.step, before + run.watch.seconds, lambda camera: self._render(run.student.gaussians(camera), camera))
+                observe(run.step, run.watch.seconds, lambda camera: self._render(run.student.gaussians(camera), camera))
 
         ended_by = adapt(run, task, self.config, keeper.stop, look)
-        self.seconds["optimization"] = run.watch.seconds
-        self.seconds["total"] += run.watch.seconds
-        return run.curve, ended_by + verdict(run)
+        self.seconds["optimization"] = run.watch.seconds - before
+        self.seconds["total"] = run.watch.seconds
+        return run, ended_by + verdict(run)
 
-    @torch.no_grad()
-    def _merge(self, student: SplatModel) -> None:
-        """Fewer splats; only a family that offers `rebuild` is asked for it (`Wrapped.adapt`)."""
+    def fresh(self) -> SplatModel:
+        """The base as it is, to be rendered as the target is."""
+        model = self.base.copy()
+        model.trained = replace(model.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
+        return model
 
-        def fewer(gaussians: Gaussians) -> Gaussians:
-            filled = light(gaussians, evenly(self.views, LIT_VIEWS), self.backend, self.trained) * self.scale**2
-            return merge(gaussians, pixel_size(gaussians.means, self.views) / self.scale, filled, self.config.merge_to)
-
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
         began = time.perf_counter()
-        student.rebuild(fewer)  # type: ignore[attr-defined]
-        self.seconds["merging"] = time.perf_counter() - began
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
-    @torch.no_grad()
-    def _closed_form(self, student: SplatModel) -> None:
-        began = time.perf_counter()
-        student.reshape(lambda gaussians: closed_form(gaussians, self.views, self.scale, self.trained, self.effects), self.views)
-        self.seconds["closed form"] = time.perf_counter() - began
+    def steer(self, model: SplatModel) -> float:
+        """dB of a model on the views that steer the run."""
+        with self.phase("validation"):
+            return self.validation.steer(model)
+
+    @property
+    def nothing_to_do(self) -> bool:
+        return self.scale == 1 and self.effects == self.trained
 
     def _render(self, gaussians: Gaussians, camera: Camera) -> Tensor:
+        """What a step sees: without the rounding of a viewer's file and picture, which is noise to it and a third of its time."""
+        return self.backend.render(gaussians, camera, self._smooth).image
+
+    def _show(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         return self.backend.render(gaussians, camera, self.effects).image
 
     @property
@@ -172,7 +201,7 @@ class Session:
         facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.trained), poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
-    def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str) -> Report:
+    def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         before = self.base.gaussians(self.views[0])
         return Report(
             scale=self.scale,
@@ -180,12 +209,15 @@ class Session:
             settings=self.config,
             backend=self.why,
             views=self.which,
+            viewer=self.viewer,
             filters=filters(self.scale, self.config, self.trained, self.effects),
             effects=list(explain(self.effects, before, effects_of(self.base), self.config, self.scale)),
             gaussians_before=len(before),
             gaussians_after=len(student.gaussians(self.views[0])),
             seconds=self.seconds,
             ended_by=ended_by,
+            returned=returned,
+            validation=validation,
             peak_memory_mib=self.peak.mib(),
             curve=curve,
             versions=versions(),
@@ -205,6 +237,10 @@ def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects,
     if matrix is not None:
         rendered = replace(rendered, image=exposed(rendered.image, matrix))
     return replace(rendered, effects=explain(effects, gaussians, effects_of(model)))
+
+
+def _rows(model: SplatModel) -> int:
+    return len(model.parameters()["means"])
 
 
 def _digest(model: SplatModel) -> str:
