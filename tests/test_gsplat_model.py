@@ -186,11 +186,25 @@ def test_a_truncated_file_is_refused(tmp_path):
         load_model(folder)
 
 
-def test_flat_splats_are_refused(tmp_path):
+def test_flat_splats_are_surfels_whose_third_scale_stays_as_it_is(tmp_path):
+    """simple_trainer_2dgs stores three scales, of which its rasterizer reads two."""
     folder = gsplat_folder(tmp_path / "r", splats())
     (folder / "cfg.yml").write_text("model_type: 2dgs\n")
-    with pytest.raises(CheckpointError, match="flat"):
-        load_model(folder)
+    model = load_model(folder)
+    assert (model.family, model.trained.screen_filter, model.trained.eps2d, model.trained.keeps_filter) == ("gsplat", "surfel", 0.5, True)
+    assert (model.gaussians().scales[:, 2] == 0).all()
+    student = model.copy()
+    student.reshape(lambda held: (2 * held.scales, held.opacities))
+    again = load_model(student.save(tmp_path / "s", provenance={}).parents[1])
+    torch.testing.assert_close(again.parameters()["scales"][:, :2], model.parameters()["scales"][:, :2] + math.log(2))
+    assert torch.equal(again.parameters()["scales"][:, 2], model.parameters()["scales"][:, 2])
+    assert again.trained == model.trained
+
+
+def test_without_options_a_note_says_that_flat_splats_look_alike(tmp_path):
+    folder = gsplat_folder(tmp_path / "r", splats())
+    (folder / "cfg.yml").unlink(missing_ok=True)
+    assert any("2DGS" in note and "cfg.yml" in note for note in load_model(folder).notes)
 
 
 # The normalized world

@@ -27,10 +27,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.surfel_form import lay_out, least_sizes, shown_area
 from mipmap_plugin.backends.filters import INTEGRALS, SQUARE_VARIANCE, footprint, keeps_light, widening
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 
 # Target pixels: how thin an axis may become. It is 1/50 of the classic dilation's width, so nobody sees it, and its log is finite.
@@ -49,10 +50,12 @@ def closed_form(gaussians: Gaussians, views: Sequence[Camera], scale: float, bas
 
     `views` are cameras of the base scale, `base` is how the base was trained, `target` how the result is rendered.
     """
-    if keeps_light(target.screen_filter) and (scale <= 1 or keeps_light(base.screen_filter)):
+    if keeps_light(target.screen_filter) and target.screen_filter != SURFEL and (scale <= 1 or keeps_light(base.screen_filter)):
         return gaussians.scales, gaussians.opacities
     views = views[:: -(-len(views) // ENOUGH_VIEWS)]
     base_pixel = pixel_size(gaussians.means, views)
+    if target.screen_filter == SURFEL:
+        return _of_surfels(gaussians, views, scale, base, target, base_pixel)
     target_pixel = base_pixel / scale
     averaged = min(SQUARE_VARIANCE, _width(base)) if scale > 1 else 0.0  # px²
     change = (_width(base) - averaged) * base_pixel**2 - (_width(target) - averaged) * target_pixel**2
@@ -66,6 +69,27 @@ def closed_form(gaussians: Gaussians, views: Sequence[Camera], scale: float, bas
     opacities = opacities * areas ** (AREA_POWER if scale <= 1 else 1.0)
     # What the target's renderer takes off by itself is added before.
     return scales, (opacities / _light(new, [view.zoomed(scale) for view in views], target)).clamp_max(1)
+
+
+def _of_surfels(
+    gaussians: Gaussians, views: Sequence[Camera], scale: float, base: Effects, target: Effects, base_pixel: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Scales [N, 3] and opacities [N] of surfels (`surfel_form`); `base_pixel` [N] world units."""
+    zoomed = [view.zoomed(scale) for view in views]
+
+    def drawn(scales: Tensor) -> Tensor:
+        """[N] the area that the target will draw over the area that the base shows."""
+        new = replace(gaussians, scales=scales)
+
+        def ratio(camera: Camera, shown: Projected) -> Tensor:
+            return shown_area(project(new, camera, target.near_plane), target.eps2d) / shown_area(shown, base.eps2d * scale**2)
+
+        return _mean_in_front(gaussians, zoomed, base.near_plane, ratio)
+
+    if scale <= 1:
+        return gaussians.scales, gaussians.opacities / drawn(gaussians.scales) ** AREA_POWER
+    wide = least_sizes(gaussians.scales, base_pixel, base.eps2d)
+    return lay_out(gaussians.scales, wide, 1 / drawn(wide)), gaussians.opacities
 
 
 def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:

@@ -13,9 +13,10 @@ from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
 from mipmap_plugin.backends.harmonics import colors
 from mipmap_plugin.backends.pixel_integral import PixelIntegral
 from mipmap_plugin.backends.projection import Projected, project
+from mipmap_plugin.backends.surfels import Surfels, surfels
 from mipmap_plugin.backends.window import WindowIntegral
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects, RenderSettings
+from mipmap_plugin.effects import SURFEL, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
 
 
@@ -25,7 +26,9 @@ class ReferenceBackend:
     name = "reference"
     api_version = API_VERSION
     speed = 0
-    capabilities = Capabilities(devices=None, dtypes=frozenset({torch.float32, torch.float64}), screen_filters=SCREEN_FILTERS, settings=True)
+    capabilities = Capabilities(
+        devices=None, dtypes=frozenset({torch.float32, torch.float64}), screen_filters=SCREEN_FILTERS | {SURFEL}, settings=True
+    )
 
     def lacking(self, needs: Needs) -> list[str]:
         return self.capabilities.lacking(needs)
@@ -67,7 +70,7 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
 
 
 @torch.no_grad()
-def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Tensor:
+def least_alpha(feet: Footprint | PixelIntegral | Surfels, settings: RenderSettings) -> Tensor:
     """[N]: the alpha below which each splat is not drawn. A radius of r standard deviations is exp(-r²/2) of its brightest."""
     packed = feet.packed()
     if settings.radius is None:
@@ -76,6 +79,8 @@ def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Te
     return (feet.alpha(packed, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
-def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral]:
+def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral | Surfels]:
+    if effects.screen_filter == SURFEL:
+        return surfels(gaussians, camera, effects)
     projected = project(gaussians, camera, effects.near_plane)
     return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d)

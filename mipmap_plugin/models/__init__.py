@@ -18,6 +18,7 @@ MODELS = Registry(
     {
         "3dgs": "mipmap_plugin.models.vanilla:load_vanilla",
         **dict.fromkeys(("mip", "gof", "analytic"), "mipmap_plugin.models.mip:load_mip"),
+        "2dgs": "mipmap_plugin.models.surfels:load_surfels",
         "deformable": "mipmap_plugin.models.deformable:load_deformable",
         "4dgs": "mipmap_plugin.models.hexplane:load_hexplane",
         "gsplat": "mipmap_plugin.models.gsplat:load_gsplat",

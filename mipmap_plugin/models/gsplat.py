@@ -19,6 +19,8 @@ from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import GSPLAT_FILE, detect
 from mipmap_plugin.models.gsplat_frame import normalized_frame
+from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
+from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.tags import render_mode
 from mipmap_plugin.models.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
@@ -28,6 +30,11 @@ NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 # World units, the trainer's default.
 NEAR_PLANE = 0.01
+
+UNKNOWN = (
+    "cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter, and not by the trainer of flat"
+    " splats (2DGS), whose files look the same"
+)
 
 # What float32 holds; a text may have any number of digits.
 MAX_OPTION = 1e38
@@ -94,7 +101,9 @@ def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaMod
     parts = [_parameters(shard["splats"], file) for shard, file in zip(shards, files, strict=True)]
     try:
         parameters = {name: torch.cat([part[name] for part in parts]) for name in NAMES}
-        model = VanillaModel(parameters, _trained(options, render_mode(comments)), origin, notes)
+        flat = str(options.get("model_type", "")).startswith("2dgs")
+        kind, trained = (SurfelModel, flat_trained(_trained(options, None))) if flat else (VanillaModel, _trained(options, render_mode(comments)))
+        model = kind(parameters, trained, origin, [*notes, *[FLAT_NOTE] * flat])
     except (ShapeError, RuntimeError) as error:  # what torch.cat raises for ranks that do not fit together
         raise CheckpointError(f"{found.path} holds tensors that do not fit together: {error}; copy it again") from error
     if len(files) > 1:
@@ -139,18 +148,16 @@ def _options_file(folder: Path | None) -> Path | None:
 
 
 def _options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
-    """The options of the training, and a note where they are not known. Raises CheckpointError for a 2DGS training."""
+    """The options of the training, and a note where they are not known. Raises CheckpointError."""
     file = _options_file(folder)
     if file is None:
-        return {}, ["cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter"]
+        return {}, [UNKNOWN]
     try:
         options = json.loads(file.read_text(encoding="utf-8")) if file.suffix == ".json" else read_scalars(file)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{file} is not JSON ({error}); copy it again, or remove it") from error
     if not isinstance(options, dict):
         raise CheckpointError(f"{file} holds no options by name; copy it again, or remove it")
-    if str(options.get("model_type", "")).startswith("2dgs"):
-        raise CheckpointError(f"{file} says that the splats are flat (2DGS), a family that is recognized but not loaded")
     return options, []
 
 

@@ -13,6 +13,7 @@ from mipmap_plugin.models import gsplat, splatfacto
 from mipmap_plugin.models.anchor_networks import NEEDED, Weights
 from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale
 from mipmap_plugin.models.scaffold import scaffold_in_memory
+from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
 
 # INRIA's GaussianModel and its descendants: attribute by our name.
@@ -69,6 +70,9 @@ def adopt(model: Any) -> SplatModel:
     if all(hasattr(model, name) for name in INRIA.values()):
         raw = _copied(model, {name: getattr(model, attribute) for name, attribute in INRIA.items()})
         raw["opacities"] = raw["opacities"].reshape(-1)
+        if raw["scales"].dim() == 2 and raw["scales"].shape[1] == 2:  # 2DGS and its descendants
+            raw["scales"] = torch.cat([raw["scales"], torch.full_like(raw["scales"][:, :1], FLAT)], dim=1)
+            return _adopted(model, raw, flat_trained(TrainedScale()), Origin(), SurfelModel)
         return _adopted(model, raw, TrainedScale(), Origin())
     tensors = _mapping(getattr(model, "gauss_params", model))
     if set(splatfacto.NAMES) <= set(tensors):
@@ -114,8 +118,8 @@ def _copied(model: Any, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
     return {name: tensor.detach().to(torch.float32, copy=True, memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
 
 
-def _adopted(model: Any, raw: dict[str, Tensor], trained: TrainedScale, origin: Origin) -> VanillaModel:
-    return without_poison(VanillaModel(raw, trained, origin, [f"copied from a live {_name(model)}"]))
+def _adopted(model: Any, raw: dict[str, Tensor], trained: TrainedScale, origin: Origin, kind: type[VanillaModel] = VanillaModel) -> VanillaModel:
+    return without_poison(kind(raw, trained, origin, [f"copied from a live {_name(model)}"]))
 
 
 def _name(model: Any) -> str:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +25,8 @@ from mipmap_plugin.models.hosts import Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.ply import read_ply, write_ply
 from mipmap_plugin.models.tags import render_mode, with_tags
+
+Splats = TypeVar("Splats", bound="VanillaModel")
 
 # World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so that it can grow again.
 MIN_SCALE = 1e-18
@@ -92,7 +94,7 @@ class VanillaModel:
         """The columns [N] of its file that 3DGS does not know."""
         return dict(self._origin.extras)
 
-    def with_extras(self, extras: dict[str, np.ndarray]) -> VanillaModel:
+    def with_extras(self: Splats, extras: dict[str, np.ndarray]) -> Splats:
         """The same splats, over the same tensors, with these columns [N] behind those of 3DGS."""
         return self._with(self._parameters, replace(self._origin, extras=extras))
 
@@ -105,16 +107,16 @@ class VanillaModel:
     def parameters(self) -> dict[str, Tensor]:
         return dict(self._parameters)
 
-    def copy(self) -> VanillaModel:
+    def copy(self: Splats) -> Splats:
         """An independent model whose leaves require gradients; as it may change, it has no digest of a file."""
         leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()}
         return self._with(leaves, replace(self._origin, digest=""))
 
-    def to(self, device: torch.device | str) -> VanillaModel:
+    def to(self: Splats, device: torch.device | str) -> Splats:
         """A copy on another device, which requires gradients where this one does."""
         return self._with({name: _moved(tensor, device) for name, tensor in self._parameters.items()})
 
-    def keep_rows(self, keep: Tensor) -> VanillaModel:
+    def keep_rows(self: Splats, keep: Tensor) -> Splats:
         """A new model of the rows where `keep` [N] is True, extra columns included."""
         extras = {name: column[keep.cpu().numpy()] for name, column in self._origin.extras.items()}
         kept = {name: tensor.detach()[keep].requires_grad_(tensor.requires_grad) for name, tensor in self._parameters.items()}
@@ -163,7 +165,7 @@ class VanillaModel:
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, self._parameters, comments, overwrite=overwrite)
-        columns = {**to_columns(self._parameters), **self._origin.extras}
+        columns = {**self._columns(), **self._origin.extras}
         if path.suffix.lower() == ".ply":
             return write_ply(path, columns, comments, overwrite=overwrite)
 
@@ -184,8 +186,17 @@ class VanillaModel:
             return list(cameras)
         return self._origin.host.as_trained(cameras, points, self._parameters["means"].detach())
 
-    def _with(self, parameters: dict[str, Tensor], origin: Origin | None = None) -> VanillaModel:
-        return VanillaModel(parameters, self.trained, origin or self._origin, self.notes)
+    @staticmethod
+    def parameters_of(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Tensor]:
+        """Raw parameters from the columns of the family's PLY at `path`. Raises CheckpointError."""
+        return to_parameters(columns, path)
+
+    def _columns(self) -> dict[str, np.ndarray]:
+        """What the family's PLY holds of the parameters."""
+        return to_columns(self._parameters)
+
+    def _with(self: Splats, parameters: dict[str, Tensor], origin: Origin | None = None) -> Splats:
+        return type(self)(parameters, self.trained, origin or self._origin, self.notes)
 
 
 def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
@@ -201,12 +212,17 @@ def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaMo
 
 def read_vanilla(found: Checkpoint) -> VanillaModel:
     """The splats of a checkpoint of 3DGS, or of a family that keeps them in the same columns. Raises CheckpointError."""
+    return read_splats(found, VanillaModel)
+
+
+def read_splats(found: Checkpoint, kind: type[Splats]) -> Splats:
+    """As `read_vanilla`, as a model of this `kind`."""
     ply = read_ply(found.path)
-    parameters, extras = to_parameters(ply.columns, found.path), extra_columns(ply.columns)
+    parameters, extras = kind.parameters_of(ply.columns, found.path), extra_columns(ply.columns)
     options, notes = read_options(found.folder)
     screen_filter = render_mode(ply.comments)
     origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, ply.comments, extras, read_exposures(found.folder))
-    model = VanillaModel(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
+    model = kind(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
     del ply  # as large as the model, and no longer needed by what follows
     model.notes += companion_notes(options, model.sh_degree, model.exposures)
     if screen_filter:
@@ -231,7 +247,7 @@ def unit_quaternions(quats: Tensor) -> Tensor:
     return scaled / scaled.norm(dim=1, keepdim=True)
 
 
-def without_poison(model: VanillaModel) -> VanillaModel:
+def without_poison(model: Splats) -> Splats:
     """The model without the splats that are not finite once activated, with a note. Raises CheckpointError when none is left."""
     health = examine(model)
     if not health.poisonous.any():
