@@ -178,6 +178,10 @@ def _oddities(options: dict[str, Any], siblings: dict[str, Any], sh_degree: int)
         notes.append(f"the cfg says SH degree {options['sh_degree']}, but the splats have degree {sh_degree}; the splats are trusted")
     if "pose_adjust" in siblings:
         notes.append("the training moved its cameras (pose_opt); the cameras of the scene are rendered as they are given")
+    if on := [name for name in ("with_ut", "with_eval3d") if options.get(name) is True]:
+        notes.append(f"trained with {', '.join(on)} (3DGUT), which projects splats otherwise than here (EWA); views differ a little from gsplat's")
+    if options.get("use_bilateral_grid") is True or options.get("post_processing") not in (None, False, "none"):
+        notes.append("trained with a bilateral grid or another correction of colors for each training view, which is not applied here")
     if options.get("camera_model", "pinhole") != "pinhole":
         notes.append(f"trained with {options['camera_model']} cameras; here all cameras are pinholes")
     return notes

@@ -42,6 +42,12 @@ NETWORKS = {
     **{"feature_bank_mlp": "mlp_feature_bank", "appearance": "embedding_appearance"},
 }
 
+# Deformable 3D Gaussians keeps its network in another object; of the classes with these tensors only its own has no `capture`.
+STILL = (
+    "this {name} has no capture(), as that of Deformable 3D Gaussians: if a network moves its splats, these are what they are before it does;"
+    " give the path of the model folder to adapt a moving scene"
+)
+
 # Attributes of descendants that hold more than these tensors, and what they are.
 MORE = {
     "_level": "anchors with levels (Octree-GS)",
@@ -73,7 +79,9 @@ def adopt(model: Any) -> SplatModel:
         if raw["scales"].dim() == 2 and raw["scales"].shape[1] == 2:  # 2DGS and its descendants
             raw["scales"] = torch.cat([raw["scales"], torch.full_like(raw["scales"][:, :1], FLAT)], dim=1)
             return _adopted(model, raw, flat_trained(TrainedScale()), Origin(), SurfelModel)
-        return _adopted(model, raw, TrainedScale(), Origin())
+        adopted = _adopted(model, raw, TrainedScale(), Origin())
+        adopted.notes += [] if hasattr(model, "capture") else [STILL.format(name=_name(model))]
+        return adopted
     tensors = _mapping(getattr(model, "gauss_params", model))
     if set(splatfacto.NAMES) <= set(tensors):
         raw = splatfacto.to_parameters(_copied(model, {name: tensors[name] for name in splatfacto.NAMES}))

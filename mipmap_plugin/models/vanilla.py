@@ -224,7 +224,7 @@ def read_splats(found: Checkpoint, kind: type[Splats]) -> Splats:
     origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, ply.comments, extras, read_exposures(found.folder))
     model = kind(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
     del ply  # as large as the model, and no longer needed by what follows
-    model.notes += companion_notes(options, model.sh_degree, model.exposures)
+    model.notes += companion_notes(options, model.sh_degree, model.exposures, screen_filter)
     if screen_filter:
         model.notes.append(f"the header says that the splats were trained {screen_filter}, so they are rendered so")
     if extras:
