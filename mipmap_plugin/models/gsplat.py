@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import GSPLAT_FILE, detect
 from mipmap_plugin.models.gsplat_frame import normalized_frame
+from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.tags import render_mode
@@ -63,10 +64,9 @@ class GsplatHost:
             self._write_options(fresh, antialiased=render_mode(comments) == "antialiased")
         return path / within
 
-    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None, means: Tensor) -> list[Camera]:
+    def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
         """Resized by `data_factor`, and moved into the normalized world, which is found again from the cameras and points."""
-        factor = _positive(self.options, "data_factor", 1)
-        resized = [camera.resized(max(1, int(camera.width // factor)), max(1, int(camera.height // factor))) for camera in cameras]
+        points, resized = taken.points, _shrunk(cameras, int(_positive(self.options, "data_factor", 1)), taken)
         if not self.options.get("normalize_world_space", True):  # always on before version 1.4, which had no such option
             return resized
         if points is None:
@@ -141,6 +141,23 @@ def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
     if set(named) != set(NAMES) or not all(torch.is_tensor(tensor) for tensor in named.values()):
         raise CheckpointError(f"{path} holds the splat tensors {', '.join(map(str, named))}; expected are {', '.join(NAMES)}")
     return {name: named[name].detach().float() for name in NAMES}
+
+
+def _shrunk(cameras: Sequence[Camera], factor: int, taken: Taken) -> list[Camera]:
+    """The cameras as simple_trainer has them (examples/datasets/colmap.py): intrinsics over `factor`, then times what the first photograph
+    of images_<factor> measures over a size that was rounded off. Without photographs they are taken to be rounded to the nearest."""
+    if factor < 2 or not cameras:
+        return list(cameras)
+    first = cameras[0]
+    actual = (taken.smaller(factor) if taken.smaller else None) or (max(1, round(first.width / factor)), max(1, round(first.height / factor)))
+    across, down = (size / max(1, whole // factor) for size, whole in zip(actual, (first.width, first.height), strict=True))
+    return [_divided(camera, factor, across, down) for camera in cameras]
+
+
+def _divided(camera: Camera, factor: int, across: float, down: float) -> Camera:
+    width, height = max(1, int(camera.width // factor * across)), max(1, int(camera.height // factor * down))
+    x, y = across / factor, down / factor
+    return replace(camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y)
 
 
 def _options_file(folder: Path | None) -> Path | None:

@@ -21,7 +21,7 @@ from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, 
 from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
-from mipmap_plugin.models.hosts import Host
+from mipmap_plugin.models.hosts import Host, Taken
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.ply import read_ply, write_ply
 from mipmap_plugin.models.tags import render_mode, with_tags
@@ -180,11 +180,11 @@ class VanillaModel:
         """[N], 0..1, without gradient; the same for all views."""
         return self._parameters["opacities"].detach().sigmoid()
 
-    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None) -> list[Camera]:
-        """Views of the photographs' scene, with its SfM `points` [P, 3], in the frame and at the size that the model was trained in."""
+    def as_trained(self, cameras: Sequence[Camera], taken: Taken) -> list[Camera]:
+        """Views of the photographs' scene in the frame and at the size that the model was trained in."""
         if self._origin.host is None:
             return list(cameras)
-        return self._origin.host.as_trained(cameras, points, self._parameters["means"].detach())
+        return self._origin.host.as_trained(cameras, taken, self._parameters["means"].detach())
 
     @staticmethod
     def parameters_of(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.cameras_json import TEST_EVERY, trained_size
+from mipmap_plugin.scenes.cameras_json import TEST_EVERY, photographs_folder, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.images import image_size, is_file
 from mipmap_plugin.scenes.json_file import pixels
@@ -37,7 +37,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """
     path, cfg = Path(path), cfg or {}
     model = _read(path)
-    folder = _root(path) / str(cfg.get("images", "images"))
+    folder = _root(path) / photographs_folder(cfg)
     try:
         images = sorted(model.images.values(), key=lambda image: image.name)
     except UnicodeDecodeError as error:
@@ -51,7 +51,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
         photograph = folder / image.name
         if is_file(photograph):
-            camera = camera.resized(*trained_size(*image_size(photograph), {**cfg, "images": "images"}))
+            camera = camera.resized(*trained_size(*image_size(photograph), {**cfg, "images": "images", "ds": 1}))
             photographs[camera] = photograph
         else:
             camera = camera.resized(*trained_size(camera.width, camera.height, cfg))

@@ -21,6 +21,9 @@ IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
+# What ns-process-data turned COLMAP's world by before its files said so (data/dataparsers/nerfstudio_dataparser.py). It is a rotation.
+USUAL_TURN = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+
 # Radians; half of it has a tangent that can be divided by, and no lens is as long.
 MIN_ANGLE = 1e-9
 
@@ -50,7 +53,8 @@ def read_transforms(path: str | Path) -> Scene:
             notes.append(f"{file.name}: {absent} listed images are absent; {unsized} of their cameras are left out because the file has no w and h")
     if not cameras:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
-    return Scene(tuple(cameras), images, path, notes, applied=_applied(transforms_files(path)[0][0]))
+    first = transforms_files(path)[0][0]
+    return Scene(tuple(cameras), images, path, notes, applied=_applied(first), applied_scale=_applied_scale(first))
 
 
 def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
@@ -103,11 +107,15 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
 
 
 def _applied(file: Path) -> Tensor | None:
-    """[4, 4] nerfstudio's `applied_transform`, by which it has turned COLMAP's world already."""
+    """[4, 4] nerfstudio's `applied_transform`, by which it has turned COLMAP's world already; in old data it goes without saying."""
     data = read_json(file)
     if "applied_transform" not in data:
-        return None
+        return _pose(USUAL_TURN, str(file)) if file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists() else None
     return _pose(data["applied_transform"], f"{file}, applied_transform")
+
+
+def _applied_scale(file: Path) -> float:
+    return positive(read_json(file).get("applied_scale", 1.0), f"{file}, applied_scale")
 
 
 def _image(folder: Path, listed: str) -> Path | None:
