@@ -123,7 +123,7 @@ def _of_appearance(model: SplatModel, appearance: str) -> list[str]:
         return []
     if appearance == "upstream":
         return ["test views have the appearance of the training view with the same number, as in the original, whatever that view looked like"]
-    return ["test views have the mean appearance of all training views; the original's is that of the one with the same number (--appearance upstream)"]
+    return ["test views have the mean appearance of all training views; the original has that of the same number (--appearance upstream)"]
 
 
 def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:

@@ -13,6 +13,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.scenes.images import image_size, is_file, read_image
+from mipmap_plugin.scenes.lenses import Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +27,7 @@ class Scene:
     points: Tensor | None = None  # [P, 3] float64, the points of structure from motion, where the files hold them
     applied: Tensor | None = None  # [4, 4] float64, how nerfstudio had turned COLMAP's world before it wrote the file
     applied_scale: float = 1.0  # and by how much it had sized it
+    lenses: dict[Path, Lens] = field(default_factory=dict)  # of the photographs that have to be undistorted
 
     def split(self, name: str) -> list[Camera]:
         """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""
@@ -68,10 +70,11 @@ class Scene:
         return None
 
     def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
-        """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution.
+        """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution, undistorted.
 
         Raises SceneError when there is none: cameras are compared by identity, so a zoomed copy has none.
         """
         if camera not in self.images:
             raise SceneError(f"{self.source}: camera {camera.name!r} has no image; ask with a camera that is a key of `images`")
-        return read_image(self.images[camera], background)
+        image, lens = read_image(self.images[camera], background), self.lenses.get(self.images[camera])
+        return image if lens is None else lens.undistorted(image)
