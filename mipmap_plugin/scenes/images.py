@@ -90,6 +90,14 @@ def write_array(path: str | Path, values: Tensor, *, overwrite: bool = False) ->
     return path
 
 
+def read_array(path: str | Path) -> Tensor:
+    """The numbers of a NumPy file, float64. It is not unpickled, and as long as it says. Raises SceneError."""
+    try:
+        return torch.from_numpy(np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64))
+    except (OSError, ValueError, TypeError, SyntaxError, OverflowError, RecursionError) as error:  # what NumPy raises for other files
+        raise SceneError(f"{path}: is no array that NumPy reads ({(str(error).splitlines() or [''])[0][:120]}); copy it again") from error
+
+
 def _opened(path: str | Path) -> Image.Image:
     try:
         return Image.open(path)
