@@ -24,6 +24,7 @@ MODELS = Registry(
         "gsplat": "mipmap_plugin.models.gsplat:load_gsplat",
         "splatfacto": "mipmap_plugin.models.splatfacto:load_splatfacto",
         "scaffold": "mipmap_plugin.models.scaffold:load_scaffold",
+        "exchange": "mipmap_plugin.models.exchanged:load_exchanged",
         "octree": "mipmap_plugin.models.octree:load_octree",
     },
 )

@@ -10,7 +10,7 @@ from typing import Any
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.anchor_networks import missing_networks
 from mipmap_plugin.models.cfg_args import read_cfg_args
-from mipmap_plugin.models.exchange import EXCHANGE, conversion
+from mipmap_plugin.models.exchange import EXCHANGE
 from mipmap_plugin.models.magic import kind_of, names_in_torch_file
 from mipmap_plugin.models.ply import Header, read_header
 from mipmap_plugin.models.tags import provenance_of, render_mode
@@ -32,6 +32,7 @@ FAMILIES = {
     "spacetime": "SpacetimeGaussians",
     "gsplat": "gsplat",
     "splatfacto": "splatfacto (nerfstudio)",
+    "exchange": "exchange format (SPZ, SOG, KSPLAT, SPLAT, compressed PLY)",
 }
 
 # What more is to be said of families that are not loaded.
@@ -76,9 +77,21 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     kind = kind_of(path)
     if kind == "torch":
         return _detect_torch_file(path)
+    if kind in EXCHANGE:
+        return Checkpoint("exchange", path)
     if kind != "ply":
         raise CheckpointError(_why_not(path, kind))
     return _detect_ply(path)
+
+
+def exchange_kind(file: Path) -> str | None:
+    """Which exchange format a file is in, a key of `exchange.EXCHANGE`; None for another. Raises CheckpointError."""
+    kind = kind_of(file)
+    return kind if kind in EXCHANGE else "compressed" if kind == "ply" and _is_compressed(read_header(file)) else None
+
+
+def _is_compressed(header: Header) -> bool:
+    return any("packed_position" in element.names for element in header.elements)
 
 
 def not_loaded(family: str) -> str:
@@ -94,9 +107,8 @@ def _detect_torch_file(path: Path) -> Checkpoint:
 
 def _detect_ply(path: Path) -> Checkpoint:
     header = read_header(path)
-    names = {name for element in header.elements for name in element.names}
-    if "packed_position" in names:
-        raise CheckpointError(_why_not(path, "compressed"))
+    if _is_compressed(header):
+        return Checkpoint("exchange", path)
     folder, iteration = _around(path)
     return Checkpoint(_family(path, header, folder), path, folder, iteration)
 
@@ -202,8 +214,6 @@ def _family_of_torch_file(path: Path) -> str:
 
 
 def _why_not(path: Path, kind: str) -> str:
-    if kind in EXCHANGE:
-        return conversion(path, kind)
     if path.suffix == ".hier":
         chunk = "the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)"
         return f"{path} is a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; give {chunk}"
@@ -226,6 +236,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     for name in ("meta.json", "lod-meta.json"):
         if (folder / name).is_file() and (kind := kind_of(folder / name)) in ("sog", "gsplat-png"):
+            if kind == "sog":
+                return Checkpoint("exchange", folder / name)
             raise CheckpointError(_why_not(folder / name, kind))
     clouds = sorted(folder.glob("*.ply"))
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:

@@ -19,6 +19,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
+from mipmap_plugin.models.exchange import is_written, write_exchange
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Host, Taken
@@ -98,6 +99,10 @@ class VanillaModel:
         """The same splats, over the same tensors, with these columns [N] behind those of 3DGS."""
         return self._with(self._parameters, replace(self._origin, extras=extras))
 
+    def coming_from(self: Splats, file: Path) -> Splats:
+        """The same splats, over the same tensors, told to be this file's."""
+        return self._with(self._parameters, replace(self._origin, source=file, digest=sha256(file)))
+
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated: exp, sigmoid, unit quaternions. `camera` is not looked at."""
         raw = self._parameters
@@ -155,7 +160,7 @@ class VanillaModel:
     def save(
         self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False, companions: Callable[[Path], Any] = lambda ply: None
     ) -> Path:
-        """Write a PLY where `path` ends in .ply, else what the model came in, atomically; return the file with the splats.
+        """Write a PLY where `path` ends in .ply, an exchange format (`exchange.WRITTEN`), else what the model came in, atomically; return the file.
 
         A model from another project's file goes back into one (`Host.write`). A folder of 3DGS repeats the iteration, cfg_args,
         cameras and exposures that the model came with; `companions` adds to it what else a family keeps around the PLY that
@@ -163,6 +168,8 @@ class VanillaModel:
         """
         path = Path(path)
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
+        if is_written(path):
+            return write_exchange(path, lambda ply: write_ply(ply, self._columns(), comments), self.trained, overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, self._parameters, comments, overwrite=overwrite)
         columns = {**self._columns(), **self._origin.extras}
