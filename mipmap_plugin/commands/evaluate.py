@@ -68,15 +68,14 @@ def evaluate(
     rows: list[Any] = []
     notes: dict[str, None] = {}  # each once, in their order
     for each, folder in zip(checkpoint, images, strict=True):
-        wrapped = wrap(each, None, background, backend, screen_filter)
-        rows += evaluation.evaluate(wrapped, _scene(folder, appearance), each_once(scale), recipe, protocol, perceptual, **settings)
+        wrapped, scene = wrap(each, None, background, backend, screen_filter), _scene(folder, appearance)
+        rows += evaluation.evaluate(wrapped, scene, each_once(scale), recipe, protocol, perceptual, **settings)
         notes |= dict.fromkeys(evaluation.notes(wrapped, scale, appearance))
     rows += evaluation.means(rows) if len(checkpoint) > 1 else []
     facts = {"rows": records(rows), "notes": list(notes)}
     if output:
         write_json(output, facts, overwrite)
-    title = f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views"
-    tell(facts, json) if json else _print_tables(title, rows, [*notes], published, each_once(scale))
+    tell(facts, json) if json else _print_tables(_title(checkpoint, images, protocol), rows, [*notes], published, each_once(scale))
 
 
 def _scene(folder: Path, appearance: str) -> Scene:
@@ -89,6 +88,10 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], output: Path | N
         refuse_existing(output, overwrite)
     if len(checkpoint) != len(images):
         raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")
+
+
+def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str) -> str:
+    return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views"
 
 
 def _listed(paths: Sequence[Path]) -> str:

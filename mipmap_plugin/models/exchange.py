@@ -66,7 +66,7 @@ def write_exchange(path: Path, write: Callable[[Path], Any], trained: TrainedSca
     Raises SettingsError where splat-transform is not installed, or splats need the filter of their training; OutputExists, OutputError.
     """
     if trained.keeps_filter:
-        raise SettingsError(f"{path}: viewers of this format have no {trained.screen_filter} filter, which these splats need; give a .ply or a folder")
+        raise SettingsError(f"{path}: viewers of this format have no {trained.screen_filter} filter, which these splats need; give a .ply or folder")
     tool = _tool()
     if tool is None:
         raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}; or give a .ply")
