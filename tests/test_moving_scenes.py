@@ -103,7 +103,7 @@ def test_hypernerf_without_test_views_trains_on_every_fourth(tmp_path):
 def test_broken_ones_are_refused_in_one_sentence(tmp_path):
     path = dynerf(tmp_path / "d")
     (path / "cam03.mp4").unlink()
-    with pytest.raises(SceneError, match="3 videos.*4 cameras"):
+    with pytest.raises(SceneError, match=r"3 videos.*4 cameras"):
         load_scene(path)
     (path / "poses_bounds.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (900000000, 17), }\n")
     with pytest.raises(SceneError, match="no array"):
