@@ -9,13 +9,15 @@ import pytest
 import tiny
 import torch
 from test_colmap import names, write_text_model
+from torch_checkpoints import gsplat_folder, splats
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.evaluation import protocols
+from mipmap_plugin.models import load_model
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.scenes.images import write_image
-from mipmap_plugin.wrap import wrap_model
+from mipmap_plugin.wrap import placed, wrap_model
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -117,3 +119,14 @@ def test_without_pycolmap_the_poses_serve_and_the_photographs_do_not(tmp_path, m
     assert any("pip install" in note for note in scene.notes)
     with pytest.raises(SceneError, match="pip install"):
         scene.image(scene.cameras[0], (0, 0, 0))
+
+
+def test_a_project_that_divides_a_bent_scene_divides_what_is_left_of_it(tmp_path):
+    """gsplat's factor applies to the undistorted lens; the copies on the disk are still bent."""
+    scene = colmap_scene(tmp_path, "OPENCV")
+    write_image(tmp_path / "images_2" / names(1)[0], photograph("OPENCV", LENSES["OPENCV"], (WIDTH // 2, HEIGHT // 2)))
+    model = load_model(gsplat_folder(tmp_path / "r", splats(), normalized="false"))
+    model.host.options["data_factor"] = 2
+    [camera], [whole] = placed(model, scene).cameras, scene.cameras
+    assert camera.fx == pytest.approx(whole.fx / 2, rel=0.01)
+    assert camera.width == pytest.approx(whole.width / 2, abs=1)

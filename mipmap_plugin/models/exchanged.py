@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.models.detect import detect, exchange_kind, not_loaded
+from mipmap_plugin.models.detect import FAMILIES, detect, exchange_kind
 from mipmap_plugin.models.exchange import EXCHANGE, as_ply
 from mipmap_plugin.models.vanilla import OPACITY_MARGIN, VanillaModel, read_vanilla
 
@@ -22,7 +22,7 @@ def load_exchanged(path: str | Path, *, iteration: int | None = None) -> Vanilla
     with as_ply(file, kind) as ply:
         found = detect(ply)
         if found.family != "3dgs":
-            raise CheckpointError(f"{file}: {not_loaded(found.family)}")
+            raise CheckpointError(f"{file}: its splats are of {FAMILIES[found.family]}, not read from this format; give its own file")
         model = read_vanilla(replace(found, folder=None)).coming_from(file)
     certain = torch.tensor(OPACITY_MARGIN).logit().abs().item()
     model.parameters()["opacities"].clamp_(-certain, certain)  # 8 bits hold 0 and 1, whose logits are infinite

@@ -57,16 +57,20 @@ class Scene:
         return self.with_cameras([replace(camera, index=place.get(camera, camera.index)) for camera in self.cameras])
 
     def smaller(self, factor: int) -> tuple[int, int] | None:
-        """(width, height) px of the copies of the photographs that lie in images_<factor> beside them; None where there are none."""
-        first = next((self.images[camera] for camera in self.cameras if camera in self.images), None)
-        folder = None if first is None else next((parent for parent in first.parents if re.fullmatch(r"images(_\d+)?", parent.name)), None)
-        if first is None or folder is None:
+        """(width, height) px of the copies of the photographs that lie in images_<factor> beside them; None where there are none.
+
+        Of photographs that have to be undistorted, what is left of the copies then.
+        """
+        camera = next((camera for camera in self.cameras if camera in self.images), None)
+        first = Path() if camera is None else self.images[camera]
+        folder = next((parent for parent in first.parents if re.fullmatch(r"images(_\d+)?", parent.name)), None)
+        if camera is None or folder is None:
             return None
         for name in (f"images_{factor}_png", f"images_{factor}"):
             within = folder.with_name(name) / first.relative_to(folder)
             for copy in (within, within.with_suffix(".png"), within.with_name(first.name)):
                 if is_file(copy):
-                    return image_size(copy)
+                    return _left(image_size(copy), first, camera) if first in self.lenses else image_size(copy)
         return None
 
     def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
@@ -78,3 +82,9 @@ class Scene:
             raise SceneError(f"{self.source}: camera {camera.name!r} has no image; ask with a camera that is a key of `images`")
         image, lens = read_image(self.images[camera], background), self.lenses.get(self.images[camera])
         return image if lens is None else lens.undistorted(image)
+
+
+def _left(size: tuple[int, int], whole: Path, camera: Camera) -> tuple[int, int]:
+    """The share of a copy's `size` that `camera`, undistorted, has of the `whole` photograph."""
+    across, down = (kept / side for kept, side in zip((camera.width, camera.height), image_size(whole), strict=True))
+    return max(1, round(size[0] * across)), max(1, round(size[1] * down))

@@ -40,7 +40,7 @@ class Lens:
             flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self._camera())
         except Exception as error:  # what pycolmap's C++ raises
             raise SceneError(f"camera {camera.name!r}: its lens ({self.model}) cannot be undistorted ({_brief(error)}); leave it out") from error
-        fx, fy, cx, cy = flat.params
+        fx, fy, cx, cy = map(float, flat.params)
         return replace(camera, width=flat.width, height=flat.height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def undistorted(self, image: Tensor) -> Tensor:
