@@ -112,7 +112,7 @@ def ellipse_box(axes: Tensor, slopes: Tensor, reach: Tensor | float) -> tuple[Te
     a number [N] that is above 0 where all of the ellipse lies in front of the eye, without which there is no box. The box of a
     conic follows from its dual, X diag(r², r², -1) Xᵀ in homogeneous coordinates.
     """
-    squared = torch.as_tensor(reach, dtype=axes.dtype, device=axes.device).square()
+    squared = reach * reach
     in_front = 1 - squared * slopes.square().sum(1, keepdim=True)
     safe = torch.where(in_front > 0, in_front, 1.0)
     center = -squared * (axes @ slopes[:, :, None])[..., 0] / safe

@@ -93,6 +93,6 @@ def flattened(gaussians: Gaussians) -> Gaussians:
     shortest = gaussians.scales.argmin(dim=1)
     turn = gaussians.quats.new_tensor(TO_THIRD)[shortest]
     quats = torch.where(thick[:, None], quaternion_product(gaussians.quats, turn), gaussians.quats)
-    order = (shortest[:, None] + torch.tensor([1, 2, 0], device=shortest.device)) % 3
+    order = (shortest[:, None] + shortest.new_tensor([1, 2, 0])) % 3
     scales = torch.where(thick[:, None], gaussians.scales.gather(1, order), gaussians.scales)
     return replace(gaussians, quats=quats, scales=scales * scales.new_tensor([1.0, 1.0, 0.0]))
