@@ -14,8 +14,9 @@ from torch import Tensor
 
 from mipmap_plugin.backends.projection import Projected
 
-# A surfel that views see at a slant shows less than the filter did; made larger than this, it would stand out where it is met from the front.
-MOST_WIDER = 4.0
+# A surfel that views see at a slant shows less than the filter did; with more than so many times its area it stands out where it is met from
+# the front (lego at x2, its splats made flat: 28.4 dB from the base; 28.0 at 1, 28.2 from 4 on).
+MOST_WIDER = 2.0
 
 
 def least_sizes(scales: Tensor, pixel: Tensor, eps2d: float) -> Tensor:
