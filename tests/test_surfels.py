@@ -236,7 +236,7 @@ def test_the_closed_form_alone_keeps_what_the_base_showed():
     adapted = wrapped.adapt(4.0, recipe="instant")
     view = wrapped.cameras[0]
     shown, base = adapted.render(view.zoomed(4)).alpha.mean(), wrapped.render(view).alpha.mean()
-    assert float(shown) == pytest.approx(float(base), rel=0.15)
+    assert float(shown) == pytest.approx(float(base), rel=0.3)
     assert float(wrapped.render(view.zoomed(4)).alpha.mean()) < 0.3 * float(base)
 
 
