@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 
 import tyro
 
@@ -24,7 +26,8 @@ for command in (inspect, adapt, render, evaluate, tradeoff, backends, demo):
 def main(arguments: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit code."""
     try:
-        app.cli(prog="mipmap-plugin", description="Make a Gaussian-splatting checkpoint look right at another zoom.", args=arguments)
+        with _our_warnings_only():
+            app.cli(prog="mipmap-plugin", description="Make a Gaussian-splatting checkpoint look right at another zoom.", args=arguments)
     except (MipmapPluginError, OSError) as error:
         print(f"mipmap-plugin: {error}", file=sys.stderr)
         return 2
@@ -32,6 +35,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}", file=sys.stderr)
         return 130
     return 0
+
+
+@contextlib.contextmanager
+def _our_warnings_only() -> Iterator[None]:
+    """Other libraries warn the programmers who call them, and not the person at the terminal; `python -W` still shows all."""
+    with warnings.catch_warnings():
+        if not sys.warnoptions:
+            warnings.simplefilter("ignore")
+            warnings.filterwarnings("default", module=r"mipmap_plugin(\.|$)")
+        yield
 
 
 if __name__ == "__main__":

@@ -14,6 +14,10 @@ from mipmap_plugin.gaussians import Gaussians
 # px²: the variance that every 3DGS rasterizer adds to a projected splat (diff-gaussian-rasterization, forward.cu).
 DILATION = 0.3
 
+# The screen filter of 2D Gaussian Splatting (`backends.surfels`), and the variance of its low-pass, px²: a deviation of half the root of
+# two (diff-surfel-rasterization, auxiliary.h).
+SURFEL, LOW_PASS = "surfel", 0.5
+
 # World units: a splat whose centre is nearer than this is not drawn (diff-gaussian-rasterization, auxiliary.h).
 NEAR_PLANE = 0.2
 

@@ -25,6 +25,7 @@ from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel, TrainedScale, exposures_of, same_for_all_views
+from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
@@ -214,7 +215,8 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
     if getattr(model, "host", None) is None:
         return scene
     scene = scene.original()
-    return scene.with_cameras(model.as_trained(scene.cameras, scene.points))  # type: ignore[attr-defined]
+    taken = Taken(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
+    return scene.with_cameras(model.as_trained(scene.cameras, taken))  # type: ignore[attr-defined]
 
 
 def own_cameras(model: SplatModel) -> list[Camera]:

@@ -107,10 +107,11 @@ BENT = {"SIMPLE_RADIAL": "70 32 24 0.1", "OPENCV": "70 72 32 24 0 0 0.01 0", "OP
 
 
 @pytest.mark.parametrize(("model", "params"), BENT.items())
-def test_distortion_is_refused_with_advice(tmp_path, model, params):
+def test_a_lens_that_bends_becomes_a_pinhole_with_a_note(tmp_path, model, params):
     write_text_model(tmp_path / "sparse/0", names(1), model, params)
-    with pytest.raises(SceneError, match=rf"distortion \({model}\).*colmap image_undistorter"):
-        load_scene(tmp_path)
+    scene = load_scene(tmp_path)
+    assert (scene.cameras[0].fx, scene.cameras[0].cx) == (70, scene.cameras[0].width / 2)
+    assert any(model in note and "undistorted" in note for note in scene.notes)
 
 
 def test_a_lens_model_whose_distortion_is_zero_is_a_pinhole(tmp_path):

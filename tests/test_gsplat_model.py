@@ -14,6 +14,7 @@ from mipmap_plugin.errors import CheckpointError, OutputExists, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.tags import provenance_of
 from mipmap_plugin.models.yaml_scalars import read_scalars
@@ -186,11 +187,25 @@ def test_a_truncated_file_is_refused(tmp_path):
         load_model(folder)
 
 
-def test_flat_splats_are_refused(tmp_path):
+def test_flat_splats_are_surfels_whose_third_scale_stays_as_it_is(tmp_path):
+    """simple_trainer_2dgs stores three scales, of which its rasterizer reads two."""
     folder = gsplat_folder(tmp_path / "r", splats())
     (folder / "cfg.yml").write_text("model_type: 2dgs\n")
-    with pytest.raises(CheckpointError, match="flat"):
-        load_model(folder)
+    model = load_model(folder)
+    assert (model.family, model.trained.screen_filter, model.trained.eps2d, model.trained.keeps_filter) == ("gsplat", "surfel", 0.5, True)
+    assert (model.gaussians().scales[:, 2] == 0).all()
+    student = model.copy()
+    student.reshape(lambda held: (2 * held.scales, held.opacities))
+    again = load_model(student.save(tmp_path / "s", provenance={}).parents[1])
+    torch.testing.assert_close(again.parameters()["scales"][:, :2], model.parameters()["scales"][:, :2] + math.log(2))
+    assert torch.equal(again.parameters()["scales"][:, 2], model.parameters()["scales"][:, 2])
+    assert again.trained == model.trained
+
+
+def test_without_options_a_note_says_that_flat_splats_look_alike(tmp_path):
+    folder = gsplat_folder(tmp_path / "r", splats())
+    (folder / "cfg.yml").unlink(missing_ok=True)
+    assert any("2DGS" in note and "cfg.yml" in note for note in load_model(folder).notes)
 
 
 # The normalized world
@@ -204,20 +219,20 @@ def test_the_normalized_world_is_found_again_whatever_half_turn_was_taken(tmp_pa
     frame = np.diag([*turn, 1.0]) @ normalized_by_numpy(cameras, points)
     raw = {**splats(500), "means": torch.tensor(points @ frame[:3, :3].T + frame[:3, 3], dtype=torch.float32)}
     model = load_model(gsplat_folder(tmp_path / "r", raw))
-    placed = model.as_trained(cameras, torch.tensor(points))
+    placed = model.as_trained(cameras, Taken(torch.tensor(points)))
     for camera, new in zip(cameras, placed, strict=True):
         pose = frame @ np.linalg.inv(camera.viewmat.numpy())
         pose[:3, :3] /= np.linalg.norm(pose[0, :3])
         assert np.allclose(new.viewmat.numpy(), np.linalg.inv(pose), atol=1e-6)
         assert (new.width, new.height, new.fx) == (32, 24, camera.fx / 4)
     with pytest.raises(SceneError, match="another than gsplat trained on"):
-        model.as_trained(cameras, torch.tensor(points) @ torch.diag(torch.tensor([1.0, 9.0, 1.0])).double())
+        model.as_trained(cameras, Taken(torch.tensor(points) @ torch.diag(torch.tensor([1.0, 9.0, 1.0])).double()))
     with pytest.raises(SceneError, match="give the COLMAP scene"):
-        model.as_trained(cameras, None)
+        model.as_trained(cameras, Taken())
 
 
 def test_a_world_that_was_not_normalized_is_the_scenes_own(tmp_path):
     model = load_model(gsplat_folder(tmp_path / "r", splats(), normalized="false"))
     camera = tiny.cameras(1, width=128, height=96)[0]
-    [placed] = model.as_trained([camera], None)
+    [placed] = model.as_trained([camera], Taken())
     assert torch.equal(placed.viewmat, camera.viewmat) and placed.size == (24, 32)

@@ -132,9 +132,9 @@ def test_other_objects_are_refused_in_one_sentence(thing, sentence):
         wrap_model(thing)
 
 
-def test_flat_splats_are_refused():
-    with pytest.raises(ShapeError, match=r"scales: expected shape \[30, 3\], got \[30, 2\]"):
-        adopt(GaussianModel({**splats(), "scales": torch.zeros(30, 2)}))
+def test_scales_of_no_shape_are_refused():
+    with pytest.raises(ShapeError, match=r"scales: expected shape \[30, 3\], got \[30, 4\]"):
+        adopt(GaussianModel({**splats(), "scales": torch.zeros(30, 4)}))
 
 
 # Scaffold-GS

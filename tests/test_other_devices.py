@@ -9,6 +9,7 @@ import mip_checkpoints
 import moving
 import pretended
 import pytest
+import test_surfels
 import tiny
 import torch
 import torch_checkpoints
@@ -34,6 +35,7 @@ def plain_adam(monkeypatch):
 
 FAMILIES = {
     "3dgs": lambda path: tiny.folder(path, tiny.cameras()),
+    "2dgs": test_surfels.folder,
     "mip": lambda path: mip_checkpoints.folder(path, "mip"),
     "scaffold": lambda path: anchor_checkpoints.write(path),
     "octree": lambda path: anchor_checkpoints.write(path, anchor_checkpoints.Layout("octree", level=True)),
@@ -43,7 +45,7 @@ FAMILIES = {
 }
 
 
-@pytest.mark.parametrize(("family", "scale"), [*((family, 1 / 2) for family in FAMILIES), ("3dgs", 2)])
+@pytest.mark.parametrize(("family", "scale"), [*((family, 1 / 2) for family in FAMILIES), ("3dgs", 2), ("2dgs", 2)])
 def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
     model = load_model(FAMILIES[family](tmp_path / "base"))
     settings = dict(steps=2, extra_views=2, prune_every=1, check_every=1)

@@ -262,8 +262,8 @@ def test_without_a_test_file_val_is_the_test_split(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"k1": 0.01, "p2": -0.1}, r"frame 0 \(r_0\): has distortion \(k1, p2\); undistort"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "has a lens that is not perspective"),
+        ({"k1": "x"}, r"frame 0 \(r_0\), k1: is not made of numbers"),
+        ({"camera_model": "EQUIRECTANGULAR"}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
         ({"fl_x": None}, "has neither 'fl_x' nor 'camera_angle_x'"),
         ({"fl_x": None, "camera_angle_x": 40.0}, "give it in radians"),
         ({"transform_matrix": None}, "has no 'transform_matrix'"),

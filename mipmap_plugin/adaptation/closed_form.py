@@ -27,10 +27,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.surfel_form import lay_out, least_sizes, shown_area
 from mipmap_plugin.backends.filters import INTEGRALS, SQUARE_VARIANCE, footprint, keeps_light, widening
 from mipmap_plugin.backends.projection import Projected, project
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 
 # Target pixels: how thin an axis may become. It is 1/50 of the classic dilation's width, so nobody sees it, and its log is finite.
@@ -56,6 +57,8 @@ def closed_form(
         return gaussians.scales, gaussians.opacities
     views = views[:: -(-len(views) // ENOUGH_VIEWS)]
     base_pixel = pixel_size(gaussians.means, views)
+    if target.screen_filter == SURFEL:
+        return _of_surfels(gaussians, views, scale, base, target, base_pixel)
     target_pixel = base_pixel / scale
     averaged = min(SQUARE_VARIANCE, _width(base)) if scale > 1 else 0.0  # px²
     wide = gaussians.scales.square() + ((_width(base) - averaged) * base_pixel**2)[:, None]
@@ -76,7 +79,30 @@ def closed_form(
 def needs_nothing(scale: float, base: Effects, target: Effects) -> bool:
     """Whether the target's own filter does what the scale asks for: it is the base's, and keeps each splat's light."""
     same = (base.screen_filter, base.eps2d) == (target.screen_filter, target.eps2d)
-    return keeps_light(target.screen_filter) and keeps_light(base.screen_filter) and (same or target.screen_filter in INTEGRALS)
+    if target.screen_filter == SURFEL or (not same and target.screen_filter not in INTEGRALS):
+        return False
+    return keeps_light(target.screen_filter) and keeps_light(base.screen_filter)
+
+
+def _of_surfels(
+    gaussians: Gaussians, views: Sequence[Camera], scale: float, base: Effects, target: Effects, base_pixel: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Scales [N, 3] and opacities [N] of surfels (`surfel_form`); `base_pixel` [N] world units."""
+    zoomed = [view.zoomed(scale) for view in views]
+
+    def drawn(scales: Tensor) -> Tensor:
+        """[N] the area that the target will draw over the area that the base shows."""
+        new = replace(gaussians, scales=scales)
+
+        def ratio(camera: Camera, shown: Projected) -> Tensor:
+            return shown_area(project(new, camera, target.near_plane), target.eps2d) / shown_area(shown, base.eps2d * scale**2)
+
+        return _mean_in_front(gaussians, zoomed, base.near_plane, ratio)
+
+    if scale <= 1:
+        return gaussians.scales, gaussians.opacities / drawn(gaussians.scales) ** AREA_POWER
+    wide = least_sizes(gaussians.scales, base_pixel, base.eps2d)
+    return lay_out(gaussians.scales, wide, 1 / drawn(wide)), gaussians.opacities
 
 
 def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 import zipfile
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -47,7 +50,8 @@ class Network:
         """Through the network until it is large enough, then down to the exact size."""
         network = self._network.to(image.device)
         while image.shape[0] < size[0] or image.shape[1] < size[1]:
-            image = _in_tiles(network, image.float().clamp(0, 1))
+            with _quietly():
+                image = _in_tiles(network, image.float().clamp(0, 1))
         return resize(image, size, "pil-bicubic").clamp(0, 1)
 
 
@@ -60,7 +64,8 @@ def _load(path: Path) -> Any:
             raise PluginError(f"{path}: is a super-resolution network, which spandrel loads; {INSTALL} ({error})") from error
     try:
         weights = spandrel.canonicalize_state_dict(_weights(path))
-        network = spandrel.ModelLoader().load_from_state_dict(weights)
+        with _quietly():
+            network = spandrel.ModelLoader().load_from_state_dict(weights)
     except (spandrel.UnsupportedModelError, RuntimeError, AttributeError, KeyError, TypeError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise CheckpointError(f"{path}: is no network that spandrel knows ({reason})") from error
@@ -69,6 +74,14 @@ def _load(path: Path) -> Any:
     if network.scale < 2:
         raise SettingsError(f"{path}: this {network.architecture.name} network does not enlarge; give one that does")
     return network.eval()
+
+
+@contextlib.contextmanager
+def _quietly() -> Iterator[None]:
+    """Without what the authors of networks are warned of, such as SwinIR's of torch.meshgrid: it is nothing that a user can act on."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _weights(path: Path) -> Any:

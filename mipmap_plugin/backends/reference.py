@@ -14,9 +14,10 @@ from mipmap_plugin.backends.harmonics import colors
 from mipmap_plugin.backends.packing import in_steps, packed
 from mipmap_plugin.backends.pixel_integral import PixelIntegral
 from mipmap_plugin.backends.projection import Projected, project
+from mipmap_plugin.backends.surfels import Surfels, surfels
 from mipmap_plugin.backends.window import WindowIntegral
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects, RenderSettings
+from mipmap_plugin.effects import SURFEL, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
 
 
@@ -26,7 +27,7 @@ class ReferenceBackend:
     name = "reference"
     api_version = API_VERSION
     speed = 0
-    capabilities = Capabilities(None, frozenset({torch.float32, torch.float64}), SCREEN_FILTERS, settings=frozenset(SETTINGS))
+    capabilities = Capabilities(None, frozenset({torch.float32, torch.float64}), SCREEN_FILTERS | {SURFEL}, settings=frozenset(SETTINGS))
 
     def lacking(self, needs: Needs) -> list[str]:
         return self.capabilities.lacking(needs)
@@ -79,7 +80,7 @@ def finite_rows(gaussians: Gaussians) -> Tensor:
 
 
 @torch.no_grad()
-def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Tensor:
+def least_alpha(feet: Footprint | PixelIntegral | Surfels, settings: RenderSettings) -> Tensor:
     """[N]: the alpha below which each splat is not drawn. A radius of r standard deviations is exp(-r²/2) of its brightest.
 
     One that fades is nothing there.
@@ -91,6 +92,8 @@ def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Te
     return (feet.alpha(numbers, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
-def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral]:
+def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral | Surfels]:
+    if effects.screen_filter == SURFEL:
+        return surfels(gaussians, camera, effects)
     projected = project(gaussians, camera, effects.near_plane, effects.settings.frozen_beyond)
     return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings)

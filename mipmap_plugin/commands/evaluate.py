@@ -13,7 +13,7 @@ from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, each_
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import refuse_existing, write_json
-from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes import Scene, load_scene
 
 
 def evaluate(
@@ -27,6 +27,7 @@ def evaluate(
     published: Literal["nerf-synthetic", "mip-nerf-360"] | None = None,
     steps: int | None = None,
     upsampler: str | None = None,
+    appearance: Literal["mean", "upstream"] = "mean",
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
     backend: str = "auto",
@@ -48,6 +49,7 @@ def evaluate(
         published: Also print what papers published for this data set.
         steps: Optimizer steps at most, instead of the recipe's.
         upsampler: What makes the base image larger, by name or the file of a network.
+        appearance: Of test views, where each training view has one: their mean, or upstream's, which is that of the view with the same number.
         background: Of the scene; by default what the checkpoint says, else black.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
@@ -66,15 +68,19 @@ def evaluate(
     rows: list[Any] = []
     notes: dict[str, None] = {}  # each once, in their order
     for each, folder in zip(checkpoint, images, strict=True):
-        wrapped = wrap(each, None, background, backend, screen_filter)
-        rows += evaluation.evaluate(wrapped, load_scene(folder), each_once(scale), recipe, protocol, perceptual, **settings)
-        notes |= dict.fromkeys(evaluation.notes(wrapped, scale))
+        wrapped, scene = wrap(each, None, background, backend, screen_filter), _scene(folder, appearance)
+        rows += evaluation.evaluate(wrapped, scene, each_once(scale), recipe, protocol, perceptual, **settings)
+        notes |= dict.fromkeys(evaluation.notes(wrapped, scale, appearance))
     rows += evaluation.means(rows) if len(checkpoint) > 1 else []
     facts = {"rows": records(rows), "notes": list(notes)}
     if output:
         write_json(output, facts, overwrite)
-    title = f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views"
-    tell(facts, json) if json else _print_tables(title, rows, [*notes], published, each_once(scale))
+    tell(facts, json) if json else _print_tables(_title(checkpoint, images, protocol), rows, [*notes], published, each_once(scale))
+
+
+def _scene(folder: Path, appearance: str) -> Scene:
+    scene = load_scene(folder)
+    return scene.numbered_as_upstream() if appearance == "upstream" else scene
 
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], output: Path | None, overwrite: bool) -> None:
@@ -82,6 +88,10 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], output: Path | N
         refuse_existing(output, overwrite)
     if len(checkpoint) != len(images):
         raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")
+
+
+def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str) -> str:
+    return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views"
 
 
 def _listed(paths: Sequence[Path]) -> str:

@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.models.exchange import WRITTEN
 
 
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, several: bool) -> Path:
     """Beside the checkpoint as NAME_x0.25, or `output`, which is a folder for all where there are several scales."""
-    suffix = ".ply" if checkpoint.suffix == ".ply" else ""
-    name = f"{checkpoint.resolve().name.removesuffix('.ply')}_x{scale:g}{suffix}"
+    checkpoint_name = checkpoint.resolve().name
+    known = (*WRITTEN, ".ply") if checkpoint.is_file() or checkpoint.suffix == ".ply" else ()
+    suffix = next((ending for ending in known if checkpoint_name.lower().endswith(ending)), "")
+    name = f"{checkpoint_name[: len(checkpoint_name) - len(suffix)]}_x{scale:g}{suffix}"
     if output is None:
         return checkpoint.resolve().parent / name
     return output / name if several else output

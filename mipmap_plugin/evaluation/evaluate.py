@@ -17,6 +17,7 @@ from mipmap_plugin.evaluation.measure import FILTERS, Show, rivals, seen_before,
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, not_exposed, test_views
+from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.wrap import Adapted, Wrapped
 
@@ -80,11 +81,20 @@ def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: st
     return [judge.row(rival.name, scale, rival.show, gaussians=count) for rival in found]
 
 
-def notes(model: Wrapped, scales: Sequence[float]) -> list[str]:
-    """What the rows of these scales do not have, in sentences."""
+def notes(model: Wrapped, scales: Sequence[float], appearance: str = "mean") -> list[str]:
+    """What the rows of these scales do not have, in sentences; and which `appearance` test views have."""
     missing = {name: model.lacks(name) for name in FILTERS if any(scale != 1 for scale in scales)}
     told = [f"there is no row {name!r}, since {why}" for name, why in missing.items() if why]
-    return told + not_exposed(model.model)
+    return told + not_exposed(model.model) + _of_appearance(model.model, appearance)
+
+
+def _of_appearance(model: SplatModel, appearance: str) -> list[str]:
+    """By which appearance test views were drawn, in a sentence, where the model has any; `appearance`: "mean" or "upstream"."""
+    if not any(effect.name == "appearance embedding" and effect.on for effect in effects_of(model)):
+        return []
+    if appearance == "upstream":
+        return ["test views have the appearance of the training view with the same number, as in the original, whatever that view looked like"]
+    return ["test views have the mean appearance of all training views; the original has that of the same number (--appearance upstream)"]
 
 
 def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:

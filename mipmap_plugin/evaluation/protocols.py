@@ -89,10 +89,13 @@ class TestView:
     photograph: Tensor  # [H, W, 3], full resolution
     file: Path
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    bent: bool = False  # the file had to be undistorted
 
     def truth(self, scale: float, protocol: Protocol) -> Tensor:
         """[h, w, 3] at `scale` times the base scale. Raises SettingsError where there is no photograph as large."""
         size = self.camera.zoomed(scale).size
+        if protocol.resize is None and self.bent:
+            raise SettingsError(f"P4 wants ready-made copies, but those of {self.file.name} were taken through a lens that bends; evaluate by P3")
         if protocol.resize is None:
             return protocol.shrunk(read_image(ready_made(self.file, size), self.background), size)
         if size[0] > self.photograph.shape[0]:
@@ -124,7 +127,9 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
     cameras = [c for c in cameras if c.split == "test"] or cameras
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to judge by")
-    return [TestView(as_sampled(camera, base), scene.image(camera, background), scene.images[camera], background) for camera in cameras]
+    files = [scene.images[camera] for camera in cameras]
+    held = [(as_sampled(camera, base), scene.image(camera, background)) for camera in cameras]
+    return [TestView(*each, file, background, file in scene.lenses) for each, file in zip(held, files, strict=True)]
 
 
 def not_exposed(model: SplatModel) -> list[str]:

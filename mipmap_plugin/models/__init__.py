@@ -18,11 +18,13 @@ MODELS = Registry(
     {
         "3dgs": "mipmap_plugin.models.vanilla:load_vanilla",
         **dict.fromkeys(("mip", "gof", "analytic"), "mipmap_plugin.models.mip:load_mip"),
+        "2dgs": "mipmap_plugin.models.surfels:load_surfels",
         "deformable": "mipmap_plugin.models.deformable:load_deformable",
         "4dgs": "mipmap_plugin.models.hexplane:load_hexplane",
         "gsplat": "mipmap_plugin.models.gsplat:load_gsplat",
         "splatfacto": "mipmap_plugin.models.splatfacto:load_splatfacto",
         "scaffold": "mipmap_plugin.models.scaffold:load_scaffold",
+        "exchange": "mipmap_plugin.models.exchanged:load_exchanged",
         "octree": "mipmap_plugin.models.octree:load_octree",
     },
 )

@@ -186,7 +186,8 @@ class AnchorModel(ABC):
                 notes.append(f"{extra} goes into {', '.join(takers)}")
         if "appearance" in self._weights:
             count = len(self._weights["appearance"]["embedding.weight"])
-            notes.append(f"it knows the appearance of {count} training views; a camera that is none of them sees their mean")
+            told = "its project gives the n-th test view the appearance of the n-th training view (evaluate --appearance upstream)"
+            notes.append(f"it knows the appearance of {count} training views; a camera that is none of them sees their mean, where {told}")
         return notes
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> AnchorModel:

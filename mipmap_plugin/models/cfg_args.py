@@ -14,7 +14,12 @@ MAX_SIZE = 64 * 1024
 
 
 def read_cfg_args(path: str | Path) -> dict[str, Any]:
-    """The options of `Namespace(key=literal, ...)`. Raises CheckpointError for anything but literals."""
+    """The options of `Namespace(key=literal, ...)`, without those whose values are none. Raises CheckpointError for any other text."""
+    return read_cfg_args_and_rest(path)[0]
+
+
+def read_cfg_args_and_rest(path: str | Path) -> tuple[dict[str, Any], list[str]]:
+    """The options, and the names of those that are left out since their values are no literals. Raises CheckpointError."""
     path = Path(path)
     text = read_head(path, MAX_SIZE + 1)
     if len(text) > MAX_SIZE:
@@ -31,15 +36,22 @@ def format_cfg_args(options: dict[str, Any]) -> str:
     return f"Namespace({', '.join(f'{key}={value!r}' for key, value in options.items())})"
 
 
-def _keywords(call: ast.expr) -> dict[str, Any]:
+def _keywords(call: ast.expr) -> tuple[dict[str, Any], list[str]]:
     if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
         raise ValueError("it is no call of Namespace")
     if call.args or any(keyword.arg is None for keyword in call.keywords):
         raise ValueError("it has arguments without a name")
-    options = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
-    if len(options) < len(call.keywords):
-        raise ValueError("it names an argument twice")
-    return options
+    options: dict[str, Any] = {}
+    rest: list[str] = []
+    for keyword in call.keywords:
+        name = str(keyword.arg)
+        if name in options or name in rest:
+            raise ValueError("it names an argument twice")
+        try:
+            options[name] = ast.literal_eval(keyword.value)
+        except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
+            rest.append(name)
+    return options, rest
 
 
 def _brief(error: BaseException) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.anchor_networks import missing_networks
 from mipmap_plugin.models.cfg_args import read_cfg_args
-from mipmap_plugin.models.exchange import EXCHANGE, conversion
+from mipmap_plugin.models.exchange import EXCHANGE
 from mipmap_plugin.models.magic import kind_of, names_in_torch_file
 from mipmap_plugin.models.ply import Header, read_header
 from mipmap_plugin.models.tags import provenance_of, render_mode
@@ -24,17 +24,30 @@ FAMILIES = {
     "2dgs": "2D Gaussian splatting",
     "scaffold": "Scaffold-GS",
     "octree": "Octree-GS",
+    "anygs": "Octree-AnyGS",
+    "hac": "HAC",
     "deformable": "Deformable 3D Gaussians",
     "sc-gs": "SC-GS",
     "4dgs": "4D Gaussians",
     "spacetime": "SpacetimeGaussians",
     "gsplat": "gsplat",
     "splatfacto": "splatfacto (nerfstudio)",
+    "exchange": "exchange format (SPZ, SOG, KSPLAT, SPLAT, compressed PLY)",
+}
+
+# What more is to be said of families that are not loaded.
+NOT_LOADED = {
+    "anygs": ": its anchors are drawn at offsets, in sizes and at levels of their own (or it is of Octree-GS before April 2024, not read either)",
+    "hac": ": its networks and grids lie in checkpoint.pth (HAC++, ContextGS and others store theirs so too)",
 }
 
 # The files in the result folders of projects that save with torch: the folder they lie in, and their names.
 GSPLAT_FILE = r"ckpt_(?P<step>\d+)(?:_rank(?P<rank>\d+))?\.pt"
 RESULTS = {"gsplat": ("ckpts", GSPLAT_FILE), "splatfacto": ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")}
+
+
+# What the optimizer of fudan-zvg's 4D Gaussian Splatting names, and no other's; that project saves no PLY.
+FUDAN = ("scaling_t", "rotation_r")
 
 
 @dataclass(frozen=True)
@@ -64,14 +77,27 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     kind = kind_of(path)
     if kind == "torch":
         return _detect_torch_file(path)
+    if kind in EXCHANGE:
+        return Checkpoint("exchange", path)
     if kind != "ply":
         raise CheckpointError(_why_not(path, kind))
     return _detect_ply(path)
 
 
+def exchange_kind(file: Path) -> str | None:
+    """Which exchange format a file is in, a key of `exchange.EXCHANGE`; None for another. Raises CheckpointError."""
+    kind = kind_of(file)
+    return kind if kind in EXCHANGE else "compressed" if kind == "ply" and _is_compressed(read_header(file)) else None
+
+
+def _is_compressed(header: Header) -> bool:
+    return any("packed_position" in element.names for element in header.elements)
+
+
 def not_loaded(family: str) -> str:
     """The sentence for a family that is recognized, but that nothing is registered for."""
-    return f"this is a {FAMILIES.get(family, family)} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
+    told = f"this is a {FAMILIES.get(family, family)} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
+    return told + NOT_LOADED.get(family, "")
 
 
 def _detect_torch_file(path: Path) -> Checkpoint:
@@ -81,9 +107,8 @@ def _detect_torch_file(path: Path) -> Checkpoint:
 
 def _detect_ply(path: Path) -> Checkpoint:
     header = read_header(path)
-    names = {name for element in header.elements for name in element.names}
-    if "packed_position" in names:
-        raise CheckpointError(_why_not(path, "compressed"))
+    if _is_compressed(header):
+        return Checkpoint("exchange", path)
     folder, iteration = _around(path)
     return Checkpoint(_family(path, header, folder), path, folder, iteration)
 
@@ -100,8 +125,9 @@ def _around(ply: Path) -> tuple[Path | None, int | None]:
 def _family(path: Path, header: Header, folder: Path | None) -> str:
     """By columns first, then by companions: a dynamic scene's own PLY looks like plain 3DGS."""
     names = set(header.vertex.names)
-    if "f_anchor_feat_0" in names:
-        return "octree" if {"level", "extra_level", "info"} <= names else "scaffold"
+    if {"f_offset_0", "f_anchor_feat_0"} & names:
+        return _family_of_anchors(names)
+    _refuse_other_columns(path, names)
     for column, family in {"trbf_center": "spacetime", "fea_0": "sc-gs"}.items():
         if column in names:
             return family
@@ -113,6 +139,25 @@ def _family(path: Path, header: Header, folder: Path | None) -> str:
         columns = ", ".join(header.vertex.names[:8])
         raise CheckpointError(f"{path} is a plain point cloud or a mesh (columns {columns}), not Gaussian splats; give a trained model")
     return _family_of_companions(path, folder)
+
+
+def _family_of_anchors(names: set[str]) -> str:
+    """HAC and what follows it have masks. Octree-AnyGS has explicit anchors too, and keeps its constants in the header, not in `info`."""
+    if "f_mask_0" in names:
+        return "hac"
+    if "f_anchor_feat_0" not in names or not names & {"opacity", "nx"} or ("level" in names and "info" not in names):
+        return "anygs"
+    return "octree" if {"level", "extra_level", "info"} <= names else "scaffold"
+
+
+def _refuse_other_columns(path: Path, names: set[str]) -> None:
+    """Columns that make another thing of those of 3DGS. Raises CheckpointError."""
+    if "scale_3" in names:
+        raise CheckpointError(f"{path} has the column scale_3, which no splats have: it holds anchors or another model; give what it exports")
+    if {"opacity1", "opacity2"} <= names:
+        raise CheckpointError(f"{path} holds half-Gaussians (3D-HGS), whose two halves have opacities of their own, which are not read here")
+    if "f_0" in names and "f_dc_0" not in names and "opacity" in names:
+        raise CheckpointError(f"{path} holds features without colors (SAGA); give the scene_point_cloud.ply of its training")
 
 
 def network_of(ply: Path, family: str) -> Path:
@@ -154,11 +199,13 @@ def _family_of_filter_3d(folder: Path | None, told: Any) -> str:
 
 def _family_of_torch_file(path: Path) -> str:
     networks = {"linear.0.weight", "nodes", "deformation_net"}
-    found = names_in_torch_file(path, ("splats", "pipeline", "gauss_params", "param_groups", *networks))
+    found = names_in_torch_file(path, ("splats", "pipeline", "gauss_params", "param_groups", *FUDAN, *networks))
     if "splats" in found:
         return "gsplat"
     if found & {"pipeline", "gauss_params"}:
         return "splatfacto"
+    if set(FUDAN) <= found:
+        raise CheckpointError(f"{path} is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here")
     if "param_groups" in found:
         raise CheckpointError(f"{path} is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it")
     if found & networks:
@@ -167,9 +214,11 @@ def _family_of_torch_file(path: Path) -> str:
 
 
 def _why_not(path: Path, kind: str) -> str:
-    if kind in EXCHANGE:
-        return conversion(path, kind)
+    if path.suffix == ".hier":
+        chunk = "the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)"
+        return f"{path} is a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; give {chunk}"
     return {
+        "gsplat-png": f"{path} lists the pictures of gsplat's PngCompression, which are quantized; give the ckpts/ckpt_*.pt that they were made from",
         "glb": f"{path} is glTF, which is not read here, nor by splat-transform; export a PLY from the program that made it",
         "torchscript": f"{path} is a TorchScript network, one companion of an anchor model; give the model folder that holds its point_cloud.ply",
         "zip": f"{path} is a zip archive; unpack it and give the PLY or the folder in it",
@@ -186,8 +235,10 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     for name in ("meta.json", "lod-meta.json"):
-        if (folder / name).is_file() and kind_of(folder / name) == "sog":
-            raise CheckpointError(_why_not(folder / name, "sog"))
+        if (folder / name).is_file() and (kind := kind_of(folder / name)) in ("sog", "gsplat-png"):
+            if kind == "sog":
+                return Checkpoint("exchange", folder / name)
+            raise CheckpointError(_why_not(folder / name, kind))
     clouds = sorted(folder.glob("*.ply"))
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
@@ -208,6 +259,8 @@ def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
     for number in [wanted] if wanted is not None else sorted(entries, reverse=True):
         ply = entries[number] / "point_cloud.ply"
         try:
+            if not ply.exists() and (scene := ply.with_name("scene_point_cloud.ply")).exists():
+                raise CheckpointError(f"{entries[number]} is of SAGA; give the PLY of its scene itself: {scene}")
             found = detect(ply)
             _refuse_incomplete(found)
             return Checkpoint(found.family, ply, folder, number, tuple(f"iteration_{number} is taken, since {trouble}" for trouble in troubles))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,9 @@ from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import GSPLAT_FILE, detect
 from mipmap_plugin.models.gsplat_frame import normalized_frame
+from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
+from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.tags import render_mode
 from mipmap_plugin.models.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
@@ -28,6 +31,11 @@ NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
 # World units, the trainer's default.
 NEAR_PLANE = 0.01
+
+UNKNOWN = (
+    "cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter, and not by the trainer of flat"
+    " splats (2DGS), whose files look the same"
+)
 
 # What float32 holds; a text may have any number of digits.
 MAX_OPTION = 1e38
@@ -56,10 +64,9 @@ class GsplatHost:
             self._write_options(fresh, antialiased=render_mode(comments) == "antialiased")
         return path / within
 
-    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None, means: Tensor) -> list[Camera]:
+    def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
         """Resized by `data_factor`, and moved into the normalized world, which is found again from the cameras and points."""
-        factor = _positive(self.options, "data_factor", 1)
-        resized = [camera.resized(max(1, int(camera.width // factor)), max(1, int(camera.height // factor))) for camera in cameras]
+        points, resized = taken.points, _shrunk(cameras, int(_positive(self.options, "data_factor", 1)), taken)
         if not self.options.get("normalize_world_space", True):  # always on before version 1.4, which had no such option
             return resized
         if points is None:
@@ -94,7 +101,9 @@ def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaMod
     parts = [_parameters(shard["splats"], file) for shard, file in zip(shards, files, strict=True)]
     try:
         parameters = {name: torch.cat([part[name] for part in parts]) for name in NAMES}
-        model = VanillaModel(parameters, _trained(options, render_mode(comments)), origin, notes)
+        flat = str(options.get("model_type", "")).startswith("2dgs")
+        kind, trained = (SurfelModel, flat_trained(_trained(options, None))) if flat else (VanillaModel, _trained(options, render_mode(comments)))
+        model = kind(parameters, trained, origin, [*notes, *[FLAT_NOTE] * flat])
     except (ShapeError, RuntimeError) as error:  # what torch.cat raises for ranks that do not fit together
         raise CheckpointError(f"{found.path} holds tensors that do not fit together: {error}; copy it again") from error
     if len(files) > 1:
@@ -134,23 +143,38 @@ def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
     return {name: named[name].detach().float() for name in NAMES}
 
 
+def _shrunk(cameras: Sequence[Camera], factor: int, taken: Taken) -> list[Camera]:
+    """The cameras as simple_trainer has them (examples/datasets/colmap.py): intrinsics over `factor`, then times what the first photograph
+    of images_<factor> measures over a size that was rounded off. Without photographs they are taken to be rounded to the nearest."""
+    if factor < 2 or not cameras:
+        return list(cameras)
+    first = cameras[0]
+    actual = (taken.smaller(factor) if taken.smaller else None) or (max(1, round(first.width / factor)), max(1, round(first.height / factor)))
+    across, down = (size / max(1, whole // factor) for size, whole in zip(actual, (first.width, first.height), strict=True))
+    return [_divided(camera, factor, across, down) for camera in cameras]
+
+
+def _divided(camera: Camera, factor: int, across: float, down: float) -> Camera:
+    width, height = max(1, int(camera.width // factor * across)), max(1, int(camera.height // factor * down))
+    x, y = across / factor, down / factor
+    return replace(camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y)
+
+
 def _options_file(folder: Path | None) -> Path | None:
     return next((folder / name for name in ("cfg.yml", "cfg.json") if (folder / name).is_file()), None) if folder else None
 
 
 def _options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
-    """The options of the training, and a note where they are not known. Raises CheckpointError for a 2DGS training."""
+    """The options of the training, and a note where they are not known. Raises CheckpointError."""
     file = _options_file(folder)
     if file is None:
-        return {}, ["cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter"]
+        return {}, [UNKNOWN]
     try:
         options = json.loads(file.read_text(encoding="utf-8")) if file.suffix == ".json" else read_scalars(file)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{file} is not JSON ({error}); copy it again, or remove it") from error
     if not isinstance(options, dict):
         raise CheckpointError(f"{file} holds no options by name; copy it again, or remove it")
-    if str(options.get("model_type", "")).startswith("2dgs"):
-        raise CheckpointError(f"{file} says that the splats are flat (2DGS), a family that is recognized but not loaded")
     return options, []
 
 
@@ -171,6 +195,10 @@ def _oddities(options: dict[str, Any], siblings: dict[str, Any], sh_degree: int)
         notes.append(f"the cfg says SH degree {options['sh_degree']}, but the splats have degree {sh_degree}; the splats are trusted")
     if "pose_adjust" in siblings:
         notes.append("the training moved its cameras (pose_opt); the cameras of the scene are rendered as they are given")
+    if on := [name for name in ("with_ut", "with_eval3d") if options.get(name) is True]:
+        notes.append(f"trained with {', '.join(on)} (3DGUT), which projects splats otherwise than here (EWA); views differ a little from gsplat's")
+    if options.get("use_bilateral_grid") is True or options.get("post_processing") not in (None, False, "none"):
+        notes.append("trained with a bilateral grid or another correction of colors for each training view, which is not applied here")
     if options.get("camera_model", "pinhole") != "pinhole":
         notes.append(f"trained with {options['camera_model']} cameras; here all cameras are pinholes")
     return notes

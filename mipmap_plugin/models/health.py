@@ -10,7 +10,7 @@ from torch import Tensor
 from mipmap_plugin.models.base import SplatModel
 
 if TYPE_CHECKING:
-    from mipmap_plugin.models.vanilla import VanillaModel
+    from mipmap_plugin.models.vanilla import Splats
 
 # Below one 8-bit step no rasterizer of the field draws a splat (diff-gaussian-rasterization, forward.cu).
 MIN_VISIBLE = 1 / 255
@@ -86,7 +86,7 @@ def examine(model: SplatModel) -> Health:
     )
 
 
-def drop(model: VanillaModel, mask: Tensor) -> VanillaModel:
+def drop(model: Splats, mask: Tensor) -> Splats:
     """A new model without the rows where `mask` [N] is True, with a note of how many they were."""
     kept = model.keep_rows(~mask)
     kept.notes.append(f"{int(mask.sum()):,} of {len(mask):,} splats were dropped")

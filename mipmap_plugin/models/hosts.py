@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """What a scene knows of its photographs besides their cameras."""
+
+    points: Tensor | None = None  # [P, 3] of structure from motion
+    smaller: Callable[[int], tuple[int, int] | None] | None = None  # (width, height) px of the copies in images_<factor>; None: no photographs
+    applied_scale: float = 1.0  # by which nerfstudio had sized COLMAP's world before it wrote the file
 
 
 class Host(Protocol):
@@ -24,8 +34,8 @@ class Host(Protocol):
         `comments` (`tags.with_tags`) tell the screen filter and the provenance. Raises OutputExists.
         """
 
-    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None, means: Tensor) -> list[Camera]:
-        """Views of the photographs' scene, with its SfM `points` [P, 3], in the frame and at the size of the training.
+    def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
+        """Views of the photographs' scene in the frame and at the size of the training.
 
         `means` [N, 3] are those of the splats. Raises SceneError.
         """

@@ -10,11 +10,17 @@ from typing import Any, TypeGuard
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.files import new_folder, refuse_to_lose
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args
+from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args_and_rest
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 
 # Copied byte for byte: the cameras, and what SIBR's viewer and `load_ply` of 3DGS look for.
 COMPANIONS = ("cameras.json", "input.ply", "exposure.json")
+
+# Pipeline options are not in cfg_args.
+ANTIALIASING = (
+    "it is taken to be trained with the classic screen filter; 3DGS has had an option --antialiasing since October 2024, which no file records:"
+    " if it was on, say so (--screen-filter antialiased)"
+)
 
 # 3DGS takes iteration 0 for "nothing loaded" (scene/__init__.py), so a model that came without one gets the usual last one.
 DEFAULT_ITERATION = 30_000
@@ -25,7 +31,8 @@ def read_options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
     if folder is None or not (folder / "cfg_args").is_file():
         return {}, []
     try:
-        return read_cfg_args(folder / "cfg_args"), []
+        options, rest = read_cfg_args_and_rest(folder / "cfg_args")
+        return options, [f"cfg_args: {', '.join(rest)} cannot be read and count as not given; the other options are taken"] if rest else []
     except CheckpointError as error:
         return {}, [f"the training options are not known: {error}"]
 
@@ -59,8 +66,8 @@ def _screen_filter(options: dict[str, Any], tag: str | None) -> tuple[str, float
     return tag or TrainedScale.screen_filter, TrainedScale.eps2d
 
 
-def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposures) -> list[str]:
-    """What differs from the plain case, in sentences."""
+def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposures, tag: str | None = None) -> list[str]:
+    """What differs from the plain case, in sentences; `tag`: the screen filter that the header tells, if any."""
     notes = []
     if options.get("sh_degree", sh_degree) != sh_degree:
         notes.append(f"cfg_args says SH degree {options['sh_degree']}, but the PLY holds degree {sh_degree}; the PLY is trusted")
@@ -68,6 +75,8 @@ def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposure
         notes.append("trained with train_test_exp: the original shows each view by its exposure, which is done here only where asked for")
     if exposures is not NO_EXPOSURES:
         notes.append(exposures.found())
+    if "train_test_exp" in options and tag is None:
+        notes.append(ANTIALIASING)
     return notes
 
 

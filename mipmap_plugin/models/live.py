@@ -13,6 +13,7 @@ from mipmap_plugin.models import gsplat, splatfacto
 from mipmap_plugin.models.anchor_networks import NEEDED, Weights
 from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale
 from mipmap_plugin.models.scaffold import scaffold_in_memory
+from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
 
 # INRIA's GaussianModel and its descendants: attribute by our name.
@@ -40,6 +41,12 @@ NETWORKS = {
     **{"opacity_mlp": "mlp_opacity", "cov_mlp": "mlp_cov", "color_mlp": "mlp_color"},
     **{"feature_bank_mlp": "mlp_feature_bank", "appearance": "embedding_appearance"},
 }
+
+# Deformable 3D Gaussians keeps its network in another object; of the classes with these tensors only its own has no `capture`.
+STILL = (
+    "this {name} has no capture(), as that of Deformable 3D Gaussians: if a network moves its splats, these are what they are before it does;"
+    " give the path of the model folder to adapt a moving scene"
+)
 
 # Attributes of descendants that hold more than these tensors, and what they are.
 MORE = {
@@ -69,7 +76,12 @@ def adopt(model: Any) -> SplatModel:
     if all(hasattr(model, name) for name in INRIA.values()):
         raw = _copied(model, {name: getattr(model, attribute) for name, attribute in INRIA.items()})
         raw["opacities"] = raw["opacities"].reshape(-1)
-        return _adopted(model, raw, TrainedScale(), Origin())
+        if raw["scales"].dim() == 2 and raw["scales"].shape[1] == 2:  # 2DGS and its descendants
+            raw["scales"] = torch.cat([raw["scales"], torch.full_like(raw["scales"][:, :1], FLAT)], dim=1)
+            return _adopted(model, raw, flat_trained(TrainedScale()), Origin(), SurfelModel)
+        adopted = _adopted(model, raw, TrainedScale(), Origin())
+        adopted.notes += [] if hasattr(model, "capture") else [STILL.format(name=_name(model))]
+        return adopted
     tensors = _mapping(getattr(model, "gauss_params", model))
     if set(splatfacto.NAMES) <= set(tensors):
         raw = splatfacto.to_parameters(_copied(model, {name: tensors[name] for name in splatfacto.NAMES}))
@@ -114,8 +126,8 @@ def _copied(model: Any, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
     return {name: tensor.detach().to(torch.float32, copy=True, memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
 
 
-def _adopted(model: Any, raw: dict[str, Tensor], trained: TrainedScale, origin: Origin) -> VanillaModel:
-    return without_poison(VanillaModel(raw, trained, origin, [f"copied from a live {_name(model)}"]))
+def _adopted(model: Any, raw: dict[str, Tensor], trained: TrainedScale, origin: Origin, kind: type[VanillaModel] = VanillaModel) -> VanillaModel:
+    return without_poison(kind(raw, trained, origin, [f"copied from a live {_name(model)}"]))
 
 
 def _name(model: Any) -> str:

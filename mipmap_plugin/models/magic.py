@@ -49,7 +49,7 @@ def _refuse_placeholder(path: Path, head: bytes) -> None:
 
 
 def kind_of(path: Path) -> str:
-    """One of: ply, spz, sog, zip, gzip, torch, torchscript, glb, ksplat, splat, unknown. Raises CheckpointError (`read_head`)."""
+    """One of: ply, spz, sog, gsplat-png, zip, gzip, torch, torchscript, glb, ksplat, splat, unknown. Raises CheckpointError (`read_head`)."""
     head = read_head(path)
     if re.match(rb"ply\s", head):
         return "ply"
@@ -90,10 +90,12 @@ def _inflated(head: bytes) -> bytes:
 
 
 def _kind_of_json(head: bytes) -> str:
-    """The meta.json of an unpacked SOG names its pictures, and the lod-meta.json of a streamed one its parts."""
+    """The meta.json of an unpacked SOG names its pictures, the lod-meta.json of a streamed one its parts; that of gsplat's pictures has shapes."""
     if b"KHR_gaussian_splatting" in head:
         return "glb"
-    return "sog" if b".webp" in head or b"meta.json" in head else "unknown"
+    if b".webp" in head or b"meta.json" in head:
+        return "sog"
+    return "gsplat-png" if all(name in head for name in (b'"means"', b'"shape"', b'"mins"', b'"quats"')) else "unknown"
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import C0
 from mipmap_plugin.models.detect import RESULTS, detect
+from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.tags import render_mode
 from mipmap_plugin.models.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.models.vanilla import OPACITY_MARGIN, Origin, VanillaModel, without_poison
@@ -65,10 +66,12 @@ class SplatfactoHost:
             self._write_companions(fresh, path.name, render_mode(comments) or "classic")
         return path / within
 
-    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None, means: Tensor) -> list[Camera]:
+    def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
         """Moved by dataparser_transforms.json, and at the size that nerfstudio shrinks large photographs to. Raises SceneError."""
         frame = self._frame()
-        return [_shrunk(camera, self.options.get("downscale_factor")).moved(frame) for camera in cameras]
+        frame[:3] /= taken.applied_scale  # the file's scale has it, but the poses of the file were not sized by it again
+        factor = _factor(cameras, self.options.get("downscale_factor"), taken)
+        return [_shrunk(camera, factor).moved(frame) for camera in cameras]
 
     def _content(self, parameters: dict[str, Tensor], comments: Sequence[str]) -> dict[str, Any]:
         content = load_torch(self.source)
@@ -164,13 +167,22 @@ def _oddities(pipeline: Mapping[str, Any], options: dict[str, Any]) -> list[str]
     return notes
 
 
-def _shrunk(camera: Camera, factor: Any) -> Camera:
-    """The size that nerfstudio trains at: divided by `downscale_factor`, or halved until it fits."""
-    if not isinstance(factor, (int, float)) or factor <= 0:
-        factor = 1
-        while max(camera.size) / factor > MAX_SIDE:
-            factor *= 2
-    return camera.resized(max(1, int(camera.width / factor)), max(1, int(camera.height / factor)))
+def _factor(cameras: Sequence[Camera], told: Any, taken: Taken) -> float:
+    """What nerfstudio divides all sizes by: `downscale_factor`, or the power of 2 by which the first photograph fits, as far as there are
+    copies of it in images_2, images_4, ...; where there are no photographs at all, they are taken to have been there."""
+    if isinstance(told, (int, float)) and told > 0:
+        return told
+    factor = 1
+    while cameras and max(cameras[0].size) / factor > MAX_SIDE and (taken.smaller is None or taken.smaller(2 * factor)):
+        factor *= 2
+    return factor
+
+
+def _shrunk(camera: Camera, factor: float) -> Camera:
+    """Sizes are cut off to whole pixels, intrinsics are not (cameras/cameras.py, rescale_output_resolution)."""
+    size = dict(width=max(1, int(camera.width / factor)), height=max(1, int(camera.height / factor)))
+    lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
+    return replace(camera, **size, **lens)  # type: ignore[arg-type]
 
 
 def _refuse_to_confuse(path: Path) -> None:

@@ -28,7 +28,7 @@ def render_mode(comments: Iterable[str]) -> str | None:
 def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any]) -> list[str]:
     """Foreign comments, then our own two lines in place of any older ones."""
     foreign = [text for text in comments if not _tag(text) and not text.startswith(PROVENANCE + " {")]
-    mode = {"classic": "default", "antialiased": "mip", "mip": "mip"}.get(screen_filter)  # no tag stands for any other
+    mode = {"classic": "default", "antialiased": "mip", "mip": "mip", "surfel": "2dgs"}.get(screen_filter)  # no tag stands for any other
     tags = [f"SplatRenderMode: {mode}"] if mode else []
     return [*foreign, *tags, f"{PROVENANCE} {json.dumps(provenance, default=str)}"]
 

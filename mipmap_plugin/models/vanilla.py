@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -19,12 +19,15 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
+from mipmap_plugin.models.exchange import is_written, write_exchange
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
-from mipmap_plugin.models.hosts import Host
+from mipmap_plugin.models.hosts import Host, Taken
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.ply import read_ply, write_ply
 from mipmap_plugin.models.tags import render_mode, with_tags
+
+Splats = TypeVar("Splats", bound="VanillaModel")
 
 # World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so that it can grow again.
 MIN_SCALE = 1e-18
@@ -92,9 +95,13 @@ class VanillaModel:
         """The columns [N] of its file that 3DGS does not know."""
         return dict(self._origin.extras)
 
-    def with_extras(self, extras: dict[str, np.ndarray]) -> VanillaModel:
+    def with_extras(self: Splats, extras: dict[str, np.ndarray]) -> Splats:
         """The same splats, over the same tensors, with these columns [N] behind those of 3DGS."""
         return self._with(self._parameters, replace(self._origin, extras=extras))
+
+    def coming_from(self: Splats, file: Path) -> Splats:
+        """The same splats, over the same tensors, told to be this file's."""
+        return self._with(self._parameters, replace(self._origin, source=file, digest=sha256(file)))
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated: exp, sigmoid, unit quaternions. `camera` is not looked at."""
@@ -105,16 +112,16 @@ class VanillaModel:
     def parameters(self) -> dict[str, Tensor]:
         return dict(self._parameters)
 
-    def copy(self) -> VanillaModel:
+    def copy(self: Splats) -> Splats:
         """An independent model whose leaves require gradients; as it may change, it has no digest of a file."""
         leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()}
         return self._with(leaves, replace(self._origin, digest=""))
 
-    def to(self, device: torch.device | str) -> VanillaModel:
+    def to(self: Splats, device: torch.device | str) -> Splats:
         """A copy on another device, which requires gradients where this one does."""
         return self._with({name: _moved(tensor, device) for name, tensor in self._parameters.items()})
 
-    def keep_rows(self, keep: Tensor) -> VanillaModel:
+    def keep_rows(self: Splats, keep: Tensor) -> Splats:
         """A new model of the rows where `keep` [N] is True, extra columns included."""
         extras = {name: column[keep.cpu().numpy()] for name, column in self._origin.extras.items()}
         kept = {name: tensor.detach()[keep].requires_grad_(tensor.requires_grad) for name, tensor in self._parameters.items()}
@@ -153,7 +160,7 @@ class VanillaModel:
     def save(
         self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False, companions: Callable[[Path], Any] = lambda ply: None
     ) -> Path:
-        """Write a PLY where `path` ends in .ply, else what the model came in, atomically; return the file with the splats.
+        """Write a PLY where `path` ends in .ply, an exchange format (`exchange.WRITTEN`), else what the model came in, atomically; return the file.
 
         A model from another project's file goes back into one (`Host.write`). A folder of 3DGS repeats the iteration, cfg_args,
         cameras and exposures that the model came with; `companions` adds to it what else a family keeps around the PLY that
@@ -161,9 +168,11 @@ class VanillaModel:
         """
         path = Path(path)
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
+        if is_written(path):
+            return write_exchange(path, lambda ply: write_ply(ply, self._columns(), comments), self.trained, overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, self._parameters, comments, overwrite=overwrite)
-        columns = {**to_columns(self._parameters), **self._origin.extras}
+        columns = {**self._columns(), **self._origin.extras}
         if path.suffix.lower() == ".ply":
             return write_ply(path, columns, comments, overwrite=overwrite)
 
@@ -178,14 +187,23 @@ class VanillaModel:
         """[N], 0..1, without gradient; the same for all views."""
         return self._parameters["opacities"].detach().sigmoid()
 
-    def as_trained(self, cameras: Sequence[Camera], points: Tensor | None) -> list[Camera]:
-        """Views of the photographs' scene, with its SfM `points` [P, 3], in the frame and at the size that the model was trained in."""
+    def as_trained(self, cameras: Sequence[Camera], taken: Taken) -> list[Camera]:
+        """Views of the photographs' scene in the frame and at the size that the model was trained in."""
         if self._origin.host is None:
             return list(cameras)
-        return self._origin.host.as_trained(cameras, points, self._parameters["means"].detach())
+        return self._origin.host.as_trained(cameras, taken, self._parameters["means"].detach())
 
-    def _with(self, parameters: dict[str, Tensor], origin: Origin | None = None) -> VanillaModel:
-        return VanillaModel(parameters, self.trained, origin or self._origin, self.notes)
+    @staticmethod
+    def parameters_of(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Tensor]:
+        """Raw parameters from the columns of the family's PLY at `path`. Raises CheckpointError."""
+        return to_parameters(columns, path)
+
+    def _columns(self) -> dict[str, np.ndarray]:
+        """What the family's PLY holds of the parameters."""
+        return to_columns(self._parameters)
+
+    def _with(self: Splats, parameters: dict[str, Tensor], origin: Origin | None = None) -> Splats:
+        return type(self)(parameters, self.trained, origin or self._origin, self.notes)
 
 
 def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
@@ -201,14 +219,19 @@ def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaMo
 
 def read_vanilla(found: Checkpoint) -> VanillaModel:
     """The splats of a checkpoint of 3DGS, or of a family that keeps them in the same columns. Raises CheckpointError."""
+    return read_splats(found, VanillaModel)
+
+
+def read_splats(found: Checkpoint, kind: type[Splats]) -> Splats:
+    """As `read_vanilla`, as a model of this `kind`."""
     ply = read_ply(found.path)
-    parameters, extras = to_parameters(ply.columns, found.path), extra_columns(ply.columns)
+    parameters, extras = kind.parameters_of(ply.columns, found.path), extra_columns(ply.columns)
     options, notes = read_options(found.folder)
     screen_filter = render_mode(ply.comments)
     origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, ply.comments, extras, read_exposures(found.folder))
-    model = VanillaModel(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
+    model = kind(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
     del ply  # as large as the model, and no longer needed by what follows
-    model.notes += companion_notes(options, model.sh_degree, model.exposures)
+    model.notes += companion_notes(options, model.sh_degree, model.exposures, screen_filter)
     if screen_filter:
         model.notes.append(f"the header says that the splats were trained {screen_filter}, so they are rendered so")
     if extras:
@@ -231,7 +254,7 @@ def unit_quaternions(quats: Tensor) -> Tensor:
     return scaled / scaled.norm(dim=1, keepdim=True)
 
 
-def without_poison(model: VanillaModel) -> VanillaModel:
+def without_poison(model: Splats) -> Splats:
     """The model without the splats that are not finite once activated, with a note. Raises CheckpointError when none is left."""
     health = examine(model)
     if not health.poisonous.any():

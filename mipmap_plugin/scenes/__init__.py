@@ -10,6 +10,7 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
 from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
+from mipmap_plugin.scenes.moving import is_dynerf, is_hypernerf, read_dynerf, read_hypernerf
 from mipmap_plugin.scenes.trajectories import jittered, orbit
 from mipmap_plugin.scenes.transforms import read_transforms
 
@@ -17,7 +18,8 @@ __all__ = ["Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_ca
 
 
 def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
-    """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file or its folder, or a COLMAP scene.
+    """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file or its folder, a COLMAP scene,
+    or one of DyNeRF or HyperNeRF as 4DGaussians reads them.
 
     `cfg` is the checkpoint's cfg_args, which tell the test split and training size (`read_cameras`, `read_colmap`). A folder with
     both COLMAP's `sparse` and transforms files is read as graphdeco-inria does, from `sparse`.
@@ -34,6 +36,10 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         return read_colmap(path, cfg)
     if any(path.glob("transforms*.json")):
         return read_transforms(path)
+    if is_dynerf(path):
+        return read_dynerf(path)
+    if is_hypernerf(path):
+        return read_hypernerf(path)
     if is_colmap(path):
         return read_colmap(path, cfg)
     raise SceneError(f"{path}: holds neither cameras.json nor transforms files nor a COLMAP model; give the folder or file that has the cameras")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +12,8 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, SettingsError
-from mipmap_plugin.scenes.images import read_image
+from mipmap_plugin.scenes.images import image_size, is_file, read_image
+from mipmap_plugin.scenes.lenses import Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +26,8 @@ class Scene:
     notes: list[str] = field(default_factory=list)  # what was assumed or left out, one sentence each
     points: Tensor | None = None  # [P, 3] float64, the points of structure from motion, where the files hold them
     applied: Tensor | None = None  # [4, 4] float64, how nerfstudio had turned COLMAP's world before it wrote the file
+    applied_scale: float = 1.0  # and by how much it had sized it
+    lenses: dict[Path, Lens] = field(default_factory=dict)  # of the photographs that have to be undistorted
 
     def split(self, name: str) -> list[Camera]:
         """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""
@@ -43,11 +47,44 @@ class Scene:
         back = torch.linalg.inv(self.applied)
         return replace(self.with_cameras([camera.moved(back) for camera in self.cameras]), applied=None)
 
+    def numbered_as_upstream(self) -> Scene:
+        """The scene whose test views have numbers (`Camera.index`), each its own among the test views by name.
+
+        Scaffold-GS and Octree-GS take by it the appearance of a training view, which has nothing to do with the test view but the number.
+        """
+        tests = sorted(self.split("test"), key=lambda camera: camera.name)
+        place = {camera: number for number, camera in enumerate(tests)}
+        return self.with_cameras([replace(camera, index=place.get(camera, camera.index)) for camera in self.cameras])
+
+    def smaller(self, factor: int) -> tuple[int, int] | None:
+        """(width, height) px of the copies of the photographs that lie in images_<factor> beside them; None where there are none.
+
+        Of photographs that have to be undistorted, what is left of the copies then.
+        """
+        camera = next((camera for camera in self.cameras if camera in self.images), None)
+        first = Path() if camera is None else self.images[camera]
+        folder = next((parent for parent in first.parents if re.fullmatch(r"images(_\d+)?", parent.name)), None)
+        if camera is None or folder is None:
+            return None
+        for name in (f"images_{factor}_png", f"images_{factor}"):
+            within = folder.with_name(name) / first.relative_to(folder)
+            for copy in (within, within.with_suffix(".png"), within.with_name(first.name)):
+                if is_file(copy):
+                    return _left(image_size(copy), first, camera) if first in self.lenses else image_size(copy)
+        return None
+
     def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
-        """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution.
+        """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution, undistorted.
 
         Raises SceneError when there is none: cameras are compared by identity, so a zoomed copy has none.
         """
         if camera not in self.images:
             raise SceneError(f"{self.source}: camera {camera.name!r} has no image; ask with a camera that is a key of `images`")
-        return read_image(self.images[camera], background)
+        image, lens = read_image(self.images[camera], background), self.lenses.get(self.images[camera])
+        return image if lens is None else lens.undistorted(image)
+
+
+def _left(size: tuple[int, int], whole: Path, camera: Camera) -> tuple[int, int]:
+    """The share of a copy's `size` that `camera`, undistorted, has of the `whole` photograph."""
+    across, down = (kept / side for kept, side in zip((camera.width, camera.height), image_size(whole), strict=True))
+    return max(1, round(size[0] * across)), max(1, round(size[1] * down))

@@ -79,6 +79,14 @@ def count_test_cameras(names: list[str]) -> int:
     return math.ceil(len(names) / TEST_EVERY)
 
 
+def photographs_folder(cfg: dict[str, Any]) -> str:
+    """The name of the folder that was trained on. Octree-GS, which has levels (`fork`), goes by `ds` and looks at no `images`."""
+    ds = cfg.get("ds", 1)
+    if "fork" in cfg and isinstance(ds, int):
+        return f"images_{ds}" if ds > 1 else "images"
+    return str(cfg.get("images", "images"))
+
+
 def trained_size(width: int, height: int, cfg: dict[str, Any]) -> tuple[int, int]:
     """(width, height) in px after INRIA's `-i images_N` and `-r`, from the size in cameras.json.
 
@@ -86,7 +94,7 @@ def trained_size(width: int, height: int, cfg: dict[str, Any]) -> tuple[int, int
     images_2, images_4 and images_8 hold photographs shrunk by that factor. Rounding is `loadCam`'s: the divisors
     round, the cap and the target width cut off.
     """
-    shrunk = re.fullmatch(r"images_(\d{1,9})", str(cfg.get("images", "")))
+    shrunk = re.fullmatch(r"images_(\d{1,9})", photographs_folder(cfg))
     if shrunk and int(shrunk[1]) > 0:
         width, height = max(1, round(width / int(shrunk[1]))), max(1, round(height / int(shrunk[1])))
     resolution = cfg.get("resolution", 1)

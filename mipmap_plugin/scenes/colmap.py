@@ -11,18 +11,17 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.cameras_json import TEST_EVERY, trained_size
+from mipmap_plugin.scenes.cameras_json import TEST_EVERY, photographs_folder, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.images import image_size, is_file
 from mipmap_plugin.scenes.json_file import pixels
+from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
 
 if TYPE_CHECKING:
     import pycolmap
 
 # Where the parts of a model lie, in the order that graphdeco-inria and gsplat look for them.
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-
-INSTALL = "install it with `pip install 'mipmap-plugin[colmap]'`"
 
 
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
@@ -33,30 +32,35 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     `images` count at their full size. A camera whose photograph is absent stays a usable view; `notes` count them.
 
     Raises:
-        SceneError: no pycolmap, no readable model, a lens with distortion, or a `resolution` that is none.
+        SceneError: no pycolmap, no readable model, a lens that cannot be undistorted, or a `resolution` that is none.
     """
     path, cfg = Path(path), cfg or {}
     model = _read(path)
-    folder = _root(path) / str(cfg.get("images", "images"))
+    folder = _root(path) / photographs_folder(cfg)
     try:
         images = sorted(model.images.values(), key=lambda image: image.name)
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: the COLMAP model has names of images that are no UTF-8; copy or export it again") from error
     if not images:
         raise SceneError(f"{path}: the COLMAP model has no image with a pose; run the mapper again")
-    _refuse_distortion(model, path)
     cameras: list[Camera] = []
     photographs: dict[Camera, Path] = {}
+    lenses: dict[Path, Lens] = {}
     for index, image in enumerate(images):
         camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
-        photograph = folder / image.name
-        if is_file(photograph):
-            camera = camera.resized(*trained_size(*image_size(photograph), {**cfg, "images": "images"}))
-            photographs[camera] = photograph
-        else:
-            camera = camera.resized(*trained_size(camera.width, camera.height, cfg))
+        photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id])
+        there, asked = is_file(photograph), cfg
+        if there:
+            size, asked = image_size(photograph), {**cfg, "images": "images", "ds": 1}
+            camera, lens = camera.resized(*size), lens and lens.at(size)
+        if lens is not None:
+            camera, lenses[photograph] = lens.straightened(camera), lens
+        camera = camera.resized(*trained_size(camera.width, camera.height, asked))
         cameras.append(camera)
-    return Scene(tuple(cameras), photographs, path, _notes(cameras, photographs, folder, cfg), points=_points(model))
+        if there:
+            photographs[camera] = photograph
+    notes = _notes(cameras, photographs, folder, cfg) + ([note(lenses.values(), len(lenses))] if lenses else [])
+    return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses)
 
 
 def is_colmap(path: Path) -> bool:
@@ -91,12 +95,12 @@ def _read(path: Path) -> pycolmap.Reconstruction:
         raise SceneError(f"{folder}: is not a COLMAP model that pycolmap reads ({reason}); copy or export it again") from error
 
 
-def _refuse_distortion(model: pycolmap.Reconstruction, path: Path) -> None:
-    for number, camera in model.cameras.items():
-        bent = [camera.params[i] for i in camera.extra_params_idxs() if camera.params[i] != 0]
-        if bent or "FISHEYE" in camera.model.name or camera.model.name == "FOV":
-            advice = "undistort the images first: `colmap image_undistorter --image_path images --input_path sparse/0 --output_path undistorted`"
-            raise SceneError(f"{path}: camera {number} has distortion ({camera.model.name}), which no rasterizer here draws; {advice}")
+def _lens(camera: pycolmap.Camera) -> Lens | None:
+    """The lens, where it bends."""
+    bent = any(camera.params[i] != 0 for i in camera.extra_params_idxs())
+    if not bent and "FISHEYE" not in camera.model.name and camera.model.name != "FOV":
+        return None
+    return Lens(camera.model.name, camera.width, camera.height, tuple(camera.params))
 
 
 def _camera(model: pycolmap.Reconstruction, image: pycolmap.Image, split: Literal["train", "test"], *, centered: bool) -> Camera:

@@ -103,6 +103,14 @@ def _bytes(image: Tensor) -> np.ndarray:
     return (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
+def read_array(path: str | Path) -> Tensor:
+    """The numbers of a NumPy file, float64. It is not unpickled, and as long as it says. Raises SceneError."""
+    try:
+        return torch.from_numpy(np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64))
+    except (OSError, ValueError, TypeError, SyntaxError, OverflowError, RecursionError) as error:  # what NumPy raises for other files
+        raise SceneError(f"{path}: is no array that NumPy reads ({(str(error).splitlines() or [''])[0][:120]}); copy it again") from error
+
+
 def _opened(path: str | Path) -> Image.Image:
     try:
         return Image.open(path)

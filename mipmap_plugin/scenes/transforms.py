@@ -15,11 +15,15 @@ from mipmap_plugin.errors import SceneError
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.images import image_size, is_file
 from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
+from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+# What ns-process-data turned COLMAP's world by before its files said so (data/dataparsers/nerfstudio_dataparser.py). It is a rotation.
+USUAL_TURN = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 
 # Radians; half of it has a tangent that can be divided by, and no lens is as long.
 MIN_ANGLE = 1e-9
@@ -35,22 +39,28 @@ def read_transforms(path: str | Path) -> Scene:
     the camera stays where the file states its size (`w`, `h`) and is left out otherwise; `notes` count both.
 
     Raises:
-        SceneError: no transforms file, no usable frame, a lens with distortion, or an entry that cannot be read.
+        SceneError: no transforms file, no usable frame, a lens that is no perspective's, or an entry that cannot be read.
     """
     path = Path(path)
     cameras: list[Camera] = []
     images: dict[Camera, Path] = {}
     notes: list[str] = []
+    lenses: dict[Path, Lens] = {}
+    bent: list[Lens] = []
     for file, split in transforms_files(path):
         found, absent = _read_file(file, split)
-        cameras += [camera for camera, _ in found]
-        images |= {camera: image for camera, image in found if image}
+        cameras += [camera for camera, _, _ in found]
+        images |= {camera: image for camera, image, _ in found if image}
+        lenses |= {image: lens for _, image, lens in found if image and lens}
+        bent += [lens for _, _, lens in found if lens]
         if absent:
-            unsized = absent - sum(image is None for _, image in found)
+            unsized = absent - sum(image is None for _, image, _ in found)
             notes.append(f"{file.name}: {absent} listed images are absent; {unsized} of their cameras are left out because the file has no w and h")
     if not cameras:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
-    return Scene(tuple(cameras), images, path, notes, applied=_applied(transforms_files(path)[0][0]))
+    first = transforms_files(path)[0][0]
+    notes += [note(bent, len(bent)) + ("" if can_undistort() else f"; pycolmap does that: {INSTALL}")] if bent else []
+    return Scene(tuple(cameras), images, path, notes, applied=_applied(first), applied_scale=_applied_scale(first), lenses=lenses)
 
 
 def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
@@ -77,13 +87,13 @@ def _first_file(folder: Path, *names: str) -> list[Path]:
     return [folder / name for name in names if (folder / name).is_file()][:1]
 
 
-def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[Camera, Path | None]], int]:
-    """Each usable camera with its image, and how many listed images are absent."""
+def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[Camera, Path | None, Lens | None]], int]:
+    """Each usable camera with its image and the lens that it has to be undistorted from, and how many listed images are absent."""
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{file}: has no list of 'frames'; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
-    found: list[tuple[Camera, Path | None]] = []
+    found: list[tuple[Camera, Path | None, Lens | None]] = []
     absent = 0
     for index, frame in enumerate(frames):
         where = f"{file}, frame {index}"
@@ -97,17 +107,22 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
         actual = image_size(image) if image else stated  # the image may have been shrunk since
         if actual:
             name = image.stem if image else listed.replace("\\", "/").rsplit("/", 1)[-1]
-            camera = _camera(values, stated or actual, name, split, f"{where} ({name})")
-            found.append((camera.resized(*actual), image))
+            camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
+            lens = _lens(values, camera, f"{where} ({name})")
+            found.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
     return found, absent
 
 
 def _applied(file: Path) -> Tensor | None:
-    """[4, 4] nerfstudio's `applied_transform`, by which it has turned COLMAP's world already."""
+    """[4, 4] nerfstudio's `applied_transform`, by which it has turned COLMAP's world already; in old data it goes without saying."""
     data = read_json(file)
     if "applied_transform" not in data:
-        return None
+        return _pose(USUAL_TURN, str(file)) if file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists() else None
     return _pose(data["applied_transform"], f"{file}, applied_transform")
+
+
+def _applied_scale(file: Path) -> float:
+    return positive(read_json(file).get("applied_scale", 1.0), f"{file}, applied_scale")
 
 
 def _image(folder: Path, listed: str) -> Path | None:
@@ -124,7 +139,6 @@ def _stated_size(values: Mapping[str, Any], where: str) -> tuple[int, int] | Non
 
 def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: Literal["train", "test"], where: str) -> Camera:
     """The camera at `size` (width, height) px, which the lens is stated at."""
-    _refuse_distortion(values, where)
     width, height = size
     fx = _focal(values, "x", width, where)
     if fx is None:
@@ -162,9 +176,17 @@ def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float
     return size / (2 * math.tan(angle / 2))
 
 
-def _refuse_distortion(values: Mapping[str, Any], where: str) -> None:
-    bent = [key for key in DISTORTION if values.get(key)]
-    model = values.get("camera_model", "PINHOLE")
-    if bent or values.get("is_fisheye") or model not in PERSPECTIVE_MODELS:
-        what = f"distortion ({', '.join(bent)})" if bent else "a lens that is not perspective"
-        raise SceneError(f"{where}: has {what}; undistort the images first (COLMAP: `colmap image_undistorter`)")
+def _lens(values: Mapping[str, Any], camera: Camera, where: str) -> Lens | None:
+    """The lens of `camera`, where it bends; its parameters are OpenCV's, and need no size. Raises SceneError where it is no perspective's."""
+    model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
+    if model not in (*PERSPECTIVE_MODELS, "OPENCV_FISHEYE"):
+        raise SceneError(f"{where}: has a lens that is not perspective ({model}); resample its images to a pinhole first")
+    k1, k2, k3, k4, p1, p2 = (numbers(values.get(key) or 0.0, (), f"{where}, {key}").item() for key in DISTORTION)
+    pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
+    if model == "OPENCV_FISHEYE":
+        return Lens(model, camera.width, camera.height, (*pinhole, k1, k2, k3, k4))
+    if not any((k1, k2, k3, p1, p2)):
+        return None
+    # nerfstudio and instant-ngp take a fourth radial term for fisheyes only.
+    params = (*pinhole, k1, k2, p1, p2, *((k3, 0.0, 0.0, 0.0) if k3 else ()))
+    return Lens("FULL_OPENCV" if k3 else "OPENCV", camera.width, camera.height, params)

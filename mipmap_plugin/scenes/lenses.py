@@ -1,0 +1,79 @@
+"""Lenses that bend: the pinhole that is left once an image is undistorted, and the undistorting, both pycolmap's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SceneError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+INSTALL = "install it with `pip install 'mipmap-plugin[colmap]'`"
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera model of COLMAP with its parameters, in px of an image of this size."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def at(self, size: tuple[int, int]) -> Lens:
+        """The lens of the same photograph at another `size` (width, height) px."""
+        camera = self._camera()
+        camera.rescale(*size)
+        return replace(self, width=camera.width, height=camera.height, params=tuple(camera.params))
+
+    def straightened(self, camera: Camera) -> Camera:
+        """`camera` with the intrinsics, and the size, of the undistorted image. Raises SceneError where the lens has none."""
+        import pycolmap
+
+        try:
+            flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self._camera())
+        except Exception as error:  # what pycolmap's C++ raises
+            raise SceneError(f"camera {camera.name!r}: its lens ({self.model}) cannot be undistorted ({_brief(error)}); leave it out") from error
+        fx, fy, cx, cy = map(float, flat.params)
+        return replace(camera, width=flat.width, height=flat.height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+    def undistorted(self, image: Tensor) -> Tensor:
+        """`image` [H, W, 3] float32 of 8-bit levels, taken through this lens, as a pinhole sees it. Raises SceneError without pycolmap."""
+        try:
+            import pycolmap
+        except ImportError as error:
+            raise SceneError(f"a photograph was taken through a lens that bends ({self.model}), which pycolmap undistorts; {INSTALL}") from error
+        lens = self.at((image.shape[1], image.shape[0]))
+        bitmap = pycolmap.Bitmap.from_array((image * 255).round().to(torch.uint8).numpy())
+        flat, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), bitmap, lens._camera())
+        return torch.from_numpy(flat.to_array()).float() / 255
+
+    def _camera(self) -> pycolmap.Camera:
+        import pycolmap
+
+        return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+
+
+def note(lenses: Any, seen: int) -> str:
+    """That `lenses` (some of `Lens`) were made pinholes, in a sentence; `seen`: how many cameras have one."""
+    models = ", ".join(sorted({lens.model for lens in lenses}))
+    return f"{seen} cameras have lenses that bend ({models}): they are taken as pinholes, and their photographs are undistorted to be looked at"
+
+
+def can_undistort() -> bool:
+    """Whether pycolmap is there."""
+    try:
+        import pycolmap  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def _brief(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]

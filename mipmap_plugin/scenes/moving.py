@@ -1,0 +1,132 @@
+"""Scenes of 4DGaussians that come without transforms: DyNeRF's videos (poses_bounds.npy) and HyperNeRF's captures (dataset.json).
+
+Poses, lenses, sizes, times and splits are those that scene/neural_3D_dataset_NDC.py and scene/hyper_loader.py of that project train on.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes.base import Scene
+from mipmap_plugin.scenes.images import image_size, is_file, read_array
+from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
+from mipmap_plugin.scenes.transforms import viewmat_from_opengl
+
+# DyNeRF: px of the video's width, which its focal lengths are stated at, and of what is trained on; and the frames of a video.
+RECORDED, WIDTH, HEIGHT, FRAMES = 2704, 1352, 1014, 300
+
+# HyperNeRF: photographs are read from the folder of half the size. Without a list of test views every fourth is trained on.
+HALF, EVERY = "2x", 4
+
+
+def is_dynerf(path: Path) -> bool:
+    return (path / "poses_bounds.npy").is_file() and (any(path.glob("cam*")) or not (path / "images").is_dir())
+
+
+def is_hypernerf(path: Path) -> bool:
+    return (path / "dataset.json").is_file() and (path / "camera").is_dir()
+
+
+def read_dynerf(path: Path) -> Scene:
+    """Every video's camera, the first for testing. A training camera is taken at some moments only, so that all of them together are as many
+    views as a video has frames, one at each. Frames lie in cam<NN>/images, if they were extracted. Raises SceneError."""
+    rows = read_array(path / "poses_bounds.npy")
+    if rows.dim() != 2 or rows.shape[1] != 17 or len(rows) < 2:
+        raise SceneError(f"{path / 'poses_bounds.npy'}: expected one row of 17 numbers for each of several cameras, got {list(rows.shape)}")
+    poses = rows[:, :15].reshape(-1, 3, 5)
+    videos = sorted({entry.name.partition(".")[0] for entry in path.glob("cam*")}) or [f"cam{number:02d}" for number in range(len(poses))]
+    if len(videos) != len(poses):
+        raise SceneError(f"{path}: has {len(videos)} videos ({videos[0]}, ...), but poses_bounds.npy tells {len(poses)} cameras; copy all of them")
+    cameras: list[Camera] = []
+    images: dict[Camera, Path] = {}
+    for number, (video, pose) in enumerate(zip(videos, poses, strict=True)):
+        moments = range(FRAMES) if number == 0 else range(number - 1, FRAMES, len(poses) - 1)
+        for moment in moments:
+            camera = _of_video(pose, video, moment, "train" if number else "test", f"{path / 'poses_bounds.npy'}, row {number}")
+            cameras.append(camera)
+            if is_file(frame := path / video / "images" / f"{moment:04d}.png"):
+                images[camera] = frame
+    notes = [f"{len(videos)} videos of {FRAMES} frames; the first is for testing, the others are seen at {FRAMES} moments in turn"]
+    return Scene(tuple(cameras), images, path, notes)
+
+
+def read_hypernerf(path: Path) -> Scene:
+    """The training and test views of a capture, at half its size. Raises SceneError."""
+    listed, facts = (_object(path / name) for name in ("dataset.json", "metadata.json"))
+    names = _names(listed, "ids", path)
+    warps = [_warp(facts.get(name), f"{path / 'metadata.json'}, {name}") for name in names]
+    last = max(warps, default=0) or 1.0
+    cameras: list[Camera] = []
+    images: dict[Camera, Path] = {}
+    tests, trains = _names(listed, "val_ids", path), _names(listed, "train_ids", path)
+    for name, split, warp in _chosen(names, set(tests), set(trains), warps):
+        photograph = path / "rgb" / HALF / f"{name}.png"
+        camera = _of_capture(path / "camera" / f"{name}.json", name, split, warp / last)
+        there = is_file(photograph)
+        camera = camera.resized(*(image_size(photograph) if there else (camera.width // 2, camera.height // 2)))
+        cameras.append(camera)
+        if there:
+            images[camera] = photograph
+    if not cameras:
+        raise SceneError(f"{path / 'dataset.json'}: lists no view; copy it again")
+    return Scene(tuple(cameras), images, path, [f"{len(cameras)} of {len(names)} views of a HyperNeRF capture, at half its size"])
+
+
+def _of_video(pose: Tensor, video: str, moment: int, split: Literal["train", "test"], where: str) -> Camera:
+    """`pose` [3, 5] is LLFF's: the camera's axes down, right and backwards, its place, and (height, width, focal length)."""
+    down, right, back, eye, lens = pose.unbind(1)
+    to_world = torch.eye(4, dtype=torch.float64)
+    to_world[:3, :3] = rotation(torch.stack([right, -down, back], 1).tolist(), where)
+    to_world[:3, 3] = eye
+    focal = positive(lens[2].item(), f"{where}, focal length") * WIDTH / RECORDED
+    viewmat = viewmat_from_opengl(to_world)
+    return Camera(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, viewmat, f"{video}/{moment:04d}", split, moment / FRAMES)
+
+
+def _object(file: Path) -> dict[str, Any]:
+    data = read_json(file)
+    if not isinstance(data, dict):
+        raise SceneError(f"{file}: holds no values by name; copy it again")
+    return data
+
+
+def _names(listed: dict[str, Any], key: str, path: Path) -> list[str]:
+    names = listed.get(key, [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise SceneError(f"{path / 'dataset.json'}, {key}: is no list of names; copy it again")
+    return names
+
+
+def _warp(entry: Any, where: str) -> float:
+    """The moment of a view, at least 0."""
+    value = numbers(present(entry if isinstance(entry, dict) else {}, "warp_id", where), (), f"{where}, warp_id").item()
+    if value < 0:
+        raise SceneError(f"{where}, warp_id: is {value:g} but must be at least 0; correct the file")
+    return value
+
+
+def _chosen(names: list[str], tests: set[str], trains: set[str], warps: list[float]) -> list[tuple[str, Literal["train", "test"], float]]:
+    """Who is trained on and who is for testing; the others are left out."""
+    if not tests:
+        trains, tests = set(names[::EVERY]), set(names[EVERY // 2 :: EVERY])
+    both = list(zip(names, warps, strict=True))
+    return [(name, "train", warp) for name, warp in both if name in trains] + [(name, "test", warp) for name, warp in both if name in tests]
+
+
+def _of_capture(file: Path, name: str, split: Literal["train", "test"], time: float) -> Camera:
+    """nerfies' camera: a rotation of the world to the camera, the eye, and a lens, of which that project takes the focal length alone."""
+    data = read_json(file)
+    turn = rotation(present(data, "orientation", str(file)), f"{file}, orientation")
+    eye = numbers(present(data, "position", str(file)), (3,), f"{file}, position")
+    focal = positive(present(data, "focal_length", str(file)), f"{file}, focal_length")
+    sides = numbers(present(data, "image_size", str(file)), (2,), f"{file}, image_size").tolist()
+    width, height = (pixels(side, f"{file}, image_size") for side in sides)
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = turn, -turn @ eye
+    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat, name, split, time)

@@ -1,0 +1,104 @@
+"""At which size, and through which lens, other projects trained on the photographs of a scene."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from PIL import Image
+from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
+
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.scenes import load_scene, read_cameras, write_cameras
+from mipmap_plugin.wrap import placed
+
+EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+
+
+def of_gsplat(path, factor):
+    folder = gsplat_folder(path, splats(), normalized="false")
+    lines = [line for line in (folder / "cfg.yml").read_text().splitlines() if not line.startswith("data_factor")]
+    (folder / "cfg.yml").write_text("\n".join([*lines, f"data_factor: {factor}", ""]))
+    return load_model(folder)
+
+
+@pytest.mark.parametrize(("width", "factor", "actual"), [(1000, 3, (333, 250)), (1000, 3, (334, 250)), (1003, 7, (143, 107)), (64, 4, (16, 12))])
+def test_gsplat_divides_the_lens_and_then_fits_it_to_the_picture(tmp_path, width, factor, actual):
+    """examples/datasets/colmap.py: K over the factor, times the size of the first photograph over a size that was rounded down."""
+    [camera] = tiny.cameras(1, width=width, height=width * 3 // 4)
+    [new] = of_gsplat(tmp_path / "r", factor).as_trained([camera], Taken(smaller=lambda asked: actual if asked == factor else None))
+    floored = width // factor, width * 3 // 4 // factor
+    assert (new.width, new.height) == (int(floored[0] * (actual[0] / floored[0])), int(floored[1] * (actual[1] / floored[1])))
+    assert new.fx == pytest.approx(camera.fx / factor * actual[0] / floored[0], rel=1e-12)
+    assert new.cy == pytest.approx(camera.cy / factor * actual[1] / floored[1], rel=1e-12)
+
+
+def test_gsplat_without_photographs_rounds_as_its_resizing_does(tmp_path):
+    [camera] = tiny.cameras(1, width=1003, height=752)
+    [new] = of_gsplat(tmp_path / "r", 7).as_trained([camera], Taken())
+    assert (new.width, new.height) == (143, 107)
+
+
+def pictures(folder, size):
+    folder.mkdir(parents=True)
+    Image.fromarray(np.zeros((size[1], size[0], 3), np.uint8)).save(folder / "a.png")
+
+
+def transforms(folder, width=3300, height=2200, **facts):
+    pictures(folder / "images", (width, height))
+    frame = {"file_path": "images/a.png", "transform_matrix": [*EYE, [0, 0, 0, 1]]}
+    lens = {"w": width, "h": height, "fl_x": 2000.0, "fl_y": 2000.0, "cx": width / 2, "cy": height / 2}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": [frame], **facts}))
+    return load_scene(folder)
+
+
+def of_nerfstudio(path, scale=1.0, transform=EYE):
+    folder = splatfacto_folder(path, splats(), downscale="null")
+    (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": transform, "scale": scale}))
+    return load_model(folder)
+
+
+@pytest.mark.parametrize(("there", "factor"), [((), 1), ((2,), 2), ((2, 4), 4), ((4,), 1)])
+def test_nerfstudio_halves_as_far_as_there_are_copies(tmp_path, there, factor):
+    scene = transforms(tmp_path / "scene")
+    for each in there:
+        pictures(tmp_path / f"scene/images_{each}", (3300 // each, 2200 // each))
+    [camera] = placed(of_nerfstudio(tmp_path / "r"), scene).cameras
+    assert (camera.width, camera.fx) == (3300 // factor, 2000 / factor)
+
+
+def test_nerfstudio_cuts_sizes_off_and_not_the_lens(tmp_path):
+    scene = transforms(tmp_path / "scene", width=1701, height=1001)
+    pictures(tmp_path / "scene/images_2", (850, 500))
+    [camera] = placed(of_nerfstudio(tmp_path / "r"), scene).cameras
+    assert (camera.size, camera.fx, camera.cx) == ((500, 850), 1000.0, 1701 / 4)
+
+
+def test_old_data_of_nerfstudio_was_turned_without_saying_so(tmp_path):
+    """ns-process-data wrote no applied_transform at first; its parser assumes the usual one where there is a COLMAP model."""
+    usual = [[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
+    new = transforms(tmp_path / "new", applied_transform=usual)
+    (tmp_path / "old/colmap/sparse/0").mkdir(parents=True)
+    old, other = transforms(tmp_path / "old"), transforms(tmp_path / "other")
+    views = [placed(of_nerfstudio(tmp_path / f"r{i}"), scene).cameras[0].viewmat for i, scene in enumerate((new, old, other))]
+    assert torch.equal(views[0], views[1]) and not torch.allclose(views[0], views[2])
+
+
+def test_a_scale_that_was_applied_before_is_not_applied_again(tmp_path):
+    """nerfstudio saves its own scale times that of the file, whose poses have it already."""
+    shifted = [[1.0, 0, 0, 3], [0, 1, 0, 0], [0, 0, 1, 0]]
+    frame = {"file_path": "images/a.png", "transform_matrix": [*shifted, [0, 0, 0, 1]]}
+    scene = transforms(tmp_path / "scene", width=64, height=48, applied_scale=0.1, frames=[frame])
+    [camera] = placed(of_nerfstudio(tmp_path / "r", scale=0.5 * 0.1), scene).cameras
+    torch.testing.assert_close(camera.center, torch.tensor([1.5, 0.0, 0.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("options", "width"), [({"ds": 8, "fork": 2, "resolution": -1}, 618), ({"ds": 1, "fork": 2}, 4946), ({"ds": 8}, 4946)])
+def test_octree_gs_trains_on_the_folder_that_ds_names(tmp_path, options, width):
+    """scene/dataset_readers.py of Octree-GS; the option of the same name in Scaffold-GS changes nothing there."""
+    path = write_cameras(tmp_path / "cameras.json", tiny.cameras(1, width=4946, height=3286))
+    assert read_cameras(path, options)[0].width == width

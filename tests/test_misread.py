@@ -1,0 +1,157 @@
+"""Siblings of the families that are read, and side files: each is read for what it is, or refused by its name."""
+
+from __future__ import annotations
+
+import json
+
+import ply_files
+import pytest
+import torch
+from ply_files import splat_columns, write, write_model_folder, write_splats
+from torch_checkpoints import gsplat_folder, splats
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.cfg_args import read_cfg_args
+from mipmap_plugin.models.live import adopt
+
+COLUMNS = splat_columns(4, bands=0)
+ONE = COLUMNS["x"]
+LEVELS = {"level": ONE, "extra_level": ONE}
+
+
+def named(*names):
+    return dict.fromkeys(names, ONE)
+
+
+ANCHORS = named("x", "y", "z", *(f"f_offset_{i}" for i in range(3)), *(f"scale_{i}" for i in range(6)), *(f"rot_{i}" for i in range(4)))
+EXPLICIT = {**ANCHORS, **named("f_dc_0", "f_dc_1", "f_dc_2", "opacity")}
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [EXPLICIT, {**EXPLICIT, **LEVELS}, {**ANCHORS, "f_anchor_feat_0": ONE}, {**ANCHORS, **LEVELS, **named("f_anchor_feat_0", "opacity")}],
+    ids=["explicit", "explicit, levels", "anchors", "anchors, levels"],
+)
+def test_octree_anygs_is_refused_by_name(tmp_path, columns):
+    """Its explicit models have all columns of 3DGS, and others that make other splats of them."""
+    path = write(tmp_path / "a.ply", columns)
+    assert detect(path).family == "anygs"
+    with pytest.raises(CheckpointError, match="Octree-AnyGS"):
+        load_model(path)
+
+
+def test_no_file_with_a_fourth_scale_is_plain(tmp_path):
+    with pytest.raises(CheckpointError, match="scale_3"):
+        load_model(write(tmp_path / "a.ply", {**COLUMNS, "scale_3": ONE}))
+
+
+def test_hac_is_refused_by_name(tmp_path):
+    folder = write_model_folder(tmp_path / "m")
+    ply = folder / "point_cloud/iteration_7000/point_cloud.ply"
+    write(ply, {**ANCHORS, **named("f_anchor_feat_0", "opacity", "f_mask_0")})
+    torch.save({}, ply.with_name("checkpoint.pth"))
+    with pytest.raises(CheckpointError, match=r"HAC.*checkpoint\.pth"):
+        load_model(folder)
+
+
+def test_half_gaussians_are_refused_by_name(tmp_path):
+    columns = {name: column for name, column in COLUMNS.items() if name != "opacity"}
+    with pytest.raises(CheckpointError, match="3D-HGS"):
+        load_model(write(tmp_path / "a.ply", {**columns, **named("opacity1", "opacity2")}))
+
+
+def test_saga_is_told_which_file_is_its_scene(tmp_path):
+    folder = write_model_folder(tmp_path / "m")
+    ply = folder / "point_cloud/iteration_7000/point_cloud.ply"
+    scene = ply.rename(ply.with_name("scene_point_cloud.ply"))
+    with pytest.raises(CheckpointError, match=r"SAGA.*scene_point_cloud\.ply"):
+        load_model(folder)
+    assert len(load_model(scene)) == 5
+    features = {name: column for name, column in COLUMNS.items() if not name.startswith("f_")}
+    with pytest.raises(CheckpointError, match="SAGA"):
+        load_model(write(tmp_path / "contrastive_feature_point_cloud.ply", {**features, **named("f_0", "f_1")}))
+
+
+def test_a_4d_gaussian_splatting_checkpoint_has_its_own_sentence(tmp_path):
+    groups = [{"params": [0], "name": name} for name in ("xyz", "t", "scaling_t", "rotation_r")]
+    torch.save(((3, torch.zeros(2, 3), {"state": {}, "param_groups": groups}), 30_000), tmp_path / "chkpnt_best.pth")
+    with pytest.raises(CheckpointError, match="fudan-zvg"):
+        load_model(tmp_path / "chkpnt_best.pth")
+
+
+def test_a_hierarchy_has_its_own_sentence(tmp_path):
+    (tmp_path / "merged.hier").write_bytes(bytes(range(7)) * 9)
+    with pytest.raises(CheckpointError, match=r"Hierarchical 3D Gaussians.*trained_chunks"):
+        load_model(tmp_path / "merged.hier")
+
+
+@pytest.mark.parametrize("place", [".", "meta.json"])
+def test_pictures_of_gsplat_have_their_own_sentence(tmp_path, place):
+    facts = {name: {"shape": [4, 3], "dtype": "float32", "mins": [0, 0, 0], "maxs": [1, 1, 1]} for name in ("means", "scales", "quats")}
+    (tmp_path / "meta.json").write_text(json.dumps(facts))
+    with pytest.raises(CheckpointError, match=r"PngCompression.*ckpt_"):
+        load_model(tmp_path / place)
+
+
+def test_one_option_that_is_no_literal_costs_only_itself(tmp_path):
+    """argparse writes inf and nan, and objects, as no Python literal."""
+    options = "far=inf, white_background=True, where=PosixPath('a'), a=__import__('os'), resolution=2"
+    folder = write_model_folder(tmp_path / "m", cfg_args=f"Namespace({options})")
+    assert read_cfg_args(folder / "cfg_args") == {"white_background": True, "resolution": 2}
+    model = load_model(folder)
+    assert model.trained.background == (1.0, 1.0, 1.0) and model.trained.resolution == 2
+    assert any("far, where, a cannot be read" in note for note in model.notes)
+
+
+def test_that_antialiasing_is_unknown_is_said(tmp_path):
+    new = load_model(write_model_folder(tmp_path / "new", cfg_args="Namespace(sh_degree=3, depths='', train_test_exp=False)"))
+    old = load_model(write_model_folder(tmp_path / "old", cfg_args="Namespace(sh_degree=3)"))
+    tagged = write_splats(tmp_path / "tag" / "point_cloud.ply", comments=("SplatRenderMode: mip",))
+    (tagged.parent / "cfg_args").write_text("Namespace(sh_degree=3, train_test_exp=False)")
+    told = [any("--antialiasing" in note for note in model.notes) for model in (new, old, load_model(tagged.parent))]
+    assert told == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [("with_ut: true\nwith_eval3d: true", "with_ut, with_eval3d"), ("use_bilateral_grid: true", "grid"), ("post_processing: ppisp", "correction")],
+)
+def test_what_gsplat_does_otherwise_is_said(tmp_path, options, word):
+    folder = gsplat_folder(tmp_path / "r", splats())
+    plain = load_model(folder).notes
+    with (folder / "cfg.yml").open("a") as file:
+        file.write(f"\n{options}\n")
+    new = [note for note in load_model(folder).notes if note not in plain]
+    assert len(new) == 1 and word in new[0]
+
+
+def test_what_gsplat_left_off_is_not_said(tmp_path):
+    folder = gsplat_folder(tmp_path / "r", splats())
+    plain = load_model(folder).notes
+    with (folder / "cfg.yml").open("a") as file:
+        file.write("\nwith_ut: false\nuse_bilateral_grid: false\npost_processing: null\n")
+    assert load_model(folder).notes == plain
+
+
+class DeformableGaussianModel:
+    """Of Deformable 3D Gaussians: the tensors of 3DGS, without `capture`; the network is another object."""
+
+    def __init__(self):
+        raw = splats()
+        self._xyz, self._scaling, self._rotation, self._opacity = raw["means"], raw["scales"], raw["quats"], raw["opacities"][:, None]
+        self._features_dc, self._features_rest = raw["sh0"], raw["shN"]
+
+
+class InriaGaussianModel(DeformableGaussianModel):
+    def capture(self):
+        return ()
+
+
+def test_a_live_canonical_cloud_is_taken_with_a_note():
+    assert any("Deformable" in note for note in adopt(DeformableGaussianModel()).notes)
+    assert not any("Deformable" in note for note in adopt(InriaGaussianModel()).notes)
+
+
+def test_a_file_of_splats_is_still_one(tmp_path):
+    assert detect(ply_files.write_splats(tmp_path / "a.ply")).family == "3dgs"

@@ -1,0 +1,122 @@
+"""Cameras of DyNeRF and HyperNeRF scenes, where 4DGaussians takes them from, against its own arithmetic in NumPy."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from PIL import Image
+
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes import load_scene
+
+
+def poses(count=4):
+    """[count, 3, 4] camera to world with OpenGL axes, somewhere."""
+    views = tiny.cameras(count)
+    flip = np.diag([1.0, -1, -1, 1])
+    return np.stack([(np.linalg.inv(view.viewmat.numpy()) @ flip)[:3] for view in views])
+
+
+def dynerf(path, count=4, frames=0):
+    """poses_bounds.npy as LLFF writes it: axes down, right, backwards, the place, height, width and focal length; near and far."""
+    path.mkdir(parents=True)
+    p = poses(count)
+    size = np.broadcast_to(np.array([2028.0, 2704.0, 1460.0])[:, None], (count, 3, 1))
+    llff = np.concatenate([-p[..., 1:2], p[..., 0:1], p[..., 2:4], size], -1)
+    np.save(path / "poses_bounds.npy", np.concatenate([llff.reshape(count, 15), np.tile([1.0, 9.0], (count, 1))], 1))
+    for number in range(count):
+        (path / f"cam{number:02d}.mp4").touch()
+        for frame in range(frames):
+            (path / f"cam{number:02d}/images").mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path / f"cam{number:02d}/images/{frame:04d}.png")
+    return path
+
+
+def as_the_project_turns_them(pose):
+    """R and T of load_images_path, and getWorld2View2 of both."""
+    rotation = -pose[:3, :3]
+    rotation[:, 0] = -rotation[:, 0]
+    view = np.eye(4)
+    view[:3, :3], view[:3, 3] = rotation.T, -pose[:3, 3].dot(rotation)
+    return view
+
+
+def test_dynerf_cameras_are_those_of_its_loader(tmp_path):
+    scene = load_scene(dynerf(tmp_path / "s"))
+    tests, trains = scene.split("test"), scene.split("train")
+    assert len(tests) == len(trains) == 300
+    stored = np.load(tmp_path / "s/poses_bounds.npy")[:, :-2].reshape(-1, 3, 5)
+    turned = np.concatenate([stored[..., 1:2], -stored[..., :1], stored[..., 2:4]], -1)
+    for camera in (tests[7], trains[0], trains[150], trains[299]):
+        wanted = as_the_project_turns_them(turned[int(camera.name[3:5])])
+        assert np.allclose(camera.viewmat.numpy(), wanted, atol=1e-9)
+        assert (camera.width, camera.height, camera.fx, camera.time) == (1352, 1014, 730.0, int(camera.name[-4:]) / 300)
+    assert sorted(camera.time for camera in trains) == [frame / 300 for frame in range(300)]
+    assert {camera.name[:5] for camera in tests} == {"cam00"} and {camera.name[:5] for camera in trains} == {"cam01", "cam02", "cam03"}
+
+
+def test_dynerf_frames_that_were_extracted_go_with_their_cameras(tmp_path):
+    scene = load_scene(dynerf(tmp_path / "s", frames=3))
+    assert {path.relative_to(tmp_path / "s").as_posix() for path in scene.images.values()} == {
+        *(f"cam00/images/000{i}.png" for i in range(3)), "cam01/images/0000.png", "cam02/images/0001.png", "cam03/images/0002.png",
+    }  # fmt: skip
+
+
+def hypernerf(path, count=9, val=True, rgb=True):
+    (path / "camera").mkdir(parents=True)
+    names = [f"{number:06d}" for number in range(count)]
+    for name, pose in zip(names, poses(count), strict=True):
+        turn = (pose[:, :3] @ np.diag([1.0, -1, -1])).T
+        lens = {"focal_length": 500.0, "principal_point": [250.0, 310.0], "image_size": [536, 960], "pixel_aspect_ratio": 1.0, "skew": 0.0}
+        (path / f"camera/{name}.json").write_text(json.dumps({"orientation": turn.tolist(), "position": pose[:, 3].tolist(), **lens}))
+        if rgb:
+            (path / "rgb/2x").mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.zeros((480, 268, 3), np.uint8)).save(path / f"rgb/2x/{name}.png")
+    splits = {"train_ids": names[::2], "val_ids": names[1::2]} if val else {"train_ids": [], "val_ids": []}
+    (path / "dataset.json").write_text(json.dumps({"count": count, "ids": names, **splits}))
+    (path / "metadata.json").write_text(json.dumps({name: {"warp_id": i, "appearance_id": i, "camera_id": 0} for i, name in enumerate(names)}))
+    return path
+
+
+@pytest.mark.parametrize("rgb", [True, False])
+def test_hypernerf_cameras_are_those_of_its_loader(tmp_path, rgb):
+    scene = load_scene(hypernerf(tmp_path / "s", rgb=rgb))
+    assert [camera.name for camera in scene.split("test")] == ["000001", "000003", "000005", "000007"]
+    for number, pose in enumerate(poses(9)):
+        [camera] = [camera for camera in scene.cameras if int(camera.name) == number]
+        wanted = np.linalg.inv(np.vstack([pose @ np.diag([1.0, -1, -1, 1]), [0, 0, 0, 1]]))
+        assert np.allclose(camera.viewmat.numpy(), wanted, atol=1e-9)
+        assert (camera.width, camera.height, camera.fx, camera.cx, camera.time) == (268, 480, 250.0, 134.0, number / 8)
+        assert (camera in scene.images) == rgb
+
+
+def test_hypernerf_without_test_views_trains_on_every_fourth(tmp_path):
+    scene = load_scene(hypernerf(tmp_path / "s", val=False))
+    assert [int(camera.name) for camera in scene.split("train")] == [0, 4, 8]
+    assert [int(camera.name) for camera in scene.split("test")] == [2, 6]
+
+
+def test_broken_ones_are_refused_in_one_sentence(tmp_path):
+    path = dynerf(tmp_path / "d")
+    (path / "cam03.mp4").unlink()
+    with pytest.raises(SceneError, match=r"3 videos.*4 cameras"):
+        load_scene(path)
+    (path / "poses_bounds.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (900000000, 17), }\n")
+    with pytest.raises(SceneError, match="no array"):
+        load_scene(path)
+    path = hypernerf(tmp_path / "h")
+    (path / "camera/000004.json").write_text('{"orientation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}')
+    with pytest.raises(SceneError, match="orientation: is no rotation"):
+        load_scene(path)
+
+
+def test_a_moving_model_adapts_to_these_cameras_at_their_times(tmp_path):
+    """Adaptation takes the time of a view as it is."""
+    from mipmap_plugin.adaptation.views import with_times
+
+    views, told = with_times(load_scene(dynerf(tmp_path / "s")).split("train"), seed=0)
+    assert told == "at their own times" and torch.tensor([view.time for view in views]).unique().numel() == 300
