@@ -24,16 +24,18 @@ from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
 from mipmap_plugin.adaptation.resume import Keeper
+from mipmap_plugin.adaptation.state_file import StateFile
 from mipmap_plugin.adaptation.views import choose_views, evenly, with_times
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects, explain
-from mipmap_plugin.files import write_json
+from mipmap_plugin.files import together, write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of, exposures_of
 from mipmap_plugin.models.exposure import exposed
+from mipmap_plugin.models.outputs import REPORT
 
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
@@ -50,7 +52,7 @@ class Adapted:
     report: Report
     backend: Backend
     effects: Effects
-    state: Path | None = None  # of the run, which is of use until the model is saved
+    state: StateFile | None = None  # of the run, which is of use until the model is saved
 
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False) -> Rendered:
         """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`."""
@@ -58,10 +60,11 @@ class Adapted:
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
-        saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
-        write_json(saved.with_name(saved.name + ".adaptation.json"), self.report.model_dump(), overwrite=True)
+        with together(Path(path)):  # no new model without its report
+            saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
+            write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=True)
         if self.state is not None:
-            self.state.unlink(missing_ok=True)
+            self.state.remove()
         return saved
 
 
@@ -94,6 +97,7 @@ class Session:
             self.views = evenly(self.views, config.upsampled_views)
             self.which += f", {len(self.views)} of them upsampled"
         self.seconds = {"optimization": 0.0}
+        self.state: StateFile | None = None
         self.peak = Peak(self.base.parameters()["means"].device)
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
@@ -110,9 +114,7 @@ class Session:
         ended_by = "scale 1, at which the base is right as it is" if nothing_to_do else "0 steps"
         if self.config.steps and not nothing_to_do:
             curve, ended_by = self._optimize(student, resume, observe)
-        else:
-            resume = None  # whatever run it is of
-        return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects, resume)
+        return Adapted(student, self._report(student, curve, ended_by), self.backend, self.effects, self.state)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[list[CurvePoint], str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists; the curve and what ended it."""
@@ -135,6 +137,7 @@ class Session:
                 observe(run.step, before + run.watch.seconds, lambda camera: self._render(run.student.gaussians(camera), camera))
 
         ended_by = adapt(run, task, self.config, keeper.stop, look)
+        self.state = keeper.left()
         self.seconds["optimization"] = run.watch.seconds
         self.seconds["total"] += run.watch.seconds
         return run.curve, ended_by + verdict(run)

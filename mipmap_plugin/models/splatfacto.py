@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import CheckpointError, OutputError, SceneError, ShapeError
-from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
+from mipmap_plugin.files import new_folder, sha256
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import C0
 from mipmap_plugin.models.detect import RESULTS, detect
@@ -56,14 +56,18 @@ class SplatfactoHost:
         training cannot go on from it after splats were removed. Raises OutputExists, OutputError.
         """
         if path.suffix == ".ckpt":
-            _refuse_to_confuse(path)
             return save_torch(path, self._content(parameters, comments), overwrite=overwrite)
-        refuse_to_lose(path, self.folder, holds=PLACE)
         within = Path(PLACE, f"step-{self.step:09d}.ckpt")
         with new_folder(path, overwrite) as fresh:
             save_torch(fresh / within, self._content(parameters, comments), overwrite=False)
             self._write_companions(fresh, path.name, render_mode(comments) or "classic")
         return path / within
+
+    def holds(self, path: Path) -> str | None:
+        if path.suffix != ".ckpt":
+            return PLACE
+        _refuse_to_confuse(path)
+        return None
 
     def as_trained(self, cameras: Sequence[Camera], points: Tensor | None, means: Tensor) -> list[Camera]:
         """Moved by dataparser_transforms.json, and at the size that nerfstudio shrinks large photographs to. Raises SceneError."""

@@ -23,6 +23,7 @@ from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposure
 from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
+from mipmap_plugin.models.outputs import finite, refuse_parts
 from mipmap_plugin.models.ply import read_ply, write_ply
 from mipmap_plugin.models.tags import render_mode, with_tags
 
@@ -157,13 +158,15 @@ class VanillaModel:
 
         A model from another project's file goes back into one (`Host.write`). A folder of 3DGS repeats the iteration, cfg_args,
         cameras and exposures that the model came with; `companions` adds to it what else a family keeps around the PLY that
-        it is given. Raises OutputExists, and OutputError when the disk refuses.
+        it is given. Raises OutputExists, OutputError when the disk refuses, and SettingsError for splats that are not finite.
         """
         path = Path(path)
+        self.refuse_output(path, overwrite=overwrite)
+        parameters = finite(self._parameters, LARGEST)
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
         if self._origin.host and path.suffix.lower() != ".ply":
-            return self._origin.host.write(path, self._parameters, comments, overwrite=overwrite)
-        columns = {**to_columns(self._parameters), **self._origin.extras}
+            return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
+        columns = {**to_columns(parameters), **self._origin.extras}
         if path.suffix.lower() == ".ply":
             return write_ply(path, columns, comments, overwrite=overwrite)
 
@@ -173,6 +176,12 @@ class VanillaModel:
 
         cfg_args = cfg_args_for(self.folder, path, self.trained, self.sh_degree)
         return write_folder(path, self.folder, cfg_args, self._origin.iteration, overwrite, write)
+
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
+        """What `save` would refuse about `path`, before anything is done for it. Raises OutputExists, OutputError."""
+        host = None if path.suffix.lower() == ".ply" else self._origin.host
+        holds = host.holds(path) if host else None if path.suffix.lower() == ".ply" else "point_cloud"
+        refuse_parts(path, overwrite, self.source, self.folder, holds)
 
     def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
         """[N], 0..1, without gradient; the same for all views."""

@@ -1,0 +1,137 @@
+"""Killed before any call that changes the file system: the old or the new output is there, whole, and the next run leaves nothing else."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from contextlib import suppress
+from itertools import count
+from pathlib import Path
+
+import kill_points
+import pytest
+import tiny
+from corpus import SAMPLES
+from test_interruptions import WRITERS, adapted, contents
+
+from mipmap_plugin import staging
+from mipmap_plugin.adaptation import resume
+from mipmap_plugin.models import load_model
+from mipmap_plugin.wrap import wrap_model
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+
+# The others only now and then: how an output takes its place does not depend on the family.
+ALWAYS = ["ply", "cfg_args"]
+LONE = [name for name in WRITERS if SAMPLES[name].damaged.endswith((".ply", "opacity_mlp.pt"))]
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c_is_heard():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def visible(folder: Path) -> dict[str, str]:
+    return {name: digest for name, digest in contents(folder).items() if not name.startswith(".")}
+
+
+class Replacing:
+    """A saved output that another model replaces, as often as one likes."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        base = SAMPLES[name].make(folder / "base")
+        self.models = [adapted(base, scale) for scale in (1 / 2, 1 / 4)]
+        self.out = folder / "out" / ("new.ply" if base.suffix == ".ply" else "new")
+        self.models[1].save(self.out)
+        self.new = contents(self.out.parent)
+        shutil.rmtree(self.out.parent)
+        self.models[0].save(self.out)
+        self.old = contents(self.out.parent)
+        assert self.old != self.new
+        self._kept = shutil.copytree(self.out.parent, folder / "kept")
+
+    def __call__(self) -> None:
+        self.models[1].save(self.out, overwrite=True)
+
+    def again(self) -> None:
+        shutil.rmtree(self.out.parent)
+        shutil.copytree(self._kept, self.out.parent)
+
+    def check(self) -> None:
+        """Whole at once where it is one file or one folder, and else when it is loaded; after the next run nothing else is there."""
+        if self.out.is_dir():
+            assert visible(self.out.parent) in (self.old, self.new)
+        assert load_model(self.out)
+        assert visible(self.out.parent) in (self.old, self.new)
+        self()
+        assert contents(self.out.parent) == self.new
+        assert not [path for path in self.out.parent.rglob("*") if path.name.startswith(".")]
+
+
+def at_every_point(replacing: Replacing, broken_off) -> int:
+    for number in count(1):
+        replacing.again()
+        if not broken_off(number, replacing):
+            return number - 1
+        replacing.check()
+
+
+@pytest.mark.parametrize("name", [*ALWAYS, *(pytest.param(name, marks=pytest.mark.slow) for name in WRITERS if name not in ALWAYS)])
+@pytest.mark.parametrize("how", ["killed", "interrupted"])
+def test_saving_broken_off_at_any_point_leaves_the_old_or_the_new_output(tmp_path, name, how):
+    assert at_every_point(Replacing(tmp_path, name), getattr(kill_points, how)) > 10
+
+
+@pytest.mark.parametrize("name", ["cfg_args", *(pytest.param(name, marks=pytest.mark.slow) for name in WRITERS if name not in LONE + ["cfg_args"])])
+def test_where_folders_cannot_be_exchanged_the_next_run_finishes_the_move(tmp_path, name, monkeypatch):
+    monkeypatch.setattr(staging, "exchange", lambda one, other: False)
+    replacing = Replacing(tmp_path, name)
+    for number in count(1):
+        replacing.again()
+        if not kill_points.killed(number, replacing):
+            break
+        assert load_model(replacing.out)
+        assert visible(replacing.out.parent) in (replacing.old, replacing.new)
+        replacing()
+        assert contents(replacing.out.parent) == replacing.new
+    assert number > 10
+
+
+def without_report(found: dict[str, str]) -> dict[str, str]:
+    """Which tells seconds."""
+    return {name: digest for name, digest in found.items() if not name.endswith(".adaptation.json")}
+
+
+class Adapting:
+    """A whole run, its state kept at every step, that saves to one output."""
+
+    def __init__(self, folder: Path, name: str) -> None:
+        self.base = SAMPLES[name].make(folder / "base")
+        self.out = folder / "out" / ("new.ply" if self.base.suffix == ".ply" else "new")
+        self.state = self.out.with_name(self.out.name + ".resume")
+
+    def __call__(self) -> None:
+        model = wrap_model(self.base, cameras=tiny.cameras(2, width=8, height=6), backend="reference")
+        model.adapt(1 / 2, steps=2, extra_views=0, views_per_step=1, resume=self.state).save(self.out, overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["ply", *(pytest.param(name, marks=pytest.mark.slow) for name in WRITERS if name != "ply")])
+def test_a_run_killed_at_any_point_is_finished_by_the_same_command(tmp_path, monkeypatch, name, request):
+    """By default at every seventh point."""
+    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    adapting = Adapting(tmp_path, name)
+    adapting()
+    whole = without_report(contents(adapting.out.parent))
+    step = 1 if request.node.get_closest_marker("slow") else 7
+    for number in count(1, step):
+        with suppress(FileNotFoundError):
+            shutil.rmtree(adapting.out.parent)
+        if not kill_points.killed(number, adapting):
+            break
+        adapting()
+        assert without_report(contents(adapting.out.parent)) == whole
+        assert not [path for path in adapting.out.parent.rglob("*") if path.name.startswith(".")]
+    assert number > 10
