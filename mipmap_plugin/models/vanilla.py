@@ -246,7 +246,7 @@ def without_poison(model: VanillaModel) -> VanillaModel:
     if not health.poisonous.any():
         return model
     if health.poisonous.all():
-        raise CheckpointError(f"{model.source}: none of its {health.splats:,} splats is finite; the training or the export failed")
+        raise CheckpointError(f"{model.source or 'this model'}: none of its {health.splats:,} splats is finite; the training or the export failed")
     model = drop(model, health.poisonous)
     reasons = health.non_finite() or [f"they were not finite once activated, or above {LARGEST:g}"]
     model.notes.append("found while loading: " + "; ".join(reasons))

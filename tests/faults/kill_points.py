@@ -34,29 +34,21 @@ class Before:
             self._act()
 
 
-def killed(number: int, job: Callable[[], Any]) -> bool:
-    """Run `job` in a process of its own, killed before its call `number`; False where it ended before."""
+def killed(number: int, job: Callable[[], Any], by: int = signal.SIGKILL) -> bool:
+    """Run `job` in a process of its own that gets the signal `by` before its call `number`; False where it ended before."""
     child = os.fork()
     if child == 0:
+        code = 3
         try:
-            sys.setprofile(Before(number, lambda: os.kill(os.getpid(), signal.SIGKILL)))
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
+            sys.setprofile(Before(number, lambda: signal.raise_signal(by)))
             job()
             sys.setprofile(None)
-            os._exit(0)
+            code = 0
+        except KeyboardInterrupt:
+            code = 130
         finally:
-            os._exit(3)
+            os._exit(code)
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    assert status in (0, -signal.SIGKILL), f"the job itself failed ({status})"
+    assert status in (0, 130, -signal.SIGKILL), f"the job itself failed ({status})"
     return status != 0
-
-
-def interrupted(number: int, job: Callable[[], Any]) -> bool:
-    """Run `job` here, with Ctrl-C before its call `number`; False where it ended before."""
-    sys.setprofile(Before(number, lambda: signal.raise_signal(signal.SIGINT)))
-    try:
-        job()
-        return False
-    except KeyboardInterrupt:
-        return True
-    finally:
-        sys.setprofile(None)

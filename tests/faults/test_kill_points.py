@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from contextlib import suppress
+from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import kill_points
 import pytest
@@ -22,16 +23,21 @@ from mipmap_plugin.wrap import wrap_model
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 
-# The others only now and then: how an output takes its place does not depend on the family.
-ALWAYS = ["ply", "cfg_args"]
+# By default one call in as many; no divisor of the calls that a file takes, so that in the end each kind has its turn.
+FEW = 7
+
 LONE = [name for name in WRITERS if SAMPLES[name].damaged.endswith((".ply", "opacity_mlp.pt"))]
+FOLDERS = [name for name in WRITERS if name not in LONE]
 
 
-@pytest.fixture(autouse=True)
-def ctrl_c_is_heard():
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
+def numbers(request: pytest.FixtureRequest, few: int = FEW) -> Iterator[int]:
+    """Of the calls to be broken off at: each in the slow tests, and else one in `few`, which is fast."""
+    return count(1, 1 if request.node.get_closest_marker("slow") else few)
+
+
+def some(names: list[str], by_default: list[str]) -> list[Any]:
+    """A few families at a few points by default, and all of them at every point."""
+    return [*by_default, *(pytest.param(name, marks=pytest.mark.slow, id=f"{name}, every point") for name in names)]
 
 
 def visible(folder: Path) -> dict[str, str]:
@@ -60,9 +66,9 @@ class Replacing:
         shutil.rmtree(self.out.parent)
         shutil.copytree(self._kept, self.out.parent)
 
-    def check(self) -> None:
-        """Whole at once where it is one file or one folder, and else when it is loaded; after the next run nothing else is there."""
-        if self.out.is_dir():
+    def check(self, at_once: bool = True) -> None:
+        """Whole at once where it is one folder, and else when it is loaded; after the next run nothing else is there."""
+        if at_once and self.out.is_dir():
             assert visible(self.out.parent) in (self.old, self.new)
         assert load_model(self.out)
         assert visible(self.out.parent) in (self.old, self.new)
@@ -71,33 +77,28 @@ class Replacing:
         assert not [path for path in self.out.parent.rglob("*") if path.name.startswith(".")]
 
 
-def at_every_point(replacing: Replacing, broken_off) -> int:
-    for number in count(1):
+@pytest.mark.parametrize("name", some(WRITERS, ["ply", "cfg_args"]))
+@pytest.mark.parametrize("by", [signal.SIGKILL, signal.SIGINT])
+def test_saving_broken_off_leaves_the_old_or_the_new_output(tmp_path, name, by, request):
+    replacing = Replacing(tmp_path, name)
+    for number in numbers(request):
         replacing.again()
-        if not broken_off(number, replacing):
-            return number - 1
+        if not kill_points.killed(number, replacing, by):
+            break
         replacing.check()
+    assert number > 20
 
 
-@pytest.mark.parametrize("name", [*ALWAYS, *(pytest.param(name, marks=pytest.mark.slow) for name in WRITERS if name not in ALWAYS)])
-@pytest.mark.parametrize("how", ["killed", "interrupted"])
-def test_saving_broken_off_at_any_point_leaves_the_old_or_the_new_output(tmp_path, name, how):
-    assert at_every_point(Replacing(tmp_path, name), getattr(kill_points, how)) > 10
-
-
-@pytest.mark.parametrize("name", ["cfg_args", *(pytest.param(name, marks=pytest.mark.slow) for name in WRITERS if name not in LONE + ["cfg_args"])])
-def test_where_folders_cannot_be_exchanged_the_next_run_finishes_the_move(tmp_path, name, monkeypatch):
+@pytest.mark.parametrize("name", some(FOLDERS, ["cfg_args"]))
+def test_where_folders_cannot_be_exchanged_the_next_run_finishes_the_move(tmp_path, name, monkeypatch, request):
     monkeypatch.setattr(staging, "exchange", lambda one, other: False)
     replacing = Replacing(tmp_path, name)
-    for number in count(1):
+    for number in numbers(request):
         replacing.again()
         if not kill_points.killed(number, replacing):
             break
-        assert load_model(replacing.out)
-        assert visible(replacing.out.parent) in (replacing.old, replacing.new)
-        replacing()
-        assert contents(replacing.out.parent) == replacing.new
-    assert number > 10
+        replacing.check(at_once=False)
+    assert number > 20
 
 
 def without_report(found: dict[str, str]) -> dict[str, str]:
@@ -118,20 +119,17 @@ class Adapting:
         model.adapt(1 / 2, steps=2, extra_views=0, views_per_step=1, resume=self.state).save(self.out, overwrite=True)
 
 
-@pytest.mark.parametrize("name", ["ply", *(pytest.param(name, marks=pytest.mark.slow) for name in WRITERS if name != "ply")])
+@pytest.mark.parametrize("name", some(WRITERS, ["ply"]))
 def test_a_run_killed_at_any_point_is_finished_by_the_same_command(tmp_path, monkeypatch, name, request):
-    """By default at every seventh point."""
     monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
     adapting = Adapting(tmp_path, name)
     adapting()
     whole = without_report(contents(adapting.out.parent))
-    step = 1 if request.node.get_closest_marker("slow") else 7
-    for number in count(1, step):
-        with suppress(FileNotFoundError):
-            shutil.rmtree(adapting.out.parent)
+    for number in numbers(request, few=17):
+        shutil.rmtree(adapting.out.parent, ignore_errors=True)
         if not kill_points.killed(number, adapting):
             break
         adapting()
         assert without_report(contents(adapting.out.parent)) == whole
         assert not [path for path in adapting.out.parent.rglob("*") if path.name.startswith(".")]
-    assert number > 10
+    assert number > 20
