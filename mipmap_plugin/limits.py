@@ -13,7 +13,7 @@ from mipmap_plugin.errors import SettingsError
 # Zooms beyond these show nothing: a photograph would be a fraction of a pixel, or its one pixel larger than any screen.
 LEAST_SCALE, MOST_SCALE = 1e-4, 1e4
 
-# Seeds above it fit no generator of random numbers, those that are derived by counting on included.
+# Seeds above it fit no generator of random numbers.
 MOST_SEED = 2**63 - 1
 
 # Bytes of a pixel at least, while an image is drawn: three 32-bit colors, the transmittance, and their copies.
@@ -25,6 +25,11 @@ def check_scale(scale: float) -> float:
     if not LEAST_SCALE <= scale <= MOST_SCALE:  # nor is a NaN
         raise SettingsError(f"scale {scale:g} is no zoom; give a number from {LEAST_SCALE:g} to {MOST_SCALE:g}, such as 0.25 or 4")
     return scale
+
+
+def mixed(seed: int, number: int) -> int:
+    """The seed of a run's draw `number`; by a prime, so that those of different runs do not meet."""
+    return (seed * 1_000_003 + number) % (MOST_SEED + 1)
 
 
 def check_background(background: Sequence[float]) -> tuple[float, float, float]:
