@@ -51,6 +51,11 @@ def check_image(width: int, height: int, device: torch.device | str = "cpu", byt
         raise SettingsError(f"{told}, and this machine has {held / 2**30:,.1f}; ask for a smaller scale, or give smaller cameras")
 
 
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether a library says in its own way that the memory does not suffice."""
+    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (isinstance(error, RuntimeError) and "allocate memory" in str(error))
+
+
 def memory(device: torch.device) -> float:
     """Bytes of a device's memory; infinite where the system does not tell."""
     if device.type == "cuda":

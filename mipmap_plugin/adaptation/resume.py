@@ -114,6 +114,9 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
 
 def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) -> Run:
     """The run of a state that `save_run` wrote, over `student`'s own parameters."""
+    for name, kind in (("step", int), ("seconds", float), ("square_error", float), ("rows_changed", bool)):
+        if not isinstance(state[name], kind):
+            raise TypeError(f"its {name} is no {kind.__name__}")
     device = student.parameters()["means"].device
     # On a GPU light is summed in any order, so that merging anew may leave a splat more or less than it did.
     if state["rows_changed"] or state["parameters"]["means"].shape != student.parameters()["means"].shape:
