@@ -86,7 +86,7 @@ class SplatfactoHost:
         try:
             facts = json.loads(file.read_text(encoding="utf-8"))
             scale, transform = float(facts["scale"]), torch.tensor(facts["transform"], dtype=torch.float64)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
             advice = "without it the cameras of the scene cannot be placed; copy it from the folder of the training"
             raise SceneError(f"{file} cannot be read ({error}): {advice}") from error
         if tuple(transform.shape) != (3, 4) or not scale > 0:

@@ -47,8 +47,8 @@ def read_image(path: str | Path, background: Sequence[float]) -> Tensor:
                 gray = torch.from_numpy(np.asarray(image).astype(np.float32)) / 65535
                 return gray[..., None].expand(-1, -1, 3).contiguous()
             pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-        except UNREADABLE as error:
-            raise SceneError(f"{path}: the image is damaged ({error}); download or export it again") from error
+        except Exception as error:  # a damaged file fails in as many ways as Pillow has decoders
+            raise SceneError(f"{path}: the image is damaged ({str(error) or type(error).__name__}); download or export it again") from error
     if pixels.shape[2] == 4:
         pixels = composite(pixels, background)
     return torch.from_numpy(pixels.astype(np.float32)).div_(255)

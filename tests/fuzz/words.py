@@ -25,12 +25,14 @@ SOUND = [
     "backends --json",
 ]
 
-VALUES = [
-    *("0", "-1", "nan", "inf", "1e5", "1e308", "1e-50", "1/0", "1/4", "2", "8", "1.5", "18446744073709551616", "", "x", "é" * 300, "y" * 5000),
-    *("\x1b[2J", "a\0b", "white", "classic", "instant", "paper", "P3", "cpu", "reference", "view_1", "--json", "--overwrite", "--depth", "--what"),
+NUMBERS = ["0", "-1", "nan", "inf", "1e5", "1e308", "1e-50", "1/0", "1/4", "2", "8", "1.5", "18446744073709551616"]
+PATHS = [
     *("base.ply", "soft.ply", "hard.ply", "model", "model/cfg_args", "model/cameras.json", "model/point_cloud", "anchors", "moving", "scene"),
     *("scene/test/view_0.png", "/dev/null", "/dev/zero", "pipe", "loop", "dangling", "nothing/at/all", "base.ply/below", ".", "..", "full", "text"),
+    *("out.ply", "new.ply", "out", "anchors/point_cloud/iteration_30000/new.ply", "z" * 250, "z" * 5000 + ".ply", "a\0b"),
 ]
+OTHERS = ["", "x", "é" * 300, "\x1b[2J", "white", "classic", "instant", "paper", "P3", "cpu", "reference", "view_1"]
+FLAGS = ["--json", "--overwrite", "--depth", "--normals", "--exposure", "--filter-3d", "--what"]
 
 # Words without which a command takes minutes, as it should.
 KEPT = {"--steps", "--recipe", "instant", "--backend", "reference", "gpu", "1"}
@@ -53,6 +55,12 @@ def prepare(folder: Path) -> None:
     (folder / "text").write_text("text")
 
 
+def instead(word: str, rng: random.Random) -> str:
+    """Another word, as a rule of the same kind."""
+    kinds = [kind for kind in (NUMBERS, PATHS, OTHERS, FLAGS) if word in kind or (kind is NUMBERS and word[:1].isdigit())]
+    return rng.choice((kinds or [PATHS])[0] if rng.random() < 0.8 else rng.choice([NUMBERS, PATHS, OTHERS, FLAGS]))
+
+
 def words(rng: random.Random) -> list[str]:
     """A sound command, of which up to three words are others, doubled or missing."""
     chosen = rng.choice(SOUND).split()
@@ -63,7 +71,7 @@ def words(rng: random.Random) -> list[str]:
         if kind == 0 and at < len(chosen) and not kept:
             chosen.pop(at)
         elif kind == 1:
-            chosen.insert(at, rng.choice(VALUES))
-        elif at < len(chosen) and not kept:
-            chosen[at] = rng.choice(VALUES)
+            chosen.insert(at, rng.choice(FLAGS if rng.random() < 0.8 else PATHS))
+        elif at < len(chosen) and not kept and (not chosen[at].startswith("--") or rng.random() < 0.1):
+            chosen[at] = instead(chosen[at], rng)
     return chosen
