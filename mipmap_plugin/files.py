@@ -110,7 +110,8 @@ def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_
     if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
         raise OutputExists(f"{path} is {kind_of_node(found)}, which is never replaced; choose another path")
     if any(os.path.samestat(found, each) for file in base for each in _around(file, stat.S_ISDIR(found.st_mode))):
-        raise OutputExists(f"{path} is the base checkpoint itself, or holds it, or a part of it, which is never replaced; choose another path")
+        told = "holds the base checkpoint itself" if stat.S_ISDIR(found.st_mode) else "is the base checkpoint itself, or a part of it"
+        raise OutputExists(f"{path} {told}, which is never replaced; choose another path")
     if is_file and stat.S_ISDIR(found.st_mode):
         raise OutputExists(f"{path} is a folder, which no file replaces; choose the path of a file")
     if not overwrite:

@@ -10,8 +10,9 @@ import torch
 
 from mipmap_plugin.errors import SettingsError
 
-# Zooms beyond these show nothing: a photograph would be a fraction of a pixel, or its one pixel larger than any screen.
-LEAST_SCALE, MOST_SCALE = 1e-4, 1e4
+# Zooms beyond these show nothing, and splats as large as their pixels leave the range that is read (`models.health.LARGEST`): a photograph
+# would be far below a pixel, or one of its pixels larger than any screen.
+LEAST_SCALE, MOST_SCALE = 1e-9, 1e4
 
 # Seeds above it fit no generator of random numbers.
 MOST_SEED = 2**63 - 1

@@ -150,4 +150,5 @@ def _read(path: Path) -> Any:
     try:
         return load_torch(path)
     except CheckpointError as error:
-        raise SettingsError(f"{path}: this is not the state of an interrupted run; delete it to start anew ({error})") from error
+        kind = type(error.__cause__ or error).__name__
+        raise SettingsError(f"{path}: this is not the state of an interrupted run ({kind}); delete it to start anew") from error

@@ -58,8 +58,7 @@ def adapt(
         json: Print the reports as JSON.
     """
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
-    limits = dict(steps=steps, time_budget_s=time_budget_s, target_db=target_db)
-    chosen: dict[str, Any] = dict(views=views, resize=resize, upsampler=upsampler, **limits)
+    chosen: dict[str, Any] = dict(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     settings = {name: value for name, value in chosen.items() if value is not None}
     scales = each_once(scale)
     targets = [adapted_path(checkpoint, output, each, len(scales) > 1) for each in scales]

@@ -14,7 +14,7 @@ from torch import Tensor
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.files import new_file
 from mipmap_plugin.models.magic import read_head
-from mipmap_plugin.models.pickles import refuse_hostile
+from mipmap_plugin.models.pickles import MOST_PACKED, refuse_hostile
 
 # What a NumPy scalar is pickled as, by NumPy 2 and by NumPy 1; learning-rate schedulers leave such scalars in checkpoints.
 _SCALAR: Any = np.float64(0).__reduce__()[0]
@@ -44,7 +44,7 @@ def load_torch(path: Path) -> Any:
         for tensor in _tensors(content):
             _refuse_unusual(tensor)
             storages[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
-        if sum(storages.values()) > path.stat().st_size:
+        if sum(storages.values()) > MOST_PACKED * path.stat().st_size:
             raise ValueError("its tensors claim more numbers than the file holds")
         return content
     except Exception as error:  # a damaged or hostile pickle may fail in any way
