@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import SettingsError, ShapeError
+from mipmap_plugin.limits import check_scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +55,9 @@ class Camera:
         """The same view sampled `factor` times more densely per axis.
 
         Width and height are rounded as Pillow users do, and the focal lengths follow each axis' true factor, so
-        that the field of view is exactly kept.
+        that the field of view is exactly kept. Raises SettingsError for a factor that is no zoom.
         """
+        check_scale(factor)
         resized = self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
         return replace(resized, zoom=self.zoom * factor)
 

@@ -17,6 +17,7 @@ from mipmap_plugin.commands.inspect import inspect
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.limits import is_out_of_memory
 
 app = tyro.extras.SubcommandApp()
 for command in (inspect, adapt, render, evaluate, tradeoff, backends, demo):
@@ -30,6 +31,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             app.cli(prog="mipmap-plugin", description="Make a Gaussian-splatting checkpoint look right at another zoom.", args=arguments)
     except (MipmapPluginError, OSError) as error:
         print(f"mipmap-plugin: {error}", file=sys.stderr)
+        return 2
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        print("mipmap-plugin: the memory does not suffice; ask for a smaller scale, fewer views or smaller cameras", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
         print(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}", file=sys.stderr)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.limits import MOST_SEED
 
 ResizeFilter = Literal["box", "area", "bilinear", "pil-bicubic", "lanczos"]
 ViewPolicy = Literal["given", "train", "test", "orbit", "jittered"]
@@ -18,7 +19,7 @@ Momentum = Annotated[float, Field(ge=0, lt=1)]
 class LearningRates(BaseModel):
     """Adam's step for each raw parameter, named as in a gsplat checkpoint. 0 keeps a parameter where it is."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     means: float = Field(0.0, ge=0, description="Target pixels at the median splat: in a scene of any size a step is as large on the screen.")
     scales: float = Field(0.005, ge=0, description="Of the log scales.")
@@ -34,7 +35,7 @@ class LearningRates(BaseModel):
 class AdaptConfig(BaseModel):
     """How one checkpoint is adapted to one scale."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     recipe: Recipe = Field("default", description="The name of the set that these settings started from.")
     steps: int = Field(1000, ge=0, description="Optimizer steps at most.")
@@ -43,7 +44,7 @@ class AdaptConfig(BaseModel):
     patience: int | None = Field(None, gt=0, description="Stop at the knee: after this many checks in a row that gained less than `min_gain_db`.")
     min_gain_db: float = Field(0.05, ge=0, description="Gain in dB between two checks that still pays.")
     check_every: int = Field(50, gt=0, description="Steps between two points of the curve.")
-    seed: int = Field(0, ge=0, description="Everything random follows from it.")
+    seed: int = Field(0, ge=0, le=MOST_SEED, description="Everything random follows from it.")
 
     resize: ResizeFilter = Field("pil-bicubic", description="How the base image is made smaller; the filter of the protocol that is aimed at.")
     upsampler: str = Field("bicubic", description="How the base image is made larger, by name in the registry.")

@@ -22,13 +22,16 @@ from mipmap_plugin.config import AdaptConfig, Recipe
 from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
+from mipmap_plugin.files import refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.limits import check_background, check_image, check_scale
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel, TrainedScale, exposures_of, same_for_all_views
 from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
+from mipmap_plugin.models.outputs import REPORT, parts_of
 from mipmap_plugin.scenes import Scene, model_cameras
 from mipmap_plugin.viewers import find_viewer
 
@@ -95,6 +98,8 @@ class Wrapped:
         photograph that `camera` is named after, as the checkpoint's exposure.json has it. Raises SettingsError where it has none.
         `viewer`: the view as that viewer draws it, instead of `screen_filter`.
         """
+        check_scale(scale)
+        check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
         effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(outputs), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if filter_3d else None
@@ -131,8 +136,7 @@ class Wrapped:
         `images`: a scene whose training images are the truth of a zoom-in, instead of what the base shows of them.
         Raises SettingsError and BackendUnavailable.
         """
-        if not 0 < scale < float("inf"):
-            raise SettingsError(f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4")
+        check_scale(scale)
         if not hasattr(self.model, "rebuild") and settings.setdefault("merge_to", 1.0) < 1:
             raise SettingsError(f"{self.model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
         if images is not None and exposures_of(self.model).changed:
@@ -144,8 +148,23 @@ class Wrapped:
         target = self._target(viewer)
         needs = replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings)
         backend, why = choose_backend(self._backend, replace(needs, gradients=config.steps > 0 or config.merge_to < 1))
+        if config.steps:
+            largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
+            check_image(largest.width, largest.height, self.model.parameters()["means"].device)
         base = Base(self.model, self.effects(), target, viewer, backend, why, not backend.lacking(needs))
         return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
+
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True) -> None:
+        """Raise what saving an adapted model to `path` would raise at the end, as far as it can be known, before any work."""
+        report, source = path.with_name(path.name + REPORT), self.model.source
+        parts = parts_of(source, self.model.folder)
+        if hasattr(self.model, "refuse_output"):
+            self.model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
+        else:
+            refuse_output(path, overwrite, parts)
+        for beside in (report, state_path(path)):
+            refuse_output(beside, True, parts, is_file=True)
+        refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 
     def _target(self, viewer: str | None) -> Effects:
         """How the adapted file is rendered. Raises SettingsError for a viewer that does not open the files of this family."""
@@ -194,8 +213,9 @@ def wrap_model(
     with, where its files do not say ("classic", "antialiased", "mip", "analytic"). Raises CheckpointError, SceneError, and
     SettingsError for an unknown filter or an object that is no model.
     """
+    color = None if background is None else check_background(background)
     model = _loaded(model, backend) if isinstance(model, (str, Path)) else adopt(model)
-    trained = replace(model.trained, background=background or model.trained.background)
+    trained = replace(model.trained, background=color or model.trained.background)
     if screen_filter is not None:
         if screen_filter not in USUAL_EPS2D:
             raise SettingsError(f"there is no screen filter {screen_filter!r}; known are {', '.join(USUAL_EPS2D)}")
@@ -217,6 +237,11 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
     scene = scene.original()
     taken = Taken(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
     return scene.with_cameras(model.as_trained(scene.cameras, taken))  # type: ignore[attr-defined]
+
+
+def state_path(output: Path) -> Path:
+    """Where the state of a run is kept whose model is to be saved to `output`."""
+    return output.with_name(output.name + ".resume")
 
 
 def own_cameras(model: SplatModel) -> list[Camera]:

@@ -385,7 +385,7 @@ def test_splats_with_ends_of_every_range_stay_finite():
 
 @pytest.mark.parametrize("scale", [0, -1, float("inf"), float("nan")])
 def test_a_scale_that_is_no_zoom_is_refused(scale):
-    with pytest.raises(SettingsError, match=f"scale {scale} is no zoom; give a number above 0, such as 0.25 or 4"):
+    with pytest.raises(SettingsError, match=f"scale {scale} is no zoom; give a number from 1e-09 to 10000, such as 0.25 or 4"):
         wrapped().adapt(scale)
 
 

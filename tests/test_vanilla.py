@@ -9,7 +9,7 @@ import pytest
 import torch
 from ply_files import splat_columns, splat_names, write, write_model_folder, write_splats
 
-from mipmap_plugin import files
+from mipmap_plugin import staging
 from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import inria_folder, load_model
@@ -362,8 +362,7 @@ def test_a_failed_save_leaves_the_old_folder_and_nothing_else(tmp_path, monkeypa
     if failing == "copy":
         monkeypatch.setattr(inria_folder.shutil, "copyfile", full)
     else:
-        rename = files.Path.rename
-        monkeypatch.setattr(files.Path, "rename", lambda self, to: full() if self.suffix == ".tmp" else rename(self, to))
+        monkeypatch.setattr(staging, "exchange", full)
     with pytest.raises(OutputError, match="cannot be written: No space left"):
         model.save(tmp_path / "out", provenance={}, overwrite=True)
     assert len(load_model(tmp_path / "out")) == 2

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists
 from mipmap_plugin.models.torch_file import load_torch, save_torch
 
 VARIABLE = "MIPMAP_PLUGIN_CACHE"
@@ -33,14 +34,24 @@ def fingerprint(image: Tensor, *facts: object) -> str:
 def cached(name: str, make: Callable[[], Tensor]) -> Tensor:
     """The image kept as `name`, or else what `make` returns; in half precision both times, which is a tenth of an 8-bit step.
 
-    A damaged file is made anew. Raises OutputError when the folder cannot be written to.
+    A damaged file is made anew. A folder that cannot be written to costs the image the next time, and a warning now.
     """
     file = cache_folder() / name[:2] / f"{name}.pt"
-    if file.is_file():
-        try:
-            return load_torch(file).float()
-        except CheckpointError:
-            pass
+    if (kept := _kept(file)) is not None:
+        return kept.float()
     image = make().detach().to("cpu", torch.float16)
-    save_torch(file, image, overwrite=True)
+    try:
+        save_torch(file, image, overwrite=True)
+    except (OutputError, OutputExists) as error:
+        warnings.warn(f"the image is made again next time, for {error} (the variable {VARIABLE} names another folder)", stacklevel=2)
     return image.float()
+
+
+def _kept(file: Path) -> Tensor | None:
+    if not file.is_file():
+        return None
+    try:
+        kept = load_torch(file)
+    except CheckpointError:
+        return None
+    return kept if isinstance(kept, Tensor) and kept.dim() == 3 and kept.is_floating_point() else None

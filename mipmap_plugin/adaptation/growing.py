@@ -20,6 +20,7 @@ from mipmap_plugin.adaptation.optimizer import put_back
 from mipmap_plugin.adaptation.resize import difference_from
 from mipmap_plugin.adaptation.views import evenly, extent
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.limits import mixed
 from mipmap_plugin.models.base import SplatModel
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def _grow(run: Run, task: Task, config: AdaptConfig, gradients: Tensor) -> None:
     if config.densify_keeps_image:
         density.halve(run.student, run.optimizer, grown, shown)
     else:
-        generator = torch.Generator().manual_seed(config.seed * 1_000_003 + run.step)
+        generator = torch.Generator().manual_seed(mixed(config.seed, run.step))
         density.clone_and_split(run.student, run.optimizer, grown, extent(task.views), shown, generator)
 
 

@@ -16,11 +16,13 @@ from mipmap_plugin.adaptation.growing import Trial
 from mipmap_plugin.adaptation.loop import Run, Task
 from mipmap_plugin.adaptation.optimizer import make_optimizer
 from mipmap_plugin.adaptation.snapshot import Snapshot
+from mipmap_plugin.adaptation.state_file import StateFile, own_state_file
 from mipmap_plugin.adaptation.validation import Steering
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import OutputError, SettingsError
+from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
+from mipmap_plugin.files import refuse_output
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.models.torch_file import save_torch
+from mipmap_plugin.models.torch_file import load_torch, save_torch
 
 # Seconds between two states of a long run: what a killed process loses at most. A state is about three times as large as the model,
 # four times where that grows on trial.
@@ -35,14 +37,40 @@ class Keeper:
     """Keeps the state of one run in a file, if there is one to keep it in: every minute, and when the run is interrupted."""
 
     def __init__(self, path: Path | None, fingerprint: str) -> None:
-        self._path, self._fingerprint = path, fingerprint
+        self._wanted, self._fingerprint = path, fingerprint
+        self.file: StateFile | None = None  # where this run keeps its state
         self._kept = time.monotonic()
 
     def begin(self, student: SplatModel, task: Task, config: AdaptConfig, spent: float) -> Run:
-        """A new run, `spent` seconds after it was asked for, or the one in the file. Raises SettingsError (`load_run`)."""
-        if self._path is None or not self._path.exists():
+        """A new run, `spent` seconds after it was asked for, or the one in the file.
+
+        Raises SettingsError (`own_state_file`, `_read`), OutputError.
+        """
+        if self._wanted is None:
             return Run.start(student, task, config, spent)
-        return load_run(self._path, student, task, config, self._fingerprint)
+        refuse_output(self._wanted, overwrite=True, is_file=True)
+        found: list[dict[str, Any]] = []
+        try:
+            self._wanted.parent.mkdir(parents=True, exist_ok=True)
+            self.file = own_state_file(self._wanted, lambda path: self._is_ours(path, found))
+        except OSError as error:
+            warnings.warn(f"{self._wanted} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)
+        if not found:
+            return Run.start(student, task, config, spent)
+        try:
+            return load_run(found[0], student, config)
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            raise SettingsError(f"{self._path}: this is not the whole state of a run; delete it to start anew ({error})") from error
+
+    def _is_ours(self, path: Path, found: list[dict[str, Any]]) -> bool:
+        state = _read(path)
+        if isinstance(state, dict) and state.get("fingerprint") == self._fingerprint:
+            found.append(state)
+        return bool(found)
+
+    @property
+    def _path(self) -> Path | None:
+        return None if self.file is None else self.file.path
 
     def now_and_then(self, run: Run) -> None:
         """Write the state if the last one is old. A disk that has no room for it does not end the run."""
@@ -54,11 +82,20 @@ class Keeper:
             warnings.warn(f"the run goes on, but could not be resumed if it were killed: {error}", stacklevel=2)
         self._kept = time.monotonic()
 
+    def left(self) -> StateFile | None:
+        """The state of a run that has ended, which is of use until its model is saved; None where none was written."""
+        if self.file is not None and not self.file.path.exists():
+            self.file.release()
+            self.file = None
+        return self.file
+
     def stop(self, run: Run) -> NoReturn:
         """Write the state and raise Interrupted. Raises OutputError when the disk refuses."""
         if self._path is None:
             raise Interrupted(f"interrupted at step {run.step}; nothing was written, for no file to resume from was named")
         save_run(run, self._path, self._fingerprint)
+        assert self.file is not None  # `_path` is its
+        self.file.release()
         raise Interrupted(f"interrupted at step {run.step}; run the same command again to go on from {self._path}")
 
 
@@ -81,11 +118,11 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
     save_torch(path, state, overwrite=True)
 
 
-def load_run(path: Path, student: SplatModel, task: Task, config: AdaptConfig, fingerprint: str) -> Run:
-    """The run that `save_run` wrote, over `student`'s own parameters. Raises SettingsError when it is of another run or unreadable."""
-    state = _read(path)
-    if not isinstance(state, dict) or state.get("fingerprint") != fingerprint:
-        raise SettingsError(f"{path}: it belongs to another base, other settings or other views; repeat those, or delete the file to start anew")
+def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) -> Run:
+    """The run of a state that `save_run` wrote, over `student`'s own parameters."""
+    for name, kind in (("step", int), ("seconds", float), ("square_error", float), ("rows_changed", bool)):
+        if not isinstance(state[name], kind):
+            raise TypeError(f"its {name} is no {kind.__name__}")
     device = student.parameters()["means"].device
     # On a GPU light is summed in any order, so that merging anew may leave a splat more or less than it did.
     if state["rows_changed"] or state["parameters"]["means"].shape != student.parameters()["means"].shape:
@@ -118,6 +155,7 @@ def _trial(state: dict[str, Any] | None, device: torch.device) -> Trial | None:
 
 def _read(path: Path) -> Any:
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load fails in many ways on a file that is not its own
-        raise SettingsError(f"{path}: this is not the state of an interrupted run ({type(error).__name__}); delete it to start anew") from error
+        return load_torch(path)
+    except CheckpointError as error:
+        kind = type(error.__cause__ or error).__name__
+        raise SettingsError(f"{path}: this is not the state of an interrupted run ({kind}); delete it to start anew") from error

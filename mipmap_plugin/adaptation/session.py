@@ -23,6 +23,7 @@ from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
 from mipmap_plugin.adaptation.resume import Keeper
 from mipmap_plugin.adaptation.start import Start, warm
+from mipmap_plugin.adaptation.state_file import StateFile
 from mipmap_plugin.adaptation.validation import HARM, Validation, hold_back
 from mipmap_plugin.adaptation.views import choose_views, evenly, with_times
 from mipmap_plugin.backends import supersample
@@ -30,10 +31,11 @@ from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, explain
-from mipmap_plugin.files import write_json
+from mipmap_plugin.files import together, write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of, exposures_of
 from mipmap_plugin.models.exposure import exposed
+from mipmap_plugin.models.outputs import REPORT
 
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
@@ -50,7 +52,7 @@ class Adapted:
     report: Report
     backend: Backend
     effects: Effects
-    state: Path | None = None  # of the run, which is of use until the model is saved
+    state: StateFile | None = None  # of the run, which is of use until the model is saved
     views: Sequence[Camera] = ()  # of the base scale, that were adapted to
 
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False) -> Rendered:
@@ -59,10 +61,11 @@ class Adapted:
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
-        saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
-        write_json(saved.with_name(saved.name + ".adaptation.json"), self.report.model_dump(), overwrite=True)
+        with together(Path(path)):  # no new model without its report
+            saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
+            write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=True)
         if self.state is not None:
-            self.state.unlink(missing_ok=True)
+            self.state.remove()
         return saved
 
 
@@ -101,6 +104,7 @@ class Session:
         if self.detail is not None:
             self.views = evenly(self.views, config.upsampled_views)
             self.which += f", {len(self.views)} of them upsampled"
+        self.state: StateFile | None = None
         asked = PseudoTruth(self.base, self.backend, self.trained, scale, config.model_copy(update=AS_THE_BASE if scale > 1 else {}))
         self.validation = Validation(validation[::2], validation[1::2], scale, asked, self._show, config.resize)
 
@@ -119,11 +123,9 @@ class Session:
             curve, best = run.curve, self.fresh()
             run.steering.best.put_into(best)
             states |= {f"the state after step {run.steering.best_step}": best, "the last state": student}
-        else:
-            resume = None  # whatever run it is of
-        return self._returned(states, curve, ended_by, resume)
+        return self._returned(states, curve, ended_by)
 
-    def _returned(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str, resume: Path | None) -> Adapted:
+    def _returned(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """The best of the states on views that have not steered the run, or the last where that is asked for."""
         began, last = time.perf_counter(), next(reversed(states))
         with self.phase("validation"):
@@ -136,7 +138,7 @@ class Session:
         why = "" if best == last else f", for {last} shows {found[last]:.2f} dB where it shows {found[best]:.2f}"
         curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=found[last], gaussians=_rows(states[last]))]
         report = self._report(states[best], curve, ended_by, f"{best}{why}", found)
-        return Adapted(states[best], report, self.backend, self.effects, resume, self.views)
+        return Adapted(states[best], report, self.backend, self.effects, self.state, self.views)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists, and what ended it."""
@@ -158,6 +160,7 @@ class Session:
                 observe(run.step, run.watch.seconds, lambda camera: self._render(run.student.gaussians(camera), camera))
 
         ended_by = adapt(run, task, self.config, keeper.stop, look)
+        self.state = keeper.left()
         self.seconds["optimization"] = run.watch.seconds - before
         self.seconds["total"] = run.watch.seconds
         return run, ended_by + verdict(run)

@@ -13,6 +13,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.limits import mixed
 from mipmap_plugin.scenes.trajectories import ORBIT_FOV, jittered, orbit
 
 # A checkpoint without cameras does not say how finely it was trained: this many px across 50 degrees is NeRF-Synthetic's density.
@@ -39,7 +40,7 @@ class Order:
             return [self._rounds(first + nth) for nth in range(each)]
         before, known = self._known(pace - 1), self._known(pace)
         new = range(before, min(known, before + each))
-        generator = torch.Generator().manual_seed(self._seed * 1_000_003 + step)
+        generator = torch.Generator().manual_seed(mixed(self._seed, step))
         again = torch.randperm(before, generator=generator)[: each - len(new)].tolist()
         return [self._rounds(place) for place in (*new, *again)]
 
@@ -70,7 +71,7 @@ class Rounds:
         """The `draw`-th view since the beginning."""
         turn, place = divmod(draw, len(self.views))
         if turn != self._round:
-            generator = torch.Generator().manual_seed(self._seed * 1_000_003 + turn)  # a prime, so that seeds and rounds do not meet
+            generator = torch.Generator().manual_seed(mixed(self._seed, turn))
             self._round, self._order = turn, torch.randperm(len(self.views), generator=generator).tolist()
         return self.views[self._order[place]]
 

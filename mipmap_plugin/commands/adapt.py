@@ -10,8 +10,9 @@ from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import Recipe, ResizeFilter, ViewPolicy
-from mipmap_plugin.files import refuse_existing
+from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.wrap import state_path
 
 
 def adapt(
@@ -57,17 +58,17 @@ def adapt(
         json: Print the reports as JSON.
     """
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
-    limits = dict(steps=steps, time_budget_s=time_budget_s, target_db=target_db)
-    chosen: dict[str, Any] = dict(views=views, resize=resize, upsampler=upsampler, **limits)
+    chosen: dict[str, Any] = dict(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     settings = {name: value for name, value in chosen.items() if value is not None}
     scales = each_once(scale)
     targets = [adapted_path(checkpoint, output, each, len(scales) > 1) for each in scales]
-    for target in targets:
-        refuse_existing(target, overwrite)
+    for each, target in zip(scales, targets, strict=True):
+        config = make_config(recipe, each, seed=seed, **settings)
+        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0)
     real = None if images is None else load_scene(images)
     reports = []
     for each, target in zip(scales, targets, strict=True):
-        adapted = wrapped.adapt(each, recipe=recipe, seed=seed, images=real, resume=target.with_name(target.name + ".resume"), **settings)
+        adapted = wrapped.adapt(each, recipe=recipe, seed=seed, images=real, resume=state_path(target), **settings)
         saved = adapted.save(target, overwrite=overwrite)
         reports.append({"file": str(saved), **adapted.report.model_dump()})
         if not json:

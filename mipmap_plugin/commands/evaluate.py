@@ -12,7 +12,8 @@ from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.files import refuse_existing, write_json
+from mipmap_plugin.files import refuse_output, refuse_unwritable, write_json
+from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.scenes import Scene, load_scene
 
 
@@ -85,13 +86,18 @@ def _scene(folder: Path, appearance: str) -> Scene:
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], output: Path | None, overwrite: bool) -> None:
     if output:
-        refuse_existing(output, overwrite)
+        refuse_output(output, overwrite, [part for each in checkpoint for part in _parts(each)], is_file=True)
+        refuse_unwritable(output)
     if len(checkpoint) != len(images):
         raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")
 
 
 def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str) -> str:
     return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views"
+
+
+def _parts(checkpoint: Path) -> list[Path]:
+    return parts_of(None, checkpoint) if checkpoint.is_dir() else [checkpoint]
 
 
 def _listed(paths: Sequence[Path]) -> str:

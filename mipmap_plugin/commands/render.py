@@ -13,8 +13,9 @@ from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.files import refuse_existing
+from mipmap_plugin.files import refuse_output, refuse_unwritable
 from mipmap_plugin.models.base import exposures_of
+from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.scenes.images import write_array, write_image
 from mipmap_plugin.wrap import Wrapped
 
@@ -63,11 +64,13 @@ def render(
         wrapped.effects(scale, asked, supersampling, viewer)  # before anything is looked for or written
     outputs = [name for name, wanted in {"depth": depth, "normals": normals}.items() if wanted]
     pictures = [output / name for name in picture_names(views)]
+    parts = parts_of(wrapped.model.source, wrapped.model.folder)
     for camera, picture in zip(views, pictures, strict=True):
         for path in (picture, *(_beside(picture, name) for name in outputs)):
-            refuse_existing(path, overwrite)
+            refuse_output(path, overwrite, parts, is_file=True)
         if exposure:
             exposures_of(wrapped.model).of(camera)  # before anything is written
+    refuse_unwritable(pictures[0])
     for camera, picture in zip(views, pictures, strict=True):
         shown = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, filter_3d, outputs=outputs, exposure=exposure, viewer=viewer)
         write_image(picture, shown.image, overwrite=overwrite)

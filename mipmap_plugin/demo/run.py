@@ -16,7 +16,7 @@ from mipmap_plugin.demo.world import render_world
 from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row, training_free_rows
 from mipmap_plugin.evaluation.protocols import Protocol
 from mipmap_plugin.evaluation.report import table
-from mipmap_plugin.files import refuse_existing
+from mipmap_plugin.files import refuse_output, refuse_unwritable
 from mipmap_plugin.scenes import read_cameras
 from mipmap_plugin.scenes.images import write_image
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -61,7 +61,8 @@ def run_demo(output: Path, scales: Sequence[float], *, overwrite: bool = False) 
     """Adapt to each scale, write checkpoints and pictures into `output`, and return the table. Raises OutputExists."""
     base = embedded()
     for scale in scales:
-        refuse_existing(output / f"x{scale:g}.ply", overwrite)
+        refuse_output(output / f"x{scale:g}.ply", overwrite, is_file=True)
+        refuse_unwritable(output / f"x{scale:g}.ply")
     views = [WorldView(camera) for camera in base.cameras if camera.split == "test"]
     views = views[:: len(views) // JUDGED][:JUDGED]
     train = [camera for camera in base.cameras if camera.split == "train"][::EVERY]

@@ -18,7 +18,7 @@ from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.evaluation.tradeoff import Point, Spread
 from mipmap_plugin.evaluation.tradeoff_front import Tradeoff, files, frames, front, milliseconds, seconds
 from mipmap_plugin.evaluation.tradeoff_plot import draw, figure_class
-from mipmap_plugin.files import new_file, refuse_existing, write_json
+from mipmap_plugin.files import new_file, refuse_output, refuse_unwritable, write_json
 
 NAMES = ("tradeoff.json", "tradeoff.csv", "tradeoff.png")
 
@@ -28,7 +28,8 @@ def refuse(folder: Path, picture: bool, overwrite: bool) -> None:
     if picture:
         figure_class()
     for name in NAMES:
-        refuse_existing(folder / name, overwrite)
+        refuse_output(folder / name, overwrite, is_file=True)
+    refuse_unwritable(folder / NAMES[0])
 
 
 def facts(tradeoffs: Sequence[Tradeoff], complete: bool) -> dict[str, Any]:

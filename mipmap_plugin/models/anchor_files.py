@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -105,13 +106,19 @@ def to_columns(parameters: Mapping[str, Tensor], carried: tuple[str, ...], secon
 
 def write_beside(ply: Path, companions: Mapping[str, bytes], source: Path | None, overwrite: bool) -> None:
     """Put the networks' files, whose names are fixed, beside a PLY. Raises OutputExists rather than spoil other anchors' networks."""
-    differ = [name for name, content in companions.items() if (ply.parent / name).exists() and (ply.parent / name).read_bytes() != content]
-    if differ and (not overwrite or (source is not None and source.parent.resolve() == ply.parent.resolve())):
-        raise OutputExists(f"{ply.parent} holds other networks ({', '.join(differ)}) that would be replaced; choose an empty folder")
+    differ = refuse_others(ply, companions, source, overwrite)
     for name, content in companions.items():
         if name in differ or not (ply.parent / name).exists():
             with new_file(ply.parent / name, overwrite) as temporary:
                 temporary.write_bytes(content)
+
+
+def refuse_others(ply: Path, companions: Mapping[str, bytes], source: Path | None, overwrite: bool) -> list[str]:
+    """The files beside `ply` that differ from `companions`. Raises OutputExists where they may not be replaced."""
+    differ = [name for name, content in companions.items() if (ply.parent / name).exists() and (ply.parent / name).read_bytes() != content]
+    if differ and (not overwrite or (source is not None and os.path.realpath(source.parent) == os.path.realpath(ply.parent))):
+        raise OutputExists(f"{ply.parent} holds other networks ({', '.join(differ)}) that would be replaced; choose an empty folder")
+    return differ
 
 
 def cfg_text(source: Path | None, target: Path, trained: TrainedScale, options: dict[str, Any]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.models.torch_file import load_torch
 from mipmap_plugin.models.torchscript import read_torchscript
 
@@ -60,6 +60,12 @@ def check_networks(weights: Weights, features: int, splats: int, folder: Path | 
             raise CheckpointError(f"{folder}: {name} gives {found} numbers, but anchors with {splats} splats need {count}; the files do not match")
     if "feature_bank_mlp" in weights and features % 4:
         raise CheckpointError(f"{folder}: a feature bank needs features in fours, but the anchors have {features}; the files do not match")
+
+
+def refuse_infinite(name: str, state: Mapping[str, Tensor]) -> None:
+    """Raise SettingsError for a network that is not finite, which nobody could read again."""
+    if not all(bool(held.isfinite().all()) for held in state.values()):
+        raise SettingsError(f"{name} holds weights that are not finite, so nothing is saved; adapt less boldly, or to another scale")
 
 
 def surplus(weights: Weights, name: str, features: int) -> int:

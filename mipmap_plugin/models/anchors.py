@@ -16,13 +16,16 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import ShapeError
+from mipmap_plugin.files import together
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchor_decoding import Anchors, decode
-from mipmap_plugin.models.anchor_files import AnchorFile, cfg_text, needs_views, to_columns, write_beside
-from mipmap_plugin.models.anchor_networks import appearance_size, packed
+from mipmap_plugin.models.anchor_files import AnchorFile, cfg_text, needs_views, refuse_others, to_columns, write_beside
+from mipmap_plugin.models.anchor_networks import appearance_size, packed, refuse_infinite
 from mipmap_plugin.models.base import CARRIED
 from mipmap_plugin.models.columns import QUATERNION
+from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import write_folder
+from mipmap_plugin.models.outputs import finite, refuse_parts
 from mipmap_plugin.models.ply import write_ply
 from mipmap_plugin.models.prefilter import in_view
 from mipmap_plugin.models.tags import with_tags
@@ -132,12 +135,16 @@ class AnchorModel(ABC):
         OutputError when the disk refuses.
         """
         path, companions = Path(path), packed(self._weights, self._read.weights, self._read.companions)
-        columns = to_columns(self._parameters, self._read.carried, self._second_columns())
+        self.refuse_output(path, overwrite=overwrite)
+        for name, state in self._weights.items():
+            refuse_infinite(name, state)
+        columns = to_columns(finite(self._parameters, LARGEST), self._read.carried, self._second_columns())
         comments = with_tags(self._read.origin.comments, self.trained.screen_filter, provenance)
         write = partial(write_ply, columns=columns, comments=comments)
         if path.suffix.lower() == ".ply":
-            write_beside(path, companions, self.source, overwrite)
-            return write(path, overwrite=overwrite)
+            with together(path):
+                write_beside(path, companions, self.source, overwrite)
+                return write(path, overwrite=overwrite)
 
         def fill(ply: Path) -> None:
             write(ply)
@@ -145,6 +152,17 @@ class AnchorModel(ABC):
 
         cfg_args = cfg_text(self.folder, path, self.trained, self._cfg_options())
         return write_folder(path, self.folder, cfg_args, self._read.origin.iteration, overwrite, fill)
+
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
+        """What `save` would refuse about `path`, before anything is done for it; `networks_move`: they will differ from what they are now.
+
+        Raises OutputExists, OutputError.
+        """
+        lone = path.suffix.lower() == ".ply"
+        refuse_parts(path, overwrite, self.source, self.folder, None if lone else "point_cloud")
+        if lone:
+            held = packed(self._weights, self._read.weights, self._read.companions)
+            refuse_others(path, dict.fromkeys(held, b"") if networks_move else held, self.source, overwrite)
 
     def _chosen(self, camera: Camera) -> Tensor:
         """[N] bool: the anchors that are there at all for this camera; a family with levels chooses."""

@@ -66,7 +66,10 @@ class SplatModel(Protocol):
         `views` are there for families whose splats exist only for a camera. Only ever called on a copy.
         """
 
-    # Optional: a family whose rows are splats that look the same to every camera offers
+    # Optional: a family may offer
+    #     refuse_output(path: Path, *, overwrite: bool, networks_move: bool) -> None
+    # which raises what `save` would raise for that path, so that nobody works in vain. A family whose rows are splats that look the same
+    # to every camera offers
     #     rebuild(form: Callable[[Gaussians], Gaussians]) -> None
     # which holds what `form` makes of its splats instead of them. Without it, splats are never merged. A family whose photographs
     # were exposed differently has

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.files import settled
 from mipmap_plugin.models.anchor_networks import missing_networks
 from mipmap_plugin.models.cfg_args import read_cfg_args
 from mipmap_plugin.models.exchange import EXCHANGE
@@ -67,7 +68,7 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     Of a folder, the newest `iteration_<N>` whose PLY is whole is taken, or the one asked for.
     Raises CheckpointError for what is missing, damaged, or not a checkpoint.
     """
-    path = Path(path)
+    path = settled(Path(path))
     if path.is_dir():
         return _detect_folder(path, iteration)
     if not path.exists():

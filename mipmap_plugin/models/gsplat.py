@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import CheckpointError, SceneError, ShapeError
-from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
+from mipmap_plugin.files import new_folder, sha256
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import GSPLAT_FILE, detect
 from mipmap_plugin.models.gsplat_frame import normalized_frame
@@ -57,12 +57,14 @@ class GsplatHost:
         content = {**self.siblings, "splats": splats, "comments": list(comments)}
         if path.suffix == ".pt":
             return save_torch(path, content, overwrite=overwrite)
-        refuse_to_lose(path, self.folder, holds="ckpts")
         within = Path("ckpts", f"ckpt_{self.siblings['step']}_rank0.pt")
         with new_folder(path, overwrite) as fresh:
             save_torch(fresh / within, content, overwrite=False)
             self._write_options(fresh, antialiased=render_mode(comments) == "antialiased")
         return path / within
+
+    def holds(self, path: Path) -> str | None:
+        return None if path.suffix == ".pt" else "ckpts"
 
     def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
         """Resized by `data_factor`, and moved into the normalized world, which is found again from the cameras and points."""

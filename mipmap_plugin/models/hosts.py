@@ -34,6 +34,9 @@ class Host(Protocol):
         `comments` (`tags.with_tags`) tell the screen filter and the provenance. Raises OutputExists.
         """
 
+    def holds(self, path: Path) -> str | None:
+        """The folder that every result folder written by `write` to `path` has; None where `path` is that of a file. Raises OutputError."""
+
     def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
         """Views of the photographs' scene in the frame and at the size of the training.
 

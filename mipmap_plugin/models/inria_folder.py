@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.files import new_folder, refuse_to_lose
+from mipmap_plugin.files import new_folder
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args_and_rest
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
@@ -82,7 +82,6 @@ def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposure
 
 def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: int | None, overwrite: bool, write_ply: Callable[[Path], Any]) -> Path:
     """Lay out a model folder around the PLY that `write_ply` writes, all or nothing; return that PLY's path. Raises OutputExists."""
-    refuse_to_lose(target, source, holds="point_cloud")
     within = Path("point_cloud", f"iteration_{iteration or DEFAULT_ITERATION}", "point_cloud.ply")
     with new_folder(target, overwrite) as fresh:
         (fresh / within).parent.mkdir(parents=True)

@@ -63,11 +63,12 @@ def adopt(model: Any) -> SplatModel:
 
     Taken are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it otherwise, Scaffold-GS's
     `GaussianModel`, gsplat's `splats` (a dict or a ParameterDict), and splatfacto's model or its `gauss_params`. The copy stays on
-    the original's device. Raises SettingsError for another object, ShapeError for tensors that do not fit together, CheckpointError
+    the original's device. Splats that are not finite are dropped, as those of a file are.
+    Raises SettingsError for another object, ShapeError for tensors that do not fit together, CheckpointError
     for networks that do not fit their anchors.
     """
     if callable(getattr(model, "gaussians", None)):
-        return model
+        return _sound(model)
     found = [what for name, what in MORE.items() if hasattr(model, name)]
     if found == [MORE["_anchor"]] and _is_scaffold(model):
         return scaffold_in_memory(_anchors(model), _networks(model), _name(model))
@@ -90,6 +91,16 @@ def adopt(model: Any) -> SplatModel:
         return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE), Origin(host=gsplat.GsplatHost()))
     told = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
     raise SettingsError(f"a {_name(model)}{told} is no model that is known; give a path, a GaussianModel, or gsplat's dictionary of splats")
+
+
+def _sound(model: SplatModel) -> SplatModel:
+    """The model, without the splats that a file's would be read without. Raises SettingsError where a family of its own holds a NaN."""
+    if isinstance(model, VanillaModel):
+        return without_poison(model)
+    for name, tensor in model.parameters().items():
+        if rows := int(tensor.detach().isnan().flatten(1).any(1).sum() if tensor.dim() > 1 else tensor.detach().isnan().sum()):
+            raise SettingsError(f"this {_name(model)} holds a NaN in {name} of {rows:,} of its {len(tensor):,} rows; drop these first")
+    return model
 
 
 def _is_scaffold(model: Any) -> bool:

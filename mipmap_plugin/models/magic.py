@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.files import no_file
 
 # Bytes that tell every format here apart; a .splat file has no magic and is judged by its first records.
 HEAD = 64 * 1024
@@ -26,6 +27,8 @@ SPLAT_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", 
 def read_head(path: Path, size: int = HEAD) -> bytes:
     """The first `size` bytes. Raises CheckpointError when there are none, or when a placeholder stands for the data."""
     try:
+        if trouble := no_file(path):
+            raise CheckpointError(f"{path} {trouble}; give a file or a model folder")
         with path.open("rb") as file:
             head = file.read(size)
     except OSError as error:

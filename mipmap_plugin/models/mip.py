@@ -21,7 +21,8 @@ from mipmap_plugin.errors import CheckpointError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.detect import detect, not_loaded
-from mipmap_plugin.models.health import drop
+from mipmap_plugin.models.health import LARGEST, drop
+from mipmap_plugin.models.outputs import finite
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 
 COLUMN = "filter_3D"
@@ -114,8 +115,13 @@ class MipModel:
         self.filter_3d.copy_(filter_3d_of(shown.means, cameras))
         self.reshape(lambda _: (shown.scales, shown.opacities))
 
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
+        """As `VanillaModel.refuse_output`."""
+        self.splats.refuse_output(path, overwrite=overwrite)
+
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
         """Write a PLY or a model folder as `VanillaModel.save` does, with filter_3D as the last column. Raises OutputExists."""
+        finite({**self.splats.parameters(), CARRIED: self.filter_3d}, LARGEST)
         filter_3d = self.filter_3d.detach().to("cpu", torch.float32).numpy()
         told = {**provenance, "family": self.family, "kernel_size": self.trained.eps2d}  # a bare PLY has no cfg_args
         return self.splats.with_extras({**self.splats.extras, COLUMN: filter_3d}).save(path, provenance=told, overwrite=overwrite)

@@ -101,14 +101,18 @@ class MovingModel:
         some = views[:: -(-len(views) // ENOUGH_MOMENTS)]
         return torch.stack([self.gaussians(view).opacities for view in some]).amax(0)
 
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
+        """What `save` would refuse about `path`, before anything is done for it. Raises SettingsError, OutputExists, OutputError."""
+        if path.suffix.lower() == ".ply":
+            raise SettingsError(f"{path}: a PLY has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}")
+        self.canonical.refuse_output(path, overwrite=overwrite)
+
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
         """Write a model folder, the network copied byte for byte to the iteration of the splats; return the PLY written.
 
         Raises SettingsError for a path that ends in .ply, OutputExists, and OutputError when the disk refuses.
         """
-        path = Path(path)
-        if path.suffix.lower() == ".ply":
-            raise SettingsError(f"{path}: a PLY has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}")
+        self.refuse_output(Path(path), overwrite=overwrite)
         return self.canonical.save(path, provenance=provenance, overwrite=overwrite, companions=self._copy_network)
 
     def _copy_network(self, ply: Path) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import CheckpointError, OutputError, SceneError, ShapeError
-from mipmap_plugin.files import new_folder, refuse_to_lose, sha256
+from mipmap_plugin.files import new_folder, sha256
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import C0
 from mipmap_plugin.models.detect import RESULTS, detect
@@ -57,14 +57,18 @@ class SplatfactoHost:
         training cannot go on from it after splats were removed. Raises OutputExists, OutputError.
         """
         if path.suffix == ".ckpt":
-            _refuse_to_confuse(path)
             return save_torch(path, self._content(parameters, comments), overwrite=overwrite)
-        refuse_to_lose(path, self.folder, holds=PLACE)
         within = Path(PLACE, f"step-{self.step:09d}.ckpt")
         with new_folder(path, overwrite) as fresh:
             save_torch(fresh / within, self._content(parameters, comments), overwrite=False)
             self._write_companions(fresh, path.name, render_mode(comments) or "classic")
         return path / within
+
+    def holds(self, path: Path) -> str | None:
+        if path.suffix != ".ckpt":
+            return PLACE
+        _refuse_to_confuse(path)
+        return None
 
     def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
         """Moved by dataparser_transforms.json, and at the size that nerfstudio shrinks large photographs to. Raises SceneError."""
@@ -85,7 +89,7 @@ class SplatfactoHost:
         try:
             facts = json.loads(file.read_text(encoding="utf-8"))
             scale, transform = float(facts["scale"]), torch.tensor(facts["transform"], dtype=torch.float64)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
             advice = "without it the cameras of the scene cannot be placed; copy it from the folder of the training"
             raise SceneError(f"{file} cannot be read ({error}): {advice}") from error
         if tuple(transform.shape) != (3, 4) or not scale > 0:

@@ -59,8 +59,8 @@ class SurfelModel(VanillaModel):
         count = len(columns[SCALE[0]])
         return to_parameters({SCALE[2]: np.full(count, FLAT, np.float32), **columns}, path)
 
-    def _columns(self) -> dict[str, np.ndarray]:
-        columns = super()._columns()
+    def _columns(self, parameters: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        columns = super()._columns(parameters)
         if (columns[SCALE[2]] <= FLAT + 1).all():  # rounding aside
             del columns[SCALE[2]]
         return columns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,15 +14,22 @@ from torch import Tensor
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.files import new_file
 from mipmap_plugin.models.magic import read_head
+from mipmap_plugin.models.pickles import MOST_PACKED, refuse_hostile
 
 # What a NumPy scalar is pickled as, by NumPy 2 and by NumPy 1; learning-rate schedulers leave such scalars in checkpoints.
 _SCALAR: Any = np.float64(0).__reduce__()[0]
+_KINDS = [np.dtype(kind) for kind in (np.float64, np.float32, np.int64, np.int32, np.bool_)]
+
+
+def _number_type(name: str, *_: bool) -> np.dtype:
+    """Only numbers: other types of NumPy's are as large as their name says."""
+    return next(kind for kind in _KINDS if kind.str[1:] == name)
+
+
 _SAFE: list[Any] = [
-    _SCALAR,
-    (_SCALAR, "numpy.core.multiarray.scalar"),
-    (_SCALAR, "numpy._core.multiarray.scalar"),
-    np.dtype,
-    *(type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64, np.int32, np.bool_)),
+    *((_SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
+    (_number_type, "numpy.dtype"),
+    *map(type, _KINDS),
 ]
 
 
@@ -29,10 +37,15 @@ def load_torch(path: Path) -> Any:
     """The content of a torch file, on the CPU. Raises CheckpointError for a damaged one, or one that would run code or fill the memory."""
     read_head(path, 512)
     try:
+        refuse_hostile(path)
         with torch.serialization.safe_globals(_SAFE):
             content = torch.load(path, map_location="cpu", weights_only=True)
+        storages: dict[int, int] = {}
         for tensor in _tensors(content):
             _refuse_unusual(tensor)
+            storages[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        if sum(storages.values()) > MOST_PACKED * path.stat().st_size:
+            raise ValueError("its tensors claim more numbers than the file holds")
         return content
     except Exception as error:  # a damaged or hostile pickle may fail in any way
         reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
@@ -46,15 +59,19 @@ def _tensors(content: Any) -> Iterator[Tensor]:
         value = ahead.pop()
         if isinstance(value, Tensor):
             yield value
-        elif isinstance(value, (Mapping, list, tuple, set)) and id(value) not in entered:
+        elif isinstance(value, (dict, list, tuple, set)) and id(value) not in entered:
             entered.add(id(value))
-            ahead += value.values() if isinstance(value, Mapping) else value
+            if set(getattr(value, "__dict__", ())) - {"_metadata"}:  # torch's own; any other could stand for a method
+                raise ValueError("its dictionaries have attributes")
+            ahead += value.values() if isinstance(value, dict) else value
 
 
 def _refuse_unusual(tensor: Tensor) -> None:
     """Only numbers that lie in the file, one after the other, are known to compute as others do and to take no more room than the file."""
     if tensor.layout != torch.strided or tensor.device.type != "cpu" or tensor.is_quantized or tensor.is_complex() or tensor.is_nested:
         raise ValueError("it holds a sparse, quantized, complex, nested or empty-shelled tensor")
+    if vars(tensor):
+        raise ValueError("a tensor has attributes")
     if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
         raise ValueError(f"a tensor of shape {list(tensor.shape)} claims more numbers than the file holds")
 
@@ -74,6 +91,6 @@ def save_torch(path: Path, content: Any, *, overwrite: bool) -> Path:
     with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
         try:
             torch.save(content, file)
-        except RuntimeError as error:  # how torch reports a full disk
-            raise OSError(str(error).splitlines()[0]) from error
+        except RuntimeError as error:  # how torch reports a disk that refuses, whose own reason it does not tell
+            raise OSError(errno.EIO, "the disk refuses; it may be full") from error
     return path

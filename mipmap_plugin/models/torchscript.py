@@ -20,10 +20,17 @@ from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.magic import read_head
+from mipmap_plugin.models.pickles import refuse_packed, scan
 
 # Bytes. The networks of an anchor model take 30 kB, an appearance for each of thousands of photographs a few MB.
 MAX_PICKLE = 1024 * 1024
-MAX_WEIGHTS = 256 * 1024 * 1024
+
+# Modules in one another, and letters of the names of all weights: both far beyond any network's.
+MAX_DEPTH = 64
+MAX_LETTERS = MAX_PICKLE
+
+# Weights may share their numbers, and are given them each: as many times, together, as the file is large.
+MOST_SHARED = 4
 
 # What a pickle calls the types of storages.
 DTYPES = {
@@ -39,11 +46,13 @@ def read_torchscript(path: str | Path) -> dict[str, Tensor]:
     read_head(path)
     try:
         with zipfile.ZipFile(path) as archive:
+            refuse_packed(archive, path)
             root = next(name for name in archive.namelist() if name.endswith("/data.pkl")).removesuffix("/data.pkl")
             if _member(archive, f"{root}/byteorder", 16, missing=b"little") != b"little":
                 raise ValueError("its numbers are big-endian")
             program = _member(archive, f"{root}/data.pkl", MAX_PICKLE)
-            return _tensors(_Weights(program, archive, root).load())
+            scan(io.BytesIO(program), None)
+            return _tensors(_Weights(program, archive, root, MOST_SHARED * path.stat().st_size).load())
     except Exception as error:  # a damaged or hostile pickle may fail in any way, and all of them mean the same here
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise CheckpointError(f"{path} is no TorchScript network whose weights can be read without executing it ({reason})") from error
@@ -71,10 +80,11 @@ class _Storage:
 class _Weights(pickle.Unpickler):
     """An unpickler that knows tensors, dictionaries and records, and nothing that could act."""
 
-    def __init__(self, program: bytes, archive: zipfile.ZipFile, root: str) -> None:
+    def __init__(self, program: bytes, archive: zipfile.ZipFile, root: str, most: int) -> None:
+        """`most`: bytes of weights."""
         super().__init__(io.BytesIO(program))
         self._archive, self._root = archive, root
-        self._left = MAX_WEIGHTS
+        self._left = most
 
     def find_class(self, module: str, name: str) -> Any:
         if module.split(".")[0] == "__torch__":
@@ -99,7 +109,7 @@ class _Weights(pickle.Unpickler):
         size = storage.count * storage.dtype.itemsize
         self._left -= max(size, math.prod(shape) * storage.dtype.itemsize)
         if self._left < 0:
-            raise ValueError(f"it holds more than {MAX_WEIGHTS >> 20} MB of weights")
+            raise ValueError("its tensors claim more numbers than the file holds")
         content = _member(self._archive, f"{self._root}/data/{storage.key}", size)
         if len(content) != size:
             raise ValueError("a storage is shorter than declared")
@@ -123,14 +133,18 @@ def _tensors(root: Any) -> dict[str, Tensor]:
     """The tensors under nested records, by dotted name. A record is entered once, so that a cycle ends."""
     found: dict[str, Tensor] = {}
     entered: set[int] = set()
-    ahead = [("", root)]
+    letters = 0
+    ahead: list[tuple[tuple[str, ...], Any]] = [((), root)]
     while ahead:
-        name, value = ahead.pop()
+        names, value = ahead.pop()
+        if len(names) > MAX_DEPTH or letters > MAX_LETTERS:
+            raise ValueError("its modules are nested too deep, or their names too long")
         if isinstance(value, Tensor):
-            found[name] = value
+            letters += sum(map(len, names))
+            found[".".join(names)] = value
         if isinstance(value, _Module) and id(value) not in entered:
             entered.add(id(value))
-            ahead += [(f"{name}.{key}" if name else str(key), each) for key, each in dict(value.attributes).items()]
+            ahead += [((*names, str(key)), each) for key, each in dict(value.attributes).items()]
     if not found:
         raise ValueError("it holds no weights")
     return found

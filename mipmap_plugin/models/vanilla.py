@@ -24,6 +24,7 @@ from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposure
 from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Host, Taken
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
+from mipmap_plugin.models.outputs import finite, refuse_parts
 from mipmap_plugin.models.ply import read_ply, write_ply
 from mipmap_plugin.models.tags import render_mode, with_tags
 
@@ -164,15 +165,17 @@ class VanillaModel:
 
         A model from another project's file goes back into one (`Host.write`). A folder of 3DGS repeats the iteration, cfg_args,
         cameras and exposures that the model came with; `companions` adds to it what else a family keeps around the PLY that
-        it is given. Raises OutputExists, and OutputError when the disk refuses.
+        it is given. Raises OutputExists, OutputError when the disk refuses, and SettingsError for splats that are not finite.
         """
         path = Path(path)
+        self.refuse_output(path, overwrite=overwrite)
+        parameters = finite(self._parameters, LARGEST)
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
         if is_written(path):
-            return write_exchange(path, lambda ply: write_ply(ply, self._columns(), comments), self.trained, overwrite=overwrite)
+            return write_exchange(path, lambda ply: write_ply(ply, self._columns(parameters), comments), self.trained, overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
-            return self._origin.host.write(path, self._parameters, comments, overwrite=overwrite)
-        columns = {**self._columns(), **self._origin.extras}
+            return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
+        columns = {**self._columns(parameters), **self._origin.extras}
         if path.suffix.lower() == ".ply":
             return write_ply(path, columns, comments, overwrite=overwrite)
 
@@ -182,6 +185,12 @@ class VanillaModel:
 
         cfg_args = cfg_args_for(self.folder, path, self.trained, self.sh_degree)
         return write_folder(path, self.folder, cfg_args, self._origin.iteration, overwrite, write)
+
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
+        """What `save` would refuse about `path`, before anything is done for it. Raises OutputExists, OutputError."""
+        host = None if path.suffix.lower() == ".ply" else self._origin.host
+        holds = host.holds(path) if host else None if path.suffix.lower() == ".ply" else "point_cloud"
+        refuse_parts(path, overwrite, self.source, self.folder, holds)
 
     def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
         """[N], 0..1, without gradient; the same for all views."""
@@ -198,9 +207,9 @@ class VanillaModel:
         """Raw parameters from the columns of the family's PLY at `path`. Raises CheckpointError."""
         return to_parameters(columns, path)
 
-    def _columns(self) -> dict[str, np.ndarray]:
-        """What the family's PLY holds of the parameters."""
-        return to_columns(self._parameters)
+    def _columns(self, parameters: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        """What the family's PLY holds of `parameters`."""
+        return to_columns(parameters)
 
     def _with(self: Splats, parameters: dict[str, Tensor], origin: Origin | None = None) -> Splats:
         return type(self)(parameters, self.trained, origin or self._origin, self.notes)
@@ -260,7 +269,7 @@ def without_poison(model: Splats) -> Splats:
     if not health.poisonous.any():
         return model
     if health.poisonous.all():
-        raise CheckpointError(f"{model.source}: none of its {health.splats:,} splats is finite; the training or the export failed")
+        raise CheckpointError(f"{model.source or 'this model'}: none of its {health.splats:,} splats is finite; the training or the export failed")
     model = drop(model, health.poisonous)
     reasons = health.non_finite() or [f"they were not finite once activated, or above {LARGEST:g}"]
     model.notes.append("found while loading: " + "; ".join(reasons))

@@ -10,11 +10,25 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from mipmap_plugin.errors import SceneError, ShapeError
-from mipmap_plugin.files import new_file
+from mipmap_plugin.errors import SceneError, SettingsError, ShapeError
+from mipmap_plugin.files import new_file, no_file
+from mipmap_plugin.limits import check_image
 
 # What Pillow calls 16-bit gray; 16-bit color it reads to 8 bits by itself, keeping the high byte.
 GRAY_16_BIT = ("I;16", "I;16B", "I;16L", "I;16N", "I")
+
+# What is read; Pillow knows formats whose pictures are programs (EPS), too.
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
+
+# Pixels that every machine holds, and how many of them a byte of a file with more may stand for: in a photograph it is fewer than 20.
+FEW_PIXELS = 2**24
+PIXELS_PER_BYTE = 50
+
+# Bytes of a pixel while it is read: 8 bits of four channels, and 32 of three.
+BYTES_PER_PIXEL = 4 + 12
+
+# Pixels that are put on a background together, in 64 bits each.
+TOGETHER = 2**18
 
 # What Pillow raises for a file that is no image, a broken one, a broken PNG chunk and an absurd size.
 UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
@@ -23,19 +37,21 @@ UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 def read_image(path: str | Path, background: Sequence[float]) -> Tensor:
     """A PNG or JPEG file as [H, W, 3] float32 in 0..1; transparency shows `background` (RGB in 0..1).
 
-    EXIF rotation is not applied: cameras are calibrated on the pixels as they are stored. Raises SceneError.
+    EXIF rotation is not applied: cameras are calibrated on the pixels as they are stored. Raises SceneError, also for more pixels
+    than the memory holds, or than a file of that size can have.
     """
     with _opened(path) as image:
+        _refuse_bomb(Path(path), *image.size)
         try:
             if image.mode in GRAY_16_BIT:
                 gray = torch.from_numpy(np.asarray(image).astype(np.float32)) / 65535
                 return gray[..., None].expand(-1, -1, 3).contiguous()
             pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
-        except UNREADABLE as error:
-            raise SceneError(f"{path}: the image is damaged ({error}); download or export it again") from error
+        except Exception as error:  # a damaged file fails in as many ways as Pillow has decoders
+            raise SceneError(f"{path}: the image is damaged ({str(error) or type(error).__name__}); download or export it again") from error
     if pixels.shape[2] == 4:
         pixels = composite(pixels, background)
-    return torch.from_numpy(pixels.astype(np.float32)) / 255
+    return torch.from_numpy(pixels.astype(np.float32)).div_(255)
 
 
 def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
@@ -45,9 +61,14 @@ def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
     0..255 floats to bytes): half-transparent pixels are up to one step darker, opaque ones and black or white background exact.
     The published protocols composite before any resizing, on these 8 bits.
     """
-    color, alpha = rgba[..., :3] / 255.0, rgba[..., 3:] / 255.0
-    blended = color * alpha + np.asarray(background, dtype=np.float64) * (1 - alpha)
-    return (blended * 255.0).astype(np.uint8)
+    rgb = np.empty((*rgba.shape[:2], 3), np.uint8)
+    rows = max(1, TOGETHER // max(1, rgba.shape[1]))
+    for top in range(0, len(rgba), rows):
+        part = rgba[top : top + rows] / 255.0
+        color, alpha = part[..., :3], part[..., 3:]
+        blended = color * alpha + np.asarray(background, dtype=np.float64) * (1 - alpha)
+        rgb[top : top + rows] = (blended * 255.0).astype(np.uint8)
+    return rgb
 
 
 def pillow_bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -111,9 +132,23 @@ def read_array(path: str | Path) -> Tensor:
         raise SceneError(f"{path}: is no array that NumPy reads ({(str(error).splitlines() or [''])[0][:120]}); copy it again") from error
 
 
+def _refuse_bomb(path: Path, width: int, height: int) -> None:
+    pixels, size = width * height, path.stat().st_size
+    if pixels > FEW_PIXELS and pixels > PIXELS_PER_BYTE * size:
+        raise SceneError(f"{path}: {width:,} x {height:,} px in {size:,} bytes are no photograph; give the image that the camera took")
+    try:
+        check_image(width, height, bytes_per_pixel=BYTES_PER_PIXEL)
+    except SettingsError as error:
+        raise SceneError(f"{path}: {error}") from error
+
+
 def _opened(path: str | Path) -> Image.Image:
     try:
-        return Image.open(path)
+        if trouble := no_file(Path(path)):
+            raise SceneError(f"{path}: {trouble}; give a PNG or JPEG file")
+        return Image.open(path, formats=FORMATS)
+    except SceneError:
+        raise
     except FileNotFoundError as error:
         raise SceneError(f"{path}: there is no such image; check the path") from error
     except UNREADABLE as error:

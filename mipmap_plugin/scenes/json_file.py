@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.files import no_file
 
 GIT_LFS_POINTER = b"version https://git-lfs"
 
@@ -24,7 +25,11 @@ ROTATION_TOLERANCE = 1e-2
 def read_json(path: Path) -> Any:
     """The content of a JSON file. Raises SceneError when it is absent, a Git LFS pointer or not JSON."""
     try:
+        if trouble := no_file(path):
+            raise SceneError(f"{path}: {trouble}; check the path")
         content = path.read_bytes()
+    except SceneError:
+        raise
     except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error.strerror}); check the path") from error
     if content.startswith(GIT_LFS_POINTER):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,8 +13,16 @@ import moving
 import numpy as np
 import ply_files
 import tiny
+import torch
 import torch_checkpoints
+from PIL import Image
 
+from mipmap_plugin.adaptation import resume
+from mipmap_plugin.adaptation.session import Adapted
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.magic import SPLAT_RECORD
+from mipmap_plugin.models.state_dict import read_state_dict
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import wrap_model
 
@@ -24,6 +33,11 @@ class Sample:
     damaged: str  # the file that is damaged, in that folder
     kinds: tuple[str, ...]  # what is done to it: functions of `mutations`
     is_scene: bool = False
+    open: Callable[[Path], None] | None = None  # where it is neither a checkpoint nor a scene
+
+    def opened(self, path: Path) -> None:
+        """Read all that a command would read of it."""
+        (self.open or (open_scene if self.is_scene else open_checkpoint))(path)
 
 
 def open_checkpoint(path: Path) -> None:
@@ -40,6 +54,88 @@ def open_scene(path: Path) -> None:
     model = wrap_model(tiny.model(5), cameras=scene, backend="reference")
     for camera in scene.cameras[:2]:
         assert model.render(camera.resized(8, 6)).image.isfinite().all(), "the image is not finite"
+
+
+def open_images(path: Path) -> None:
+    scene = load_scene(path)
+    for camera in scene.cameras:
+        assert scene.image(camera, (1.0, 1.0, 1.0)).isfinite().all(), "the photograph is not finite"
+
+
+def open_placed(path: Path) -> None:
+    """A checkpoint, and a scene seen in its frame."""
+    model = load_model(path)
+    assert model.as_trained(tiny.cameras(2), None)
+
+
+def open_state(path: Path) -> None:
+    """Go on with an interrupted run."""
+    _quick_run(path)
+
+
+def open_exchange(path: Path) -> None:
+    """What is only told how to be converted counts as read."""
+    try:
+        open_checkpoint(path)
+    except CheckpointError as error:
+        if "convert it first" not in str(error):
+            raise
+
+
+def _quick_run(state: Path) -> Adapted:
+    model = wrap_model(tiny.model(8), cameras=tiny.cameras(2, width=8, height=6), backend="reference")
+    return model.adapt(1 / 2, steps=2, extra_views=0, views_per_step=1, resume=state)
+
+
+def _state(path: Path) -> Path:
+    path.mkdir()
+    kept, resume.KEEP_EVERY_S = resume.KEEP_EVERY_S, 0.0
+    try:
+        _quick_run(path / "state")
+    finally:
+        resume.KEEP_EVERY_S = kept
+    return path / "state"
+
+
+def _network(path: Path) -> Path:
+    path.mkdir()
+    rng = torch.Generator().manual_seed(0)
+    shapes = {"lin0.model.1.weight": (1, 3, 1, 1), "layer.weight": (4, 3), "layer.bias": (4,)}
+    torch.save({name: torch.randn(shape, generator=rng) for name, shape in shapes.items()}, path / "net.pth")
+    return path / "net.pth"
+
+
+def _pictures(form: str, mode: str) -> Callable[[Path], Path]:
+    def make(path: Path) -> Path:
+        scene = tiny.scene(path, test=tiny.cameras(1, split="test", width=16, height=12))
+        rgb = Image.open(scene / "test/view_0.png")
+        picture = rgb.convert("I").point(lambda value: value * 256).convert("I;16") if mode == "I;16" else rgb.convert(mode)
+        picture.save(scene / "test/view_0.png", format=form)
+        return scene
+
+    return make
+
+
+def _gsplat_json(path: Path) -> Path:
+    folder = _gsplat(path)
+    (folder / "cfg.yml").unlink()
+    facts = {"antialiased": True, "data_factor": 4, "sh_degree": 3, "near_plane": 0.01, "normalize_world_space": False, "model_type": "3dgs"}
+    (folder / "cfg.json").write_text(json.dumps(facts))
+    return folder
+
+
+def _dot_splat(path: Path) -> Path:
+    path.mkdir()
+    rows = np.zeros(20, SPLAT_RECORD)
+    rows["scale"], rows["quat"] = 0.1, (255, 128, 128, 128)
+    rows.tofile(path / "a.splat")
+    return path / "a.splat"
+
+
+def _spz(path: Path) -> Path:
+    path.mkdir()
+    (path / "a.spz").write_bytes(gzip.compress(b"NGSP" + bytes(200)))
+    return path / "a.spz"
 
 
 def _folder(path: Path) -> Path:
@@ -87,6 +183,13 @@ def _splatfacto(path: Path) -> Path:
     return torch_checkpoints.splatfacto_folder(path, torch_checkpoints.splats(12))
 
 
+def _placed_splatfacto(path: Path) -> Path:
+    folder = _splatfacto(path)
+    facts = {"scale": 0.5, "transform": [[1.0, 0, 0, 0.1], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]}
+    (folder / "dataparser_transforms.json").write_text(json.dumps(facts))
+    return folder
+
+
 def _transforms(path: Path) -> Path:
     path.mkdir()
     pose = np.eye(4).tolist()
@@ -114,6 +217,7 @@ def _deformable(path: Path) -> Path:
 SPLATS = "point_cloud/iteration_30000/point_cloud.ply"
 BINARY, TEXT, OPTIONS = ("of_bytes",), ("of_text", "of_text", "of_bytes"), ("of_options", "of_options", "of_text")
 PLY, TORCH = ("of_bytes", "of_text"), ("of_bytes", "of_torch", "of_torch")
+PICTURE, PICTURES = "test/view_0.png", ("of_bytes", "of_png")
 SCAFFOLD, UNITED = anchor_checkpoints.Layout(appearance=(3, 2)), anchor_checkpoints.Layout(united=True)
 
 SAMPLES: dict[str, Sample] = {
@@ -139,6 +243,16 @@ SAMPLES: dict[str, Sample] = {
     "cfg.yml": Sample(_gsplat, "cfg.yml", OPTIONS),
     "ckpt of splatfacto": Sample(_splatfacto, "nerfstudio_models/step-000029999.ckpt", TORCH),
     "config.yml": Sample(_splatfacto, "config.yml", OPTIONS),
+    "cfg.json": Sample(_gsplat_json, "cfg.json", ("of_json", *TEXT), open=open_placed),
+    "dataparser_transforms.json": Sample(_placed_splatfacto, "dataparser_transforms.json", ("of_json", *TEXT), open=open_placed),
+    "state of a run": Sample(_state, "state", BINARY, open=open_state),
+    "state dict of a network": Sample(_network, "net.pth", TORCH, open=lambda path: read_state_dict(path) and None),
+    "png": Sample(_pictures("PNG", "RGBA"), PICTURE, PICTURES, open=open_images),
+    "png, 16 bits": Sample(_pictures("PNG", "I;16"), PICTURE, PICTURES, open=open_images),
+    "png, palette": Sample(_pictures("PNG", "P"), PICTURE, PICTURES, open=open_images),
+    "jpeg": Sample(_pictures("JPEG", "RGB"), PICTURE, BINARY, open=open_images),
+    ".splat": Sample(_dot_splat, "a.splat", BINARY, open=open_exchange),
+    ".spz": Sample(_spz, "a.spz", BINARY, open=open_exchange),
     "COLMAP cameras": Sample(_colmap, "sparse/0/cameras.bin", BINARY, is_scene=True),
     "COLMAP images": Sample(_colmap, "sparse/0/images.bin", BINARY, is_scene=True),
     "COLMAP rigs": Sample(_colmap, "sparse/0/rigs.bin", BINARY, is_scene=True),

@@ -6,6 +6,8 @@ import json
 import pickle
 import random
 import re
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -122,6 +124,26 @@ def of_json(content: bytes, rng: random.Random) -> bytes:
         return json.dumps(value).encode()
     except RecursionError:
         return b"[" * 50_000
+
+
+def of_png(content: bytes, rng: random.Random) -> bytes:
+    """A part of a chunk is changed, and its sum made right again, so that what reads the chunk sees it."""
+    chunks, at = [], 8
+    while at + 8 <= len(content):
+        (length,) = struct.unpack_from(">I", content, at)
+        chunks.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + length]))
+        at += 12 + length
+    which = rng.randrange(len(chunks))
+    name, part = chunks[which]
+    if name == b"IHDR" and rng.random() < 0.6:
+        width, height = (rng.choice([0, 1, 16, 9000, 2**31 - 1, 2**32 - 1]) for _ in range(2))
+        chunks[which] = name, struct.pack(">II", width, height) + part[8:]
+    elif rng.random() < 0.3:
+        chunks.insert(which, chunks[rng.randrange(len(chunks))])
+    else:
+        chunks[which] = name, of_bytes(part, rng)
+    parts = (struct.pack(">I", len(part)) + name + part + struct.pack(">I", zlib.crc32(name + part)) for name, part in chunks)
+    return content[:8] + b"".join(parts)
 
 
 def of_torch(path: Path, rng: random.Random, canary: Path) -> None:

@@ -1,0 +1,68 @@
+"""What a model may not be saved as: a part of the checkpoint that it came from, and numbers that nobody can read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.files import refuse_output, refuse_to_lose
+
+# Where the projects that are read keep the parts of a checkpoint, in their folders.
+PARTS = ("point_cloud", "deform", "ckpts", "nerfstudio_models")
+
+REPORT = ".adaptation.json"
+
+# Finite numbers that activate, in float32, to what an infinite logit and an infinite logarithm do: opacity 1 or 0, and a length of almost 0.
+LOGIT, LOG_SCALE = 80.0, -87.0
+
+
+def parts_of(source: Path | None, folder: Path | None) -> list[Path]:
+    """The files of the checkpoint that was read from the file `source`, in `folder`, as far as these are known.
+
+    What an adaptation has put among them is known by the report beside it, and is no part.
+    """
+    found = [] if source is None else [file for file in source.absolute().parent.iterdir() if _belongs(file.name, source.name)]
+    if folder is not None:
+        found += [*folder.iterdir(), *(file for part in PARTS for file in (folder / part).rglob("*"))]
+    return [*([source] if source else []), *(file for file in found if file.is_file() and not _is_adapted(file))]
+
+
+def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path | None, holds: str | None) -> None:
+    """Raise OutputExists for a path that a model of that checkpoint may not be saved to; `holds` names what is in a folder, None: a file."""
+    refuse_output(path, overwrite, parts_of(source, folder), is_file=holds is None)
+    if holds is not None:
+        refuse_to_lose(path, source if folder is None else folder, holds)
+
+
+def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
+    """The raw parameters, without infinities: a log scale of -infinity and a logit of infinity are the longest finite way there.
+
+    Raises SettingsError where a row holds a NaN, or is infinite or above `most` once activated.
+    """
+    sound = {name: tensor.detach() for name, tensor in parameters.items()}
+    for name, low, high in (("opacities", -LOGIT, LOGIT), ("scales", LOG_SCALE, torch.inf)):
+        if name in sound:
+            sound[name] = sound[name].nan_to_num(nan=torch.nan, posinf=high, neginf=low)
+    for name, value in {**sound, "lengths": sound["scales"].exp()}.items():
+        wrong = ~value.isfinite() if name in ("opacities", "quats") else ~(value.abs() <= most)  # also of a NaN
+        if rows := int(wrong.flatten(1).any(1).sum() if wrong.dim() > 1 else wrong.sum()):
+            raise SettingsError(
+                f"{rows:,} of {len(value):,} rows hold a NaN, an infinity or more than {most:g} in {name}, so nothing is saved;"
+                " adapt less boldly, or to another scale"
+            )
+    return sound
+
+
+def _belongs(name: str, source: str) -> bool:
+    """Whether a file beside `source` is read with it: another rank of a training, or a network of its splats."""
+    rank = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", source)
+    return bool(rank and re.fullmatch(re.escape(rank[1]) + r"\d+\.pt", name)) or name.endswith((".pth", "_mlp.pt", "embedding_appearance.pt"))
+
+
+def _is_adapted(file: Path) -> bool:
+    return file.name.endswith((REPORT, ".resume")) or file.with_name(file.name + REPORT).exists()

@@ -1,0 +1,182 @@
+"""Where outputs are made before they take their places: a hidden folder beside them, locked by the run that fills it.
+
+`.NAME.<slot>.tmp` holds `new` while something is being made; that is worthless once its run is dead. One file takes its place by one rename,
+and one folder is exchanged with the old one, each in one step of the system. Where it takes several steps (a file and its companions, or a
+system that exchanges no folders), `new` is first renamed to `ready`: from then on it is whole, and whoever comes next finishes the moves.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import shutil
+import sys
+import time
+from pathlib import Path
+
+# As many runs may write to one output at the same time.
+SLOTS = 8
+
+# Seconds after which a folder counts as a dead run's where the system has no locks to tell.
+STALE_S = 24 * 3600.0
+
+# Linux: renameat2 with paths relative to the working folder, and the flag that exchanges them (linux/fs.h).
+AT_FDCWD = -100
+RENAME_EXCHANGE = 2
+
+# What a system answers that has no such call, or none on this disk.
+NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
+
+
+class Staging:
+    """The hidden folder of one output, from its first byte until it has taken its place."""
+
+    def __init__(self, path: Path) -> None:
+        """`path`: absolute. What dead runs left there is put right first. Raises OSError."""
+        self.path, self.place = path, path.parent
+        settle(path)
+        self._folder, self._lock = _free_slot(path)
+        self.new = self._folder / "new"
+        self.new.mkdir()
+
+    def inside(self, path: Path) -> Path | None:
+        """Where what is to become `path` (absolute) is made: here, if it is the output, beside it, or in a folder that is being made."""
+        if path.is_relative_to(self.new):
+            return path
+        made = self.new / os.path.relpath(path, self.place)
+        return made if path.parent == self.place or (self.new / self.path.name in made.parents and (self.new / self.path.name).is_dir()) else None
+
+    def commit(self) -> None:
+        """Let what lies in `new` take its place. Raises OSError."""
+        made = list(self.new.iterdir())
+        if len(made) == 1 and _moved_at_once(made[0], self.place / made[0].name):
+            return
+        ready = self._folder / "ready"
+        os.rename(self.new, ready)
+        try:
+            _move_in(self._folder)
+        except OSError:
+            shutil.rmtree(ready, ignore_errors=True)
+            raise
+
+    def close(self) -> None:
+        """Take the hidden folder away. Moves that Ctrl-C broke off are finished first."""
+        _finish(self._folder, self._lock)
+
+
+def settle(path: Path) -> None:
+    """Put right what dead runs left beside the output `path`: finish what was whole, and remove what was not."""
+    for folder in _slots(path):
+        if os.path.lexists(folder) and (lock := claim(folder)) is not None:
+            _finish(folder, lock)
+
+
+def claim(folder: Path) -> int | None:
+    """Make `folder` this run's, also where a dead run left it: the descriptor of its lock. None where a living run has it."""
+    while True:
+        made = _made(folder)
+        try:
+            lock = os.open(folder, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0))
+        except FileNotFoundError:  # its run has ended at this moment
+            continue
+        except PermissionError:  # Windows opens no folders
+            return -1 if made or _is_stale(folder.stat()) else None
+        if not _locked(lock, made):
+            os.close(lock)
+            return None
+        if os.path.lexists(folder) and os.path.samestat(os.fstat(lock), os.stat(folder)):
+            return lock
+        os.close(lock)
+
+
+def release(folder: Path, lock: int) -> None:
+    """Give back what `claim` took, and remove it."""
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        if lock >= 0:
+            os.close(lock)
+
+
+def exchange(one: Path, other: Path) -> bool:
+    """Let two folders change their names in one step; False where the system cannot. Raises OSError."""
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
+    if call is None:
+        return False
+    if call(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in NO_EXCHANGE:
+        return False
+    raise OSError(number, os.strerror(number))
+
+
+def _slots(path: Path) -> list[Path]:
+    return [path.with_name(f".{path.name}.{slot}.tmp") for slot in range(SLOTS)]
+
+
+def _free_slot(path: Path) -> tuple[Path, int]:
+    for folder in _slots(path):
+        if (lock := claim(folder)) is not None:
+            return folder, lock
+    raise OSError(errno.EBUSY, f"{SLOTS} other runs are writing to it")
+
+
+def _made(folder: Path) -> bool:
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        return False
+    return True
+
+
+def _locked(lock: int, made: bool) -> bool:
+    """Whether the folder of this descriptor is ours now; `made` by us, where the disk has no locks, or long untouched."""
+    import fcntl  # not on Windows, where no folder has a descriptor
+
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return made or _is_stale(os.fstat(lock))
+    return True
+
+
+def _is_stale(folder: os.stat_result) -> bool:
+    return time.time() - folder.st_mtime > STALE_S
+
+
+def _moved_at_once(made: Path, target: Path) -> bool:
+    """Whether one step of the system has put what was `made` into its place."""
+    if not made.is_dir():
+        os.replace(made, target)
+        return True
+    if os.path.lexists(target):
+        return exchange(made, target)
+    os.rename(made, target)
+    return True
+
+
+def _move_in(folder: Path) -> None:
+    """What is ready takes its place: companions first, the output that they belong to last. Raises OSError, the old one being back."""
+    main = folder.name[1:].rsplit(".", 2)[0]
+    for made in sorted((folder / "ready").iterdir(), key=lambda each: each.name == main):
+        target, aside = folder.parent / made.name, folder / "old"
+        if not made.is_dir():
+            os.replace(made, target)
+            continue
+        if os.path.lexists(target):
+            os.rename(target, aside)
+        try:
+            os.rename(made, target)
+        except OSError:
+            os.rename(aside, target)
+            raise
+
+
+def _finish(folder: Path, lock: int) -> None:
+    if (folder / "ready").is_dir():
+        _move_in(folder)
+    release(folder, lock)

@@ -1,0 +1,236 @@
+"""What a command or a model may write to: never the base or a part of it, by no name; and what would fail at the end is refused first."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+from corpus import SAMPLES
+from test_interruptions import WRITERS, adapted, contents
+
+from mipmap_plugin import files, staging
+from mipmap_plugin.adaptation import disk_cache, resume
+from mipmap_plugin.adaptation.state_file import own_state_file
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
+from mipmap_plugin.models import load_model
+from mipmap_plugin.wrap import wrap_model
+
+INSTANT = ["--recipe", "instant", "--backend", "reference"]
+
+
+@pytest.fixture
+def refused(capsys):
+    """Call the command line, which has to end in one sentence; return it."""
+
+    def call(*words) -> str:
+        capsys.readouterr()
+        assert main([str(word) for word in words]) == 2
+        said = capsys.readouterr()
+        assert said.out == "" and said.err.startswith("mipmap-plugin: ") and said.err.count("\n") == 1
+        return said.err
+
+    return call
+
+
+def names_of(base: Path, folder: Path) -> list[Path]:
+    """The base by other names."""
+    (folder / "soft.ply").symlink_to(base)
+    os.link(base, folder / "hard.ply")
+    (folder / "by").symlink_to(base.parent)
+    return [base, folder / "soft.ply", folder / "hard.ply", folder / "by" / base.name]
+
+
+@pytest.mark.parametrize("which", range(4), ids=["itself", "link", "hard link", "linked folder"])
+def test_a_base_is_never_overwritten_by_what_is_adapted_from_it(tmp_path, refused, which):
+    base = tiny.ply(tmp_path / "base.ply")
+    before, name = base.read_bytes(), names_of(base, tmp_path)[which]
+    assert "is the base checkpoint itself" in refused("adapt", base, "--scale", "1/2", "--output", name, "--overwrite", *INSTANT)
+    with pytest.raises(OutputExists, match="is the base checkpoint itself"):
+        wrap_model(base, backend="reference").adapt(1 / 2, recipe="instant").save(name, overwrite=True)
+    with pytest.raises(OutputExists, match="is the base checkpoint itself"):
+        load_model(base).save(name, provenance={}, overwrite=True)
+    assert base.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_no_part_of_a_base_is_ever_overwritten(tmp_path, name):
+    """Nor a folder around one."""
+    base = SAMPLES[name].make(tmp_path / "base")
+    before, new = contents(tmp_path), adapted(base, 1 / 2)
+    folder = base if base.is_dir() else base.parent
+    parts = [path for path in folder.rglob("*") if base.is_dir() or path == base]
+    for part in [tmp_path, folder, *parts]:
+        with pytest.raises((OutputExists, OutputError, SettingsError)):
+            new.save(part, overwrite=True)
+    assert contents(tmp_path) == before
+
+
+def test_a_rank_of_a_training_is_a_part_of_the_base(tmp_path):
+    folder = SAMPLES["ckpt of gsplat"].make(tmp_path / "base")
+    first = folder / "ckpts/ckpt_6999_rank0.pt"
+    first = Path(shutil.copytree(first.parent, tmp_path / "lone"), first.name)
+    second = Path(shutil.copy(first, first.with_name("ckpt_6999_rank1.pt")))
+    with pytest.raises(OutputExists, match=r"rank1\.pt is the base checkpoint itself"):
+        load_model(first).save(second, provenance={}, overwrite=True)
+
+
+def test_what_was_adapted_before_may_be_overwritten_also_among_the_base(tmp_path):
+    folder = tiny.folder(tmp_path / "base", tiny.cameras(2))
+    model = wrap_model(folder / "point_cloud/iteration_30000/point_cloud.ply", backend="reference")
+    out = folder / "point_cloud/iteration_30000/point_cloud_x0.5.ply"
+    for scale in (1 / 2, 1 / 4):
+        model.adapt(scale, recipe="instant").save(out, overwrite=True)
+    with pytest.raises(OutputExists, match=r"point_cloud\.ply is the base checkpoint itself"):
+        model.adapt(1 / 2, recipe="instant").save(out.with_name("point_cloud.ply"), overwrite=True)
+
+
+@pytest.mark.parametrize("words", [[], ["--overwrite"]])
+def test_nodes_that_are_no_files_are_refused_before_any_work(tmp_path, refused, monkeypatch, words):
+    base = tiny.ply(tmp_path / "base.ply")
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+    (tmp_path / "dangling.ply").symlink_to(tmp_path / "nothing")
+    (tmp_path / "loop.ply").symlink_to(tmp_path / "loop.ply")
+    os.mkfifo(tmp_path / "pipe.ply")
+    for output in ("/dev/null", *(tmp_path / f"{name}.ply" for name in ("dangling", "loop", "pipe"))):
+        assert str(output) in refused("adapt", base, "--scale", "1/2", "--output", output, *words, *INSTANT)
+    for beside in (".adaptation.json", ".resume"):
+        (tmp_path / f"new.ply{beside}").symlink_to(base)
+        assert "is the base checkpoint itself" in refused("adapt", base, "--scale", "1/2", "--output", tmp_path / "new.ply", *words, *INSTANT)
+        (tmp_path / f"new.ply{beside}").unlink()
+
+
+def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+    moving, anchors = SAMPLES["deform.pth"].make(tmp_path / "moving"), SAMPLES["opacity_mlp.pt"].make(tmp_path / "anchors")
+    base, full = tiny.ply(tmp_path / "base.ply"), tmp_path / "full"
+    full.mkdir()
+    (full / "precious").write_text("")
+    words = ["--scale", "1/2", *INSTANT, "--overwrite", "--output"]
+    assert "a PLY has no room for the network" in refused("adapt", moving, *words, tmp_path / "new.ply")
+    assert "is a folder with other things in it" in refused("adapt", moving, *words, full)
+    assert "is a folder, which no file replaces" in refused("adapt", base, *words[:-2], "--overwrite", "--output", _named(full, "full.ply"))
+    splats = anchors / "point_cloud/iteration_30000/point_cloud.ply"
+    beside = splats.with_name("new.ply")
+    assert "holds other networks" in refused("adapt", splats, "--scale", "1/2", "--backend", "reference", "--output", beside)
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(100, 90, 10))
+    assert "its disk has 10 bytes free, and the base takes" in refused("adapt", base, *words, tmp_path / "new.ply")
+
+
+def _named(path: Path, name: str) -> Path:
+    return path.rename(path.with_name(name))
+
+
+def test_other_commands_spare_the_checkpoint_too(tmp_path, refused):
+    folder = tiny.folder(tmp_path / "base", tiny.cameras(2))
+    scene = tiny.scene(tmp_path / "scene")
+    before = contents(folder)
+    for part in ("cfg_args", "cameras.json", "point_cloud/iteration_30000/point_cloud.ply"):
+        words = ["--images", scene, "--scale", "1", "--output", folder / part, "--overwrite"]
+        assert "is the base checkpoint itself" in refused("evaluate", folder, *words)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/train_view_0.png").symlink_to(folder / "cameras.json")
+    assert "is the base checkpoint itself" in refused("render", folder, "--output", tmp_path / "out", "--overwrite", "--backend", "reference")
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_an_output_error_names_the_output(tmp_path, monkeypatch, name):
+    base = SAMPLES[name].make(tmp_path / "base")
+    out, new = tmp_path / ("new.ply" if base.suffix == ".ply" else "new"), adapted(base, 1 / 2)
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OutputError) as told:
+        new.save(out)
+    assert str(told.value).startswith(str(out)) and str(told.value).endswith("cannot be written: No space left on device")
+    assert ".tmp" not in str(told.value)
+
+
+def test_no_model_appears_without_its_report(tmp_path, monkeypatch):
+    for name in ("new.ply", "new"):
+        new = adapted(tiny.ply(tmp_path / f"base of {name}.ply"), 1 / 2)
+        monkeypatch.setattr("mipmap_plugin.files.json_text", lambda _: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            new.save(tmp_path / "out" / name)
+        monkeypatch.undo()
+        assert list((tmp_path / "out").iterdir()) == []
+
+
+# States of runs at the same time
+
+
+def test_runs_with_one_output_keep_their_states_in_files_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
+    first = model.adapt(1 / 4, steps=1, resume=state)
+    second = model.adapt(1 / 4, steps=2, resume=state)
+    assert torch.load(state, weights_only=True)["step"] == 1 and torch.load(tmp_path / "state.2", weights_only=True)["step"] == 2
+    first.save(tmp_path / "one.ply")
+    assert not state.exists() and (tmp_path / "state.2").exists()
+    second.save(tmp_path / "two.ply")
+    assert sorted(path.name for path in tmp_path.iterdir() if "state" in path.name) == []
+
+
+def test_each_interrupted_run_goes_on_from_its_own_state(tmp_path, monkeypatch):
+    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
+    living = [model.adapt(1 / 4, steps=steps, resume=state) for steps in (1, 2)]
+    curves = [each.report.curve for each in living]
+    del living  # neither was saved
+    assert model.adapt(1 / 4, steps=2, resume=state).report.curve == curves[1]
+    with pytest.raises(SettingsError, match="state: it belongs to another base, other settings or other views"):
+        model.adapt(1 / 4, steps=3, resume=state)
+
+
+def test_a_state_is_nobodys_pipe_or_folder(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    for name, told in {"pipe": "is a pipe", ".": "is a folder"}.items():
+        with pytest.raises(OutputExists, match=told):
+            model.adapt(1 / 4, steps=1, resume=tmp_path / name)
+
+
+def test_a_state_that_cannot_be_kept_costs_a_warning(tmp_path, monkeypatch):
+    def refused(*_):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("mipmap_plugin.adaptation.resume.own_state_file", refused)
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    with pytest.warns(UserWarning, match=r"state cannot be written \(Read-only file system\), so that this run could not be resumed"):
+        assert model.adapt(1 / 4, steps=1, resume=tmp_path / "state").report.ended_by == "1 steps"
+
+
+def test_states_beyond_the_last_are_refused(tmp_path):
+    living = [own_state_file(tmp_path / "state", lambda _: False) for _ in range(staging.SLOTS)]
+    assert len({each.path for each in living}) == staging.SLOTS
+    with pytest.raises(SettingsError, match="state"):
+        own_state_file(tmp_path / "state", lambda _: False)
+
+
+# The cache
+
+
+@pytest.mark.parametrize("folder", ["a file", "a file/below"])
+def test_a_cache_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch, folder):
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setenv(disk_cache.VARIABLE, str(tmp_path / folder))
+    with pytest.warns(UserWarning, match="the image is made again next time, for .* cannot be written"):
+        image = disk_cache.cached("ab", lambda: torch.ones(2, 2, 3))
+    assert torch.equal(image, torch.ones(2, 2, 3))
+
+
+@pytest.mark.parametrize("content", [5, {}, torch.ones(2), torch.ones(2, 2, 3, dtype=torch.int64)], ids=str)
+def test_a_cache_that_holds_something_else_is_made_anew(tmp_path, monkeypatch, content):
+    monkeypatch.setenv(disk_cache.VARIABLE, str(tmp_path))
+    (tmp_path / "ab").mkdir()
+    torch.save(content, tmp_path / "ab/ab.pt")
+    assert torch.equal(disk_cache.cached("ab", lambda: torch.zeros(2, 2, 3)), torch.zeros(2, 2, 3))
+    assert torch.equal(disk_cache.cached("ab", lambda: pytest.fail("made again")), torch.zeros(2, 2, 3))
