@@ -14,6 +14,10 @@ from mipmap_plugin.gaussians import Gaussians
 # further out the affine approximation would blow splats up (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
 FRUSTUM_MARGIN = 0.3
 
+# A quaternion without a component of this size is no rotation, as one of zeros is: the shorter it is the steeper is its gradient, which
+# would leave float32.
+LEAST_QUATERNION = 1e-30
+
 
 @dataclass(frozen=True, eq=False)
 class Projected:
@@ -46,11 +50,16 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> Projected:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Quaternions wxyz of any norm [N, 4] -> rotation matrices [N, 3, 3]; a zero quaternion is the identity."""
-    squared = quats.square().sum(-1, keepdim=True)
-    zero = squared == 0
-    # `where` before the root as well as after it: the root's gradient at 0 is infinite, and infinity times zero is NaN.
-    unit = torch.where(zero, 0.0, quats * torch.where(zero, 1.0, squared).rsqrt())
+    """Quaternions wxyz of any norm [N, 4] -> rotation matrices [N, 3, 3]; a zero quaternion is the identity.
+
+    Divided by its largest component first, a quaternion's squares stay in range. That is taken as a constant, which is exact: the
+    rotation does not depend on it.
+    """
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    zero = largest < LEAST_QUATERNION
+    # `where` before the division and the root as well as after: their gradients at 0 are infinite, and infinity times zero is NaN.
+    scaled = torch.where(zero, 0.0, quats / torch.where(zero, 1.0, largest))
+    unit = scaled * torch.where(zero, 1.0, scaled.square().sum(-1, keepdim=True)).rsqrt()
     w, x, y, z = unit.unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
             2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
