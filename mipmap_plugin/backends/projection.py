@@ -34,8 +34,7 @@ class Projected:
 def project(gaussians: Gaussians, camera: Camera, near: float) -> Projected:
     """Means, depths and covariances on the image plane. Splats nearer than `near` get finite values of no meaning."""
     viewmat = camera.viewmat.to(gaussians.means)
-    # Eye first: in a world far from its origin the rounding of rotation · mean + translation is larger than a pixel.
-    in_camera = (gaussians.means - camera.center.to(viewmat)) @ viewmat[:3, :3].T
+    in_camera = camera.to_camera(gaussians.means)
     depths = in_camera[:, 2]
     safe = depths.clamp_min(near)
     slopes = in_camera[:, :2] / safe[:, None]
