@@ -71,6 +71,19 @@ def test_growing_is_judged_and_undone_there(enough, monkeypatch):
     assert (there.report.gaussians_after > len(tiny.model())) == enough
 
 
+@pytest.mark.parametrize("method", ["box", "area", "bilinear", "pil-bicubic", "lanczos"])
+def test_images_are_resampled_there(method):
+    image, weights = torch.rand(24, 32, 3), torch.rand(6, 8, 3)
+    found = []
+    with pretended.pretending():
+        for device in ("cpu", pretended.DEVICE):
+            there = image.to(device).requires_grad_()
+            small = resize(there, (6, 8), method)
+            (gradient,) = torch.autograd.grad(small, there, weights.to(device))
+            found.append((small.detach().cpu(), gradient.cpu()))
+    assert all(torch.equal(*pair) for pair in zip(*found, strict=True))
+
+
 @pytest.mark.parametrize("screen_filter", USUAL_EPS2D)
 def test_the_reference_draws_there(screen_filter):
     views, model = tiny.cameras(), tiny.model()
@@ -125,4 +138,6 @@ def test_the_pretence_holds():
         assert there.device.type == pretended.DEVICE and not device.waits
         with pytest.raises(RuntimeError, match="tensors on two devices"):
             there + torch.ones(3)
+        with pytest.raises(RuntimeError, match="torch has it for processors alone"):
+            torch.histogram(there.detach(), 2)
         assert float((2 * there.detach()).sum()) == 6 and device.waits
