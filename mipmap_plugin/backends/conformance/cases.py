@@ -214,3 +214,9 @@ CASES: dict[str, Builder] = {
         for seed, kind, eps2d in product((1, 2), FILTERS, (DILATION, DILATION / 64))
     },
 }
+
+# What is looked at where there is time.
+MORE: dict[str, Builder] = {
+    **{f"random-{seed}-{kind}": partial(random_scene, seed, kind, USUAL_EPS2D[kind]) for seed, kind in product(range(3, 43), FILTERS)},
+    **{f"long-lens-{seed}-window": partial(long_lens, seed, "window") for seed in range(100) if f"long-lens-{seed}-window" not in CASES},
+}
