@@ -8,6 +8,7 @@ with the line that asks.
 from __future__ import annotations
 
 import traceback
+import types
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,10 +16,12 @@ from contextlib import contextmanager
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import tree_flatten, tree_map
 
 # Torch knows the device "meta" without anything being installed, and computes nothing there by itself.
 DEVICE = "meta"
+if not hasattr(torch, DEVICE):
+    torch.meta = types.ModuleType("torch.meta")  # where torch before 2.8 looks for a device's random numbers, to leave them alone
 
 aten = torch.ops.aten
 MOVES = {aten._to_copy.default, aten.copy_.default}
@@ -61,7 +64,7 @@ class Device(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
-        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        tensors = [leaf for leaf in tree_flatten((args, kwargs))[0] if isinstance(leaf, torch.Tensor)]
         there = any(isinstance(tensor, Pretended) for tensor in tensors)
         if any(tensor.is_meta and not isinstance(tensor, Pretended) for tensor in tensors):
             raise RuntimeError(f"{func}: a tensor was made where nobody looked, and holds nothing")

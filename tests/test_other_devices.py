@@ -25,6 +25,10 @@ from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.scenes.images import write_image
 
 
+# Older torch takes more operations apart there than the products of networks.
+EXACT = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 10)
+
+
 @pytest.fixture(autouse=True)
 def plain_adam(monkeypatch):
     """Torch fuses Adam on devices that it knows to be real."""
@@ -54,7 +58,7 @@ def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
         write_image(tmp_path / "there.png", there.render(tiny.cameras()[0]).image)
         found = {name: tensor.cpu() for name, tensor in there.model.parameters().items()}
     assert [point.psnr_db for point in there.report.curve] == pytest.approx([point.psnr_db for point in here.report.curve], abs=1e-3)
-    if family == "3dgs":  # networks' products of matrices are taken apart in another way there
+    if family == "3dgs" and EXACT:  # networks' products of matrices are taken apart in another way there
         assert all(torch.equal(tensor, found[name]) for name, tensor in here.model.parameters().items())
 
 

@@ -49,21 +49,25 @@ def project(gaussians: Gaussians, camera: Camera, near: float) -> Projected:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Quaternions wxyz of any norm [N, 4] -> rotation matrices [N, 3, 3]; a zero quaternion is the identity.
+    """Quaternions wxyz of any norm [N, 4] -> rotation matrices [N, 3, 3]; a zero quaternion is the identity."""
+    w, x, y, z = unit(quats).unbind(-1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def unit(quats: Tensor) -> Tensor:
+    """Quaternions of any norm [N, 4] -> of norm 1, and zeros for a zero quaternion.
 
     Divided by its largest component first, a quaternion's squares stay in range. That is taken as a constant, which is exact: the
-    rotation does not depend on it.
+    result does not depend on it.
     """
     largest = quats.detach().abs().amax(-1, keepdim=True)
     zero = largest < LEAST_QUATERNION
     # `where` before the division and the root as well as after: their gradients at 0 are infinite, and infinity times zero is NaN.
     scaled = torch.where(zero, 0.0, quats / torch.where(zero, 1.0, largest))
-    unit = scaled * torch.where(zero, 1.0, scaled.square().sum(-1, keepdim=True)).rsqrt()
-    w, x, y, z = unit.unbind(-1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    return scaled * torch.where(zero, 1.0, scaled.square().sum(-1, keepdim=True)).rsqrt()
 
 
 def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,22 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.files import new_file
 from mipmap_plugin.models.magic import read_head
 
-# What a NumPy scalar is pickled as, by NumPy 2 and by NumPy 1; learning-rate schedulers leave such scalars in checkpoints.
 _SCALAR: Any = np.float64(0).__reduce__()[0]
+
+
+def _scalar_of(module: str) -> Any:
+    """What makes NumPy's scalars under the name that it has in `module`; torch takes the names of what is safe from the functions themselves."""
+
+    def scalar(*values: Any) -> Any:
+        return _SCALAR(*values)
+
+    scalar.__module__, scalar.__qualname__ = module, "scalar"
+    return scalar
+
+
+# What a NumPy scalar is pickled as, by NumPy 2 and by NumPy 1; learning-rate schedulers leave such scalars in checkpoints.
 _SAFE: list[Any] = [
-    _SCALAR,
-    (_SCALAR, "numpy.core.multiarray.scalar"),
-    (_SCALAR, "numpy._core.multiarray.scalar"),
+    *map(_scalar_of, ("numpy._core.multiarray", "numpy.core.multiarray")),
     np.dtype,
     *(type(np.dtype(kind)) for kind in (np.float64, np.float32, np.int64, np.int32, np.bool_)),
 ]
@@ -29,7 +40,7 @@ def load_torch(path: Path) -> Any:
     """The content of a torch file, on the CPU. Raises CheckpointError for a damaged one, or one that would run code or fill the memory."""
     read_head(path, 512)
     try:
-        with torch.serialization.safe_globals(_SAFE):
+        with _allowing_scalars():
             content = torch.load(path, map_location="cpu", weights_only=True)
         for tensor in _tensors(content):
             _refuse_unusual(tensor)
@@ -37,6 +48,11 @@ def load_torch(path: Path) -> Any:
     except Exception as error:  # a damaged or hostile pickle may fail in any way
         reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
         raise CheckpointError(f"{path} is damaged, or holds more than plain tensors and is not executed; save it again ({reason})") from error
+
+
+def _allowing_scalars() -> AbstractContextManager[None]:
+    """NumPy's scalars may be read inside; older torch can be told of no exceptions and refuses a file with some, by their name."""
+    return torch.serialization.safe_globals(_SAFE) if hasattr(torch.serialization, "safe_globals") else nullcontext()
 
 
 def _tensors(content: Any) -> Iterator[Tensor]:
