@@ -24,7 +24,6 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.scenes.images import write_image
 
-
 # Older torch takes more operations apart there than the products of networks.
 EXACT = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 10)
 
