@@ -46,6 +46,13 @@ class Camera:
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
         return -torch.linalg.solve(rotation, translation)
 
+    def to_camera(self, points: Tensor) -> Tensor:
+        """[N, 3] world units -> [N, 3] in camera space, x right, y down, z forward.
+
+        Eye first: in a world far from its origin the rounding of rotation · point + translation is larger than a pixel.
+        """
+        return (points - self.center.to(points)) @ self.viewmat[:3, :3].to(points).T
+
     @property
     def size(self) -> tuple[int, int]:
         """(height, width), as images are indexed."""

@@ -1,12 +1,14 @@
 """A device that is none: tensors that say that they lie elsewhere, and lie in the processor's memory all the same.
 
 Operations on them compute what a processor does, so that results can be compared to the last bit; one that mixes them with tensors of the
-processor fails as on a GPU, and one for whose answer the host would have to wait for a GPU is noted, with the line that asks.
+processor fails as on a GPU, as does one that torch has for processors alone; one for whose answer the host would have to wait for a GPU is noted,
+with the line that asks.
 """
 
 from __future__ import annotations
 
 import traceback
+import types
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,10 +16,12 @@ from contextlib import contextmanager
 import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import tree_flatten, tree_map
 
 # Torch knows the device "meta" without anything being installed, and computes nothing there by itself.
 DEVICE = "meta"
+if not hasattr(torch, DEVICE):
+    torch.meta = types.ModuleType("torch.meta")  # where torch before 2.8 looks for a device's random numbers, to leave them alone
 
 aten = torch.ops.aten
 MOVES = {aten._to_copy.default, aten.copy_.default}
@@ -26,6 +30,12 @@ TAKES_INDICES = {aten.index.Tensor, aten.index_put.default, aten.index_put_.defa
 WAITS = {
     aten._local_scalar_dense.default, aten.nonzero.default, aten.equal.default, aten.masked_select.default, aten._unique2.default,
     aten.unique_consecutive.default, aten.repeat_interleave.Tensor, aten.bincount.default,
+}  # fmt: skip
+# What has an implementation for CPU in torch's native_functions.yaml (2.13) and none for CUDA or for all devices; sparse and quantized
+# tensors aside.
+CPU_ONLY = {
+    "_upsample_lanczos2d_aa", "_upsample_lanczos2d_aa_backward", "histogram", "_histogramdd_bin_edges", "_histogramdd_from_bin_cts",
+    "_histogramdd_from_bin_tensors", "slow_conv3d_forward", "_spdiags", "_add_relu", "_add_relu_",
 }  # fmt: skip
 
 
@@ -54,7 +64,7 @@ class Device(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
-        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        tensors = [leaf for leaf in tree_flatten((args, kwargs))[0] if isinstance(leaf, torch.Tensor)]
         there = any(isinstance(tensor, Pretended) for tensor in tensors)
         if any(tensor.is_meta and not isinstance(tensor, Pretended) for tensor in tensors):
             raise RuntimeError(f"{func}: a tensor was made where nobody looked, and holds nothing")
@@ -62,6 +72,8 @@ class Device(TorchDispatchMode):
         goes_there = there if target is None else torch.device(target).type == DEVICE
         if not there and not goes_there:
             return func(*args, **kwargs)
+        if func.overloadpacket.__name__ in CPU_ONLY:
+            raise RuntimeError(f"{func}: torch has it for processors alone")
         if there and func not in MOVES | TAKES_INDICES and any(not isinstance(tensor, Pretended) and tensor.dim() for tensor in tensors):
             raise RuntimeError(f"{func}: tensors on two devices")
         goes_there = isinstance(args[0], Pretended) if func is aten.copy_.default else goes_there

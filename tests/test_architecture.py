@@ -43,7 +43,7 @@ CONFINED = {
     "safetensors": ["adaptation/super_resolution.py"],
     "skimage": ["evaluation/metrics.py"],
     "spandrel": ["adaptation/super_resolution.py"],
-    "tqdm": ["adaptation/detail.py", "adaptation/loop.py", "evaluation/tradeoff.py", "evaluation/evaluate.py"],
+    "tqdm": ["adaptation/detail.py", "adaptation/loop.py", "evaluation/backends.py", "evaluation/tradeoff.py", "evaluation/evaluate.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
 }

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 import tiny
+import torch
 from PIL import Image
 
 from mipmap_plugin import registry
-from mipmap_plugin.backends.conformance import Outcome
+from mipmap_plugin.backends.conformance import CASES, MORE, Outcome
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.commands.outputs import picture_names
@@ -261,13 +262,32 @@ def test_backends_lists_each_with_its_reasons(run, monkeypatch):
 
 def test_backends_check_prints_a_table_and_fails_if_a_case_does(run, monkeypatch):
     outcomes = [Outcome("fine", 1e-6, True, True, ""), Outcome("odd", 0.5, True, False, "the image differs")]
-    monkeypatch.setattr(backends_module, "check_backend", lambda backend, device: outcomes)
+    monkeypatch.setattr(backends_module, "CASES", {"one": None})
+    monkeypatch.setattr(backends_module, "check_backend", lambda backend, cases, device: outcomes)
     code, out, err = run("backends", "--check", "reference")
     assert code == 2 and "FAIL: the image differs" in out and "| fine " in out
     assert err == "mipmap-plugin: backend 'reference' fails 1 of 2 cases: odd\n"
     outcomes.pop()
     assert run("backends", "--check", "reference")[0] == 0
     refused(run("backends", "--check", "gpu"), "there is no 'gpu'")
+    refused(run("backends", "--full"), "say what, with --check NAME")
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_backends_check_goes_case_by_case_and_further_where_asked(full, run, monkeypatch):
+    """So that a bar can show how far it is; in one thread, and then in as many as before."""
+    asked, threads = [], torch.get_num_threads()
+
+    def one(backend, cases, device):
+        asked.append((list(cases), torch.get_num_threads()))
+        return [Outcome(case, 0.0, True, True, "") for case in cases]
+
+    monkeypatch.setattr(backends_module, "check_backend", one)
+    torch.set_num_threads(2)
+    assert run("backends", "--check", "reference", *(["--full"] if full else []))[0] == 0
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(threads)
+    assert asked == [([case], 1) for case in [*CASES, *(MORE if full else [])]]
 
 
 # One sentence, no traceback

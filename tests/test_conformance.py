@@ -13,9 +13,9 @@ from unittest import mock
 import pytest
 import torch
 
-from mipmap_plugin.backends import reference
+from mipmap_plugin.backends import get_backend, reference
 from mipmap_plugin.backends.base import Capabilities, Rendered
-from mipmap_plugin.backends.conformance import CASES, TOLERANCE, check_backend
+from mipmap_plugin.backends.conformance import CASES, MORE, TOLERANCE, check_backend
 from mipmap_plugin.backends.conformance.cases import random_scene
 from mipmap_plugin.backends.conformance.suite import BackendSuite
 from mipmap_plugin.backends.conformance.tolerance import PIXEL_BAND, differing_gradients, differing_images
@@ -35,6 +35,14 @@ class TestReference(BackendSuite):
 class TestCpu(BackendSuite):
     if MISSING is None:
         backend = importlib.import_module(CPU).CpuBackend()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["reference", "cpu"])
+def test_random_scenes_and_telescopes_equal_the_reference(name):
+    if name == "cpu" and MISSING is not None:
+        pytest.skip(f"{MISSING} is not there")
+    assert [outcome.message for outcome in check_backend(get_backend(name), MORE) if not outcome.passed] == []
 
 
 class LongGradients(ReferenceBackend):

@@ -6,6 +6,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation import optimizer as optimizer_module
 from mipmap_plugin.adaptation.density import (
     HALF_APART,
     SPLIT_SHRINK,
@@ -299,3 +300,15 @@ def test_every_rate_is_as_bold_as_the_run_may_be(student):
     set_rates(adam, config, 0.0, 0.25)
     rates = {group["name"]: group["lr"] for group in adam.param_groups}
     assert (rates["sh0"], rates["shN"], rates["scales"]) == pytest.approx((0.125, 0.05, config.rates.scales / 4))
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_older_torch_steps_as_far_without_a_kernel_of_its_own(student, monkeypatch, fused):
+    monkeypatch.setattr(optimizer_module, "FUSED", fused and optimizer_module.FUSED)
+    adam = make_optimizer(student, AdaptConfig(), pixel=1.0)
+    before = student.parameters()["means"].detach().clone()
+    for tensor in student.parameters().values():
+        tensor.grad = torch.ones_like(tensor)
+    adam.step()
+    moved = before - student.parameters()["means"].detach()
+    torch.testing.assert_close(moved, torch.full_like(moved, adam.param_groups[0]["lr"]), rtol=1e-3, atol=1e-7)

@@ -1,5 +1,6 @@
 """Merging: what a pair becomes has its weight, mean and covariance, and only like splats that share pixels are paired."""
 
+import math
 from dataclasses import replace
 
 import mip_checkpoints
@@ -157,3 +158,17 @@ def test_a_family_whose_splats_are_not_its_rows_says_so(tmp_path):
     assert base.adapt(1 / 4, steps=1, views="given").report.settings.merge_to == 1
     with pytest.raises(SettingsError, match="none are merged; leave merge_to out"):
         base.adapt(1 / 4, merge_to=0.5)
+
+
+@pytest.mark.parametrize("axes", [(0.3, 0.2, 0.0), (0.3, 0.0, 0.2), (0.0, 0.3, 0.2), (0.3, 0.2, 0.1)])
+def test_of_unequal_shapes_depth_is_weighed_by_all_three_sides(axes):
+    """Two that lie in one place and along the axes: the surface is the root of the squared products of each two half-axes."""
+
+    def surface(a: float, b: float, c: float) -> float:
+        return math.sqrt(a * a * b * b + b * b * c * c + c * c * a * a)
+
+    pair = replace(cloud(2), means=torch.zeros(2, 3), scales=torch.tensor([[*axes], [0.1, 0.1, 0.1]]), opacities=torch.tensor([0.6, 0.2]))
+    pair = replace(pair, quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1))
+    one = [math.sqrt((axis**2 + 0.1**2) / 2) for axis in axes]
+    depth = -math.log(0.4) * surface(*axes) - math.log(0.8) * surface(0.1, 0.1, 0.1)
+    torch.testing.assert_close(merged(pair, 0.5).opacities, torch.tensor([1 - math.exp(-depth / surface(*one))]))

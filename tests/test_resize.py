@@ -6,6 +6,7 @@ import torch
 from PIL import Image
 
 from mipmap_plugin.adaptation import upsamplers
+from mipmap_plugin.adaptation.resampling import matrix_of
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
 from mipmap_plugin.errors import PluginError, SettingsError
@@ -73,6 +74,35 @@ def test_bilinear_has_two_taps_and_no_prefilter(image, size):
 def test_a_constant_stays_and_the_same_size_is_the_same_image(image, method):
     torch.testing.assert_close(resize(torch.full((24, 30, 3), 0.7), (6, 10), method), torch.full((6, 10, 3), 0.7))
     assert resize(image, (24, 30), method) is image
+
+
+@pytest.mark.parametrize("size", [SMALLER, LARGER, (8, 45)])
+@pytest.mark.parametrize("method", ["area", "bilinear", "pil-bicubic", "lanczos"])
+def test_gradients_are_those_of_finite_differences(method, size):
+    image = torch.rand(13, 15, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda image: resize(image, size, method), image, fast_mode=True)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_any_floating_point_type_stays(image, dtype):
+    small = resize(image.to(dtype), SMALLER, "lanczos")
+    assert small.dtype == dtype
+    torch.testing.assert_close(small.float(), resize(image, SMALLER, "lanczos"), atol=8 * torch.finfo(dtype).eps + 1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("count", "wanted"), [(1, 9), (9, 1), (5187, 648), (7, 7000)])
+def test_one_pixel_and_thousands(count, wanted):
+    row = torch.rand(count, 1, 1, generator=torch.Generator().manual_seed(0))
+    found = resize(row, (wanted, 1), "lanczos")[:, 0, 0]
+    expected = Image.fromarray(row[:, :, 0].numpy()).resize((1, wanted), Image.Resampling.LANCZOS)
+    torch.testing.assert_close(found, torch.from_numpy(np.array(expected))[:, 0], atol=3e-6, rtol=0)
+
+
+def test_weights_are_made_once_a_size(image):
+    before = matrix_of.cache_info().misses
+    for _ in range(3):
+        resize(image, (11, 13), "lanczos")
+    assert matrix_of.cache_info().misses == before + 2  # one for each axis
 
 
 def test_gradients_flow(image):

@@ -113,8 +113,7 @@ def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
     views = views[:: -(-len(views) // ENOUGH_VIEWS)]
     finest, anywhere = (torch.full_like(means[:, 0], torch.inf) for _ in range(2))
     for view in views:
-        viewmat = view.viewmat.to(means)
-        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
+        x, y, z = view.to_camera(means).unbind(-1)
         size = z.abs() / (view.fx * view.fy) ** 0.5
         u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
         inside = (z > 0) & (u > 0) & (u < view.width) & (v > 0) & (v < view.height)

@@ -46,9 +46,8 @@ class ScreenGradients:
 
     def add(self, means: Tensor, gradient: Tensor, camera: Camera) -> None:
         """Take one view's `gradient` [N, 3] of the `means` [N, 3]."""
-        viewmat = camera.viewmat.to(means)
-        depths = (means.detach() @ viewmat[2, :3] + viewmat[2, 3]).abs()
-        across = gradient @ viewmat[:2, :3].T
+        depths = camera.to_camera(means.detach())[:, 2].abs()
+        across = gradient @ camera.viewmat[:2, :3].to(means).T
         per_ndc = across * depths[:, None] * across.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2
         norm = per_ndc.norm(dim=1)
         self.total += norm

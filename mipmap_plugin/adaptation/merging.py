@@ -14,6 +14,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+from mipmap_plugin.backends.eigen import eigh3
 from mipmap_plugin.backends.harmonics import C0
 from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.gaussians import Gaussians
@@ -139,7 +140,7 @@ class _Splats:
         def put(old: Tensor, values: Tensor) -> Tensor:
             return old[origin].masked_scatter(new.view(-1, *[1] * (old.dim() - 1)), values.to(old))
 
-        variances, directions = torch.linalg.eigh(self.covariances[new])
+        variances, directions = eigh3(self.covariances[new])
         directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
         opacities = -torch.expm1(-self.depth[new] / _surface(self.covariances[new]))
         share = (light / self.light[rows])[:, None, None]

@@ -15,6 +15,9 @@ from mipmap_plugin.models.base import CARRIED, SplatModel
 # INRIA's: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
 ADAM_EPS = 1e-15
 
+# From this version on torch has all of a step in one kernel for processors too.
+FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
+
 
 def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torch.optim.Adam:
     """One group per parameter that moves; that of means is in pixels of `pixel` world units."""
@@ -23,7 +26,8 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torc
     groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]
     if shared := list(model.shared_parameters().values()):
         groups.append({"params": shared, "lr": rates["networks"], "base_lr": rates["networks"], "name": "networks"})
-    return torch.optim.Adam(groups, betas=config.betas, eps=ADAM_EPS, fused=True)
+    fused = FUSED or all(tensor.is_cuda for group in groups for tensor in group["params"])
+    return torch.optim.Adam(groups, betas=config.betas, eps=ADAM_EPS, fused=fused)
 
 
 def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float, boldness: float, still: Collection[str] = ()) -> None:

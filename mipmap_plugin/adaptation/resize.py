@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import torch.nn.functional as F
 from torch import Tensor
 
+from mipmap_plugin.adaptation.resampling import resample
 from mipmap_plugin.errors import SettingsError
 
 
@@ -17,24 +17,15 @@ def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
     """
     if tuple(image.shape[:2]) == tuple(size):
         return image
-    planes = image.movedim(-1, 0)[None]
-    return _METHODS[method](planes, size)[0].movedim(0, -1)
+    if method == "box":
+        _check_box(image, size)
+    return resample(image, size, method)
 
 
-def _box(planes: Tensor, size: tuple[int, int]) -> Tensor:
-    ratios = [whole / part for whole, part in zip(planes.shape[2:], size, strict=True)]
-    if any(ratio != int(ratio) for ratio in ratios):
-        raise SettingsError(f"box: {list(planes.shape[2:])} px is not a whole multiple of {list(size)} px; use area")
-    return F.avg_pool2d(planes, [int(ratio) for ratio in ratios])
-
-
-_METHODS = {
-    "box": _box,
-    "area": lambda planes, size: F.interpolate(planes, size, mode="area"),
-    "bilinear": lambda planes, size: F.interpolate(planes, size, mode="bilinear", align_corners=False),
-    "pil-bicubic": lambda planes, size: F.interpolate(planes, size, mode="bicubic", antialias=True),
-    "lanczos": lambda planes, size: F.interpolate(planes, size, mode="lanczos", antialias=True),
-}
+def _check_box(image: Tensor, size: tuple[int, int]) -> None:
+    whole = list(image.shape[:2])
+    if any(pixels % wanted for pixels, wanted in zip(whole, size, strict=True)):
+        raise SettingsError(f"box: {whole} px is not a whole multiple of {list(size)} px; use area")
 
 
 def difference_from(target: Tensor, image: Tensor, method: str) -> Tensor:

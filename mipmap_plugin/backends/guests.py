@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import Backend, Needs
+from mipmap_plugin.backends.projection import unit
 from mipmap_plugin.backends.reference import finite_rows
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
@@ -37,6 +38,6 @@ def sound(gaussians: Gaussians) -> Gaussians:
 
 
 def turned(quats: Tensor) -> Tensor:
-    """`quats` [N, 4] with the identity where one is zero; others would divide by its length."""
-    zero = (quats == 0).all(1, keepdim=True)
-    return torch.where(zero, quats.new_tensor([1.0, 0.0, 0.0, 0.0]), quats)
+    """`quats` [N, 4] of norm 1, with the identity where one is zero; others would divide by a length that float32 does not hold."""
+    turns = unit(quats)
+    return torch.where((turns == 0).all(1, keepdim=True), turns.new_tensor([1.0, 0.0, 0.0, 0.0]), turns)

@@ -11,6 +11,10 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import FRUSTUM_MARGIN
 from mipmap_plugin.gaussians import Gaussians
 
+# A quaternion without a component of this size is no rotation, as one of zeros is: the shorter it is the steeper is its gradient, which
+# would leave float32.
+LEAST_QUATERNION = 1e-30
+
 
 @dataclass(frozen=True, eq=False)
 class Projected:
@@ -27,8 +31,7 @@ class Projected:
 def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: float = FRUSTUM_MARGIN) -> Projected:
     """Means, depths and covariances on the image plane. Splats nearer than `near` get finite values of no meaning."""
     viewmat = camera.viewmat.to(gaussians.means)
-    # Eye first: in a world far from its origin the rounding of rotation · mean + translation is larger than a pixel.
-    in_camera = (gaussians.means - camera.center.to(viewmat)) @ viewmat[:3, :3].T
+    in_camera = camera.to_camera(gaussians.means)
     depths = in_camera[:, 2]
     safe = depths.clamp_min(near)
     slopes = in_camera[:, :2] / safe[:, None]
@@ -44,15 +47,24 @@ def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: fl
 
 def rotations(quats: Tensor) -> Tensor:
     """Quaternions wxyz of any norm [N, 4] -> rotation matrices [N, 3, 3]; a zero quaternion is the identity."""
-    squared = quats.square().sum(-1, keepdim=True)
-    zero = squared == 0
-    # `where` before the root as well as after it: the root's gradient at 0 is infinite, and infinity times zero is NaN.
-    unit = torch.where(zero, 0.0, quats * torch.where(zero, 1.0, squared).rsqrt())
-    w, x, y, z = unit.unbind(-1)
+    w, x, y, z = unit(quats).unbind(-1)
     rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
             2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
             2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def unit(quats: Tensor) -> Tensor:
+    """Quaternions of any norm [N, 4] -> of norm 1, and zeros for a zero quaternion.
+
+    Divided by its largest component first, a quaternion's squares stay in range. That is taken as a constant, which is exact: the
+    result does not depend on it.
+    """
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    zero = largest < LEAST_QUATERNION
+    # `where` before the division and the root as well as after: their gradients at 0 are infinite, and infinity times zero is NaN.
+    scaled = torch.where(zero, 0.0, quats / torch.where(zero, 1.0, largest))
+    return scaled * torch.where(zero, 1.0, scaled.square().sum(-1, keepdim=True)).rsqrt()
 
 
 def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: float) -> Tensor:

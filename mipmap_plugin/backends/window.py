@@ -26,6 +26,7 @@ from mipmap_plugin.effects import MAX_ALPHA
 
 # px²: the least variance of a window along x or y.
 LEAST_VARIANCE = 1e-3
+NARROWEST = math.sqrt(12 * LEAST_VARIANCE)  # px, the width of such a window
 
 # A window of up to so many standard deviations is summed over points (five of Gauss and Legendre: right to 4e-8).
 WIDE = 1.5
@@ -74,9 +75,13 @@ class WindowIntegral(PixelIntegral):
         return torch.stack(seen, 1)
 
     def visible(self, min_alpha: Tensor) -> Tensor:
-        """[N] bool: finite, of some width, and bright enough to reach `min_alpha` [N] through the narrowest window."""
+        """[N] bool: finite, and bright enough to reach `min_alpha` [N] through the narrowest window.
+
+        No more of a splat is in a window than all of it, which leaves out what is too thin to have a gradient in float32.
+        """
         finite = torch.isfinite(torch.cat([self.packed(), self.xx[:, None], self.yy[:, None]], 1)).all(1)
-        return finite & (self.opacities >= min_alpha) & (self.short > 0)
+        shares = [(math.sqrt(2 * math.pi) * width / NARROWEST).clamp_max(1) for width in (self.long, self.short)]
+        return finite & (self.opacities * shares[0] * shares[1] >= min_alpha) & (self.short > 0)
 
     def extents(self, min_alpha: Tensor) -> Tensor:
         """[N, 2] px, without gradient: half-sizes of a box around all pixels with alpha >= `min_alpha` [N] in any window."""

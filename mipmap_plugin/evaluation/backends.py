@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
+from tqdm import tqdm
 
 from mipmap_plugin.backends import get_backend, note_of, survey
 from mipmap_plugin.backends.base import Needs
-from mipmap_plugin.backends.conformance import Outcome, check_backend
+from mipmap_plugin.backends.conformance import CASES, MORE, Outcome, check_backend
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.evaluation.report import markdown
 
@@ -30,17 +32,31 @@ def listing() -> list[Listed]:
     return [Listed(name, need.device, tuple(reasons), note_of(name)) for need in needs for name, reasons in survey(need).items()]
 
 
-def check(name: str) -> list[Outcome]:
-    """The conformance suite's outcome for each hard case, on the first device that the backend serves.
+def check(name: str, *, full: bool = False) -> list[Outcome]:
+    """The conformance suite's outcome for each hard case, on the first device that the backend serves; `full`: for random ones too.
 
     Raises SettingsError for an unknown backend, BackendUnavailable for one that serves none here.
     """
     backend = get_backend(name)
-    for device in _devices():
-        outcomes = check_backend(backend, device=device)
-        if not all(outcome.skipped for outcome in outcomes):
-            return outcomes
+    cases = {**CASES, **MORE} if full else CASES
+    with _one_thread():
+        for device in _devices():
+            shown = tqdm(cases.items(), disable=None, desc=f"checking {name} on {device}", unit="case")
+            outcomes = [outcome for case, build in shown for outcome in check_backend(backend, {case: build}, device=device)]
+            if not all(outcome.skipped for outcome in outcomes):
+                return outcomes
     raise BackendUnavailable(f"backend {name!r} cannot be checked here: {outcomes[0].message}")
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Images this small cost torch four times as much to share out among two threads as to compute in one."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def listing_table(rows: Sequence[Listed]) -> str:

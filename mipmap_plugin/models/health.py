@@ -102,7 +102,7 @@ def _poisonous(raw: dict[str, Tensor], scales: Tensor, opacities: Tensor) -> Ten
 
 
 def _rows(marked: Tensor) -> int:
-    return int(marked.any(tuple(range(1, marked.dim()))).sum()) if marked.dim() > 1 else int(marked.sum())
+    return int(marked.flatten(1).any(1).sum()) if marked.dim() > 1 else int(marked.sum())
 
 
 def _extent(means: Tensor) -> float:

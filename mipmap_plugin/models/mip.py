@@ -179,8 +179,7 @@ def filter_3d_of(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
     """
     nearest = torch.full_like(means[:, 0], torch.inf)
     for camera in cameras:
-        viewmat = camera.viewmat.to(means)
-        x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
+        x, y, z = camera.to_camera(means).unbind(-1)
         across, down = (camera.fx * x / z + camera.cx) / camera.width, (camera.fy * y / z + camera.cy) / camera.height
         inside = (torch.stack([across, down]) - 0.5).abs().amax(0) <= 0.5 + FRAME_MARGIN
         nearest = torch.where((z > NEAR_PLANE) & inside, torch.minimum(nearest, z), nearest)

@@ -21,7 +21,7 @@ def in_view(means: Tensor, scales: Tensor, quats: Tensor, camera: Camera) -> Ten
     `means` [N, 3], `scales` [N, 3] (lengths) and unit `quats` [N, 4] wxyz are the anchors' own, in world units.
     """
     viewmat = camera.viewmat.to(means)
-    x, y, z = ((means - camera.center.to(means)) @ viewmat[:3, :3].T).unbind(-1)
+    x, y, z = camera.to_camera(means).unbind(-1)
     depth = z.clamp_min(NEAR_PLANE)
     u, v = x / depth, y / depth
     radius = _radius(_axes(scales, quats) @ viewmat[:3, :3].T, u, v, depth, camera)

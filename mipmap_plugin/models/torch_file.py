@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,18 @@ from mipmap_plugin.files import new_file
 from mipmap_plugin.models.magic import read_head
 from mipmap_plugin.models.pickles import MOST_PACKED, refuse_hostile
 
-# What a NumPy scalar is pickled as, by NumPy 2 and by NumPy 1; learning-rate schedulers leave such scalars in checkpoints.
 _SCALAR: Any = np.float64(0).__reduce__()[0]
 _KINDS = [np.dtype(kind) for kind in (np.float64, np.float32, np.int64, np.int32, np.bool_)]
+
+
+def _named(module: str, name: str, made: Callable[..., Any]) -> Any:
+    """`made` under a name of NumPy's; torch takes the names of what is safe from the functions themselves."""
+
+    def stand_in(*values: Any) -> Any:
+        return made(*values)
+
+    stand_in.__module__, stand_in.__qualname__ = module, name
+    return stand_in
 
 
 def _number_type(name: str, *_: bool) -> np.dtype:
@@ -26,9 +36,10 @@ def _number_type(name: str, *_: bool) -> np.dtype:
     return next(kind for kind in _KINDS if kind.str[1:] == name)
 
 
+# What a NumPy scalar is pickled as, by NumPy 2 and by NumPy 1; learning-rate schedulers leave such scalars in checkpoints.
 _SAFE: list[Any] = [
-    *((_SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")),
-    (_number_type, "numpy.dtype"),
+    *(_named(module, "scalar", _SCALAR) for module in ("numpy._core.multiarray", "numpy.core.multiarray")),
+    _named("numpy", "dtype", _number_type),
     *map(type, _KINDS),
 ]
 
@@ -38,7 +49,7 @@ def load_torch(path: Path) -> Any:
     read_head(path, 512)
     try:
         refuse_hostile(path)
-        with torch.serialization.safe_globals(_SAFE):
+        with _allowing_scalars():
             content = torch.load(path, map_location="cpu", weights_only=True)
         storages: dict[int, int] = {}
         for tensor in _tensors(content):
@@ -50,6 +61,11 @@ def load_torch(path: Path) -> Any:
     except Exception as error:  # a damaged or hostile pickle may fail in any way
         reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
         raise CheckpointError(f"{path} is damaged, or holds more than plain tensors and is not executed; save it again ({reason})") from error
+
+
+def _allowing_scalars() -> AbstractContextManager[None]:
+    """NumPy's scalars may be read inside; older torch can be told of no exceptions and refuses a file with some, by their name."""
+    return torch.serialization.safe_globals(_SAFE) if hasattr(torch.serialization, "safe_globals") else nullcontext()
 
 
 def _tensors(content: Any) -> Iterator[Tensor]:

@@ -1,10 +1,11 @@
 """Conformance: hard cases on which every backend must equal the float64 reference.
 
-`check_backend` gives one `Outcome` a case. Authors of a backend subclass `BackendSuite` (in `.suite`, which needs pytest) in a test file.
+`check_backend` gives one `Outcome` a case; `MORE` are random scenes, which take some minutes. Authors of a backend subclass `BackendSuite`
+(in `.suite`, which needs pytest) in a test file.
 """
 
-from mipmap_plugin.backends.conformance.cases import CASES, Builder, HardCase
+from mipmap_plugin.backends.conformance.cases import CASES, MORE, Builder, HardCase
 from mipmap_plugin.backends.conformance.checks import Outcome, check_backend, check_case
 from mipmap_plugin.backends.conformance.tolerance import TOLERANCE, Tolerance
 
-__all__ = ["CASES", "TOLERANCE", "Builder", "HardCase", "Outcome", "Tolerance", "check_backend", "check_case"]
+__all__ = ["CASES", "MORE", "TOLERANCE", "Builder", "HardCase", "Outcome", "Tolerance", "check_backend", "check_case"]

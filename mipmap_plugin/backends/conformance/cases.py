@@ -155,6 +155,17 @@ def far_from_the_origin(shift: float = 1e6, size: float = 64.0) -> HardCase:
     return HardCase(gaussians, camera.looking_from(viewmat, ""), Effects(1))
 
 
+def long_lens(seed: int, screen_filter: str, focal: float = 171_310.0) -> HardCase:
+    """One splat through a telescope, 10 to 10,000 px long along each of its axes: it hardly changes over the image."""
+    rng = torch.Generator().manual_seed(seed)
+    spread = partial(torch.rand, generator=rng, dtype=torch.float64)
+    camera = replace(view(), fx=focal, fy=0.9 * focal)
+    pixel = 3 / focal
+    means = torch.cat([(spread(1, 2) - 0.5) * 18 * pixel, torch.full((1, 1), 3.0)], 1)
+    splat = Gaussians(means, spread(1, 4) - 0.5, 10 ** (1 + 3 * spread(1, 3)) * pixel, 0.3 + 0.5 * spread(1), spread(1, 4, 3) - 0.3)
+    return HardCase(splat, camera, Effects(1, screen_filter, USUAL_EPS2D[screen_filter]))
+
+
 def _row(**values: tuple[float, ...] | float) -> dict[str, Tensor]:
     return {name: torch.tensor(value, dtype=torch.float64) for name, value in values.items()}
 
@@ -179,12 +190,17 @@ ROWS = {
     "scale-0-on-two-axes": _row(scales=(0.3, 0.0, 0.0)),
     "scale-0-on-three-axes": _row(scales=(0.0, 0.0, 0.0)),
     "scale-1e-9": _row(scales=(1e-9, 2e-9, 3e-9)),
+    "scale-1e-20": _row(scales=(1e-20, 2e-20, 3e-20)),
+    "scale-1e-20-on-two-axes": _row(scales=(0.3, 1e-20, 2e-20)),
     "scale-1e4": _row(scales=(1e4, 2e4, 3e4)),
     "needle-1e12": _row(scales=(1e3, 1e-3, 2e-3), quats=TURN),
     "disc-1e12": _row(scales=(1e3, 2e3, 1e-3), quats=TURN),
     "quaternion-0": _row(quats=(0.0, 0.0, 0.0, 0.0)),
+    "quaternion-norm-1e-35": _row(quats=tuple(1e-35 * q for q in TURN)),
+    "quaternion-norm-1e-15": _row(quats=tuple(1e-15 * q for q in TURN)),
     "quaternion-norm-1e-3": _row(quats=tuple(1e-3 * q for q in TURN)),
     "quaternion-norm-1e3": _row(quats=tuple(1e3 * q for q in TURN)),
+    "quaternion-norm-1e25": _row(quats=tuple(1e25 * q for q in TURN)),
     "opacity-0": _row(opacities=0.0),
     "opacity-1": _row(opacities=1.0, scales=WIDE),
     "opacity-1-1e-7": _row(opacities=1 - 1e-7, scales=WIDE),
@@ -236,6 +252,8 @@ CASES: dict[str, Builder] = {
     "10000-opaque-in-one-pixel": in_one_pixel,
     "1e6-units-from-the-origin": far_from_the_origin,
     **{f"{name}-{kind}": partial(seen_by, camera, kind) for (name, camera), kind in product(CAMERAS.items(), FILTERS)},
+    **{f"long-lens-{seed}-{kind}": partial(long_lens, seed, kind) for seed, kind in product((1, 42), FILTERS)},
+    **{f"long-lens-{seed}-window": partial(long_lens, seed, "window") for seed in (35, 48)},
     **{f"sh-degree-{degree}": partial(of_degree, degree, degree) for degree in range(5)},
     "sh-bands-left-out": partial(of_degree, 3, 1),
     **{f"covariances-{kind}": partial(covariances_given, kind) for kind in FILTERS},
@@ -252,4 +270,10 @@ CASES: dict[str, Builder] = {
         f"random-{seed}-{kind}-{eps2d:.2g}": partial(random_scene, seed, kind, eps2d)
         for seed, kind, eps2d in product((1, 2), FILTERS, (DILATION, DILATION / 64))
     },
+}
+
+# What is looked at where there is time.
+MORE: dict[str, Builder] = {
+    **{f"random-{seed}-{kind}": partial(random_scene, seed, kind, USUAL_EPS2D[kind]) for seed, kind in product(range(3, 43), FILTERS)},
+    **{f"long-lens-{seed}-window": partial(long_lens, seed, "window") for seed in range(100) if f"long-lens-{seed}-window" not in CASES},
 }

@@ -12,6 +12,7 @@ xx·yy - xy² cancels for needles.
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import both, maximum, minimum, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, apply_transposed, blend, cross, dot, plus, times
+from mipmap_plugin.backends.projection import LEAST_QUATERNION
 
 
 @inner
@@ -164,5 +165,5 @@ def pull_rotation(quat, d_turn):
 def per_square(quat):
     """1 / the square of its norm; 0 for a zero quaternion."""
     w, x, y, z = quat
-    squared = w * w + x * x + y * y + z * z
-    return select(squared > 0, 1 / squared, 0.0)
+    largest = maximum(maximum(maximum(w, -w), maximum(x, -x)), maximum(maximum(y, -y), maximum(z, -z)))
+    return select(largest >= LEAST_QUATERNION, 1 / (w * w + x * x + y * y + z * z), 0.0)

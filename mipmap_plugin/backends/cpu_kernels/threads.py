@@ -87,6 +87,7 @@ def _dismiss_idle_threads() -> None:
 
 @cache
 def _openmp() -> ctypes.CDLL | None:
-    """The GNU OpenMP that torch brought; None where it brought none."""
+    """The GNU OpenMP that torch brought; None where it brought none, or one that cannot dismiss threads (before torch 2.2)."""
     libraries = sorted((Path(torch.__file__).parent / "lib").glob("libgomp*.so*"))
-    return ctypes.CDLL(str(libraries[0])) if libraries else None
+    openmp = ctypes.CDLL(str(libraries[0])) if libraries else None
+    return openmp if hasattr(openmp, "omp_pause_resource_all") else None

@@ -219,7 +219,42 @@ def pull_left(width, opacity, moment, per_rest, outcome, d_mean, d_new):
 
 @inner
 def pull_moments(u, width, per_sigma, moment, d_moment):
-    """The gradients by u, the width and log sigma. p, m and q have the degrees 0, 1 and 2 in (u, width, sigma): Euler gives the third."""
+    """The gradients by u, the width and log sigma, of `sums` or of `differences`, whichever is right for each lane."""
+    wide = width * per_sigma < WIDE
+    some = bits(wide)
+    if some == ALL:
+        return pull_sums(u, width, per_sigma, d_moment)
+    if some == 0:
+        return pull_differences(u, width, per_sigma, moment, d_moment)
+    d_u, d_width, grow = pull_sums(u, width, per_sigma, d_moment)
+    other_u, other_width, other_grow = pull_differences(u, width, per_sigma, moment, d_moment)
+    return select(wide, d_u, other_u), select(wide, d_width, other_width), select(wide, grow, other_grow)
+
+
+@inner
+def pull_sums(u, width, per_sigma, d_moment):
+    """Point by point: across a window that is narrow for its splat, the Gaussian's values at both ends differ by no more than rounding."""
+    d_u, d_width, grow = pull_point(u, width * 0, per_sigma, WEIGHTS[2], d_moment)
+    for k in (0, 1, 3, 4):
+        more_u, more_width, more_grow = pull_point(u, width * (0.5 * POINTS[k]), per_sigma, WEIGHTS[k], d_moment)
+        d_u, d_width, grow = d_u + more_u, d_width + more_width, grow + more_grow
+    return d_u, d_width / width, grow
+
+
+@inner
+def pull_point(u, s, per_sigma, weight, d_moment):
+    """What one point adds to the gradients by u, the logarithm of the width, and log sigma."""
+    d_p, d_m, d_q = d_moment
+    t = (u + s) * per_sigma
+    g = gaussian(t) * weight
+    fall = fma(fma(d_q, s, d_m), s, d_p) * g * t
+    d_u = 0 - fall * per_sigma
+    return d_u, fma(fma(d_q, s * 2, d_m), g, d_u) * s, fall * t
+
+
+@inner
+def pull_differences(u, width, per_sigma, moment, d_moment):
+    """From both ends. p, m and q have the degrees 0, 1 and 2 in (u, width, sigma): Euler gives the third gradient."""
     p, m, q = moment
     d_p, d_m, d_q = d_moment
     first, last = gaussian((u - width * 0.5) * per_sigma), gaussian((u + width * 0.5) * per_sigma)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+from mipmap_plugin.backends import projection
+
 LARGEST = tl.constexpr(3.4e38)
+LEAST_QUATERNION = tl.constexpr(projection.LEAST_QUATERNION)
 
 
 @triton.jit
@@ -38,9 +41,12 @@ def cross(ax, ay, az, bx, by, bz):
 @triton.jit
 def unit(w, x, y, z):
     """A quaternion over its length, and 1 / length; of a zero quaternion zeros, whose rotation is the identity."""
-    squared = w * w + x * x + y * y + z * z
-    scale = tl.where(squared == 0, 0.0, tl.rsqrt(tl.where(squared == 0, 1.0, squared)))
-    return w * scale, x * scale, y * scale, z * scale, scale
+    largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
+    zero = largest < LEAST_QUATERNION
+    per = tl.where(zero, 0.0, 1 / tl.where(zero, 1.0, largest))  # of its own size the squares would leave float32
+    w, x, y, z = w * per, x * per, y * per, z * per
+    scale = tl.rsqrt(tl.where(zero, 1.0, w * w + x * x + y * y + z * z))
+    return w * scale, x * scale, y * scale, z * scale, scale * per
 
 
 @triton.jit
