@@ -142,7 +142,8 @@ def test_warming_up_takes_one_step_on_one_view(monkeypatch):
     monkeypatch.setattr(ReferenceBackend, "render", render)
     model = wrapped()
     warm_up(model, 2, model.cameras)
-    assert drawn == {tuple(model.cameras[0].viewmat.flatten().tolist())}
+    assert tuple(model.cameras[0].viewmat.flatten().tolist()) in drawn
+    assert len(drawn) == 1 + 2 + 1  # two of validation, and where a splat is drawn to have kernels compiled
 
 
 # Poses

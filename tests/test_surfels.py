@@ -254,7 +254,7 @@ def test_merged_splats_are_flat_again():
 
 
 def test_merging_gives_fewer_and_flat(tmp_path):
-    adapted = wrap_model(folder(tmp_path / "model")).adapt(1 / 8, recipe="instant", merge_to=0.3)
+    adapted = wrap_model(folder(tmp_path / "model")).adapt(1 / 8, recipe="instant", merge_to=0.3, merging_costs=99)
     assert len(adapted.model) < 50
     assert "scale_2" not in read_ply(adapted.save(tmp_path / "a.ply")).columns
 

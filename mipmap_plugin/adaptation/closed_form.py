@@ -41,6 +41,9 @@ THINNEST = 0.01
 # for 1, but the tails of many overlap and cover more together than each adds: best between 1.15 and 1.3 on lego and chair at x1/2 to x1/8.
 AREA_POWER = 1.25
 
+# How far above the size at which a viewer leaves splats out the closed form keeps them: foreshortened, they are smaller.
+CLEAR_OF_CULLS = 2.0
+
 # Views that the distance and the area of a splat are taken from; more change a result of this accuracy by nothing.
 ENOUGH_VIEWS = 12
 
@@ -65,7 +68,8 @@ def closed_form(
     narrow = (wide - ((_width(target) - averaged) * target_pixel**2)[:, None]).clamp_min(0)
     if keeps_light(target.screen_filter):  # an area may become smaller by as much as the opacity can rise
         narrow = narrow.maximum(gaussians.opacities[:, None] * wide)
-    scales = narrow.sqrt().maximum((THINNEST * target_pixel)[:, None])
+    thinnest = torch.full_like(narrow, THINNEST**2).scatter(1, wide.topk(2, dim=1).indices, max(THINNEST**2, _least_variance(target)))
+    scales = narrow.maximum(thinnest * target_pixel[:, None].square()).sqrt()
     new = replace(gaussians, scales=scales)
     opacities = gaussians.opacities * _light(gaussians, views, base)
     # A splat of no size of its own rises most; a view from afar, in which every splat has none, must not raise it further.
@@ -120,6 +124,11 @@ def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
         finest = torch.where(inside, torch.minimum(finest, size), finest)
         anywhere = torch.minimum(anywhere, size)
     return torch.where(finest.isfinite(), finest, anywhere)
+
+
+def _least_variance(effects: Effects) -> float:
+    """Target px²: what the two longer axes of a splat must not fall below, so that a viewer does not leave it out for its size."""
+    return CLEAR_OF_CULLS * max(0.0, effects.settings.min_variance - _width(effects), effects.settings.least_spread)
 
 
 def _width(effects: Effects) -> float:

@@ -53,7 +53,7 @@ class Adapted:
     backend: Backend
     effects: Effects
     state: StateFile | None = None  # of the run, which is of use until the model is saved
-    views: Sequence[Camera] = ()  # of the base scale, that were adapted to
+    views: Sequence[Camera] = ()  # of the base scale, that were adapted to or selected on
 
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False) -> Rendered:
         """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`."""
@@ -138,7 +138,7 @@ class Session:
         why = "" if best == last else f", for {last} shows {found[last]:.2f} dB where it shows {found[best]:.2f}"
         curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=found[last], gaussians=_rows(states[last]))]
         report = self._report(states[best], curve, ended_by, f"{best}{why}", found)
-        return Adapted(states[best], report, self.backend, self.effects, self.state, self.views)
+        return Adapted(states[best], report, self.backend, self.effects, self.state, [*self.views, *self.validation.steering, *self.validation.choosing])
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists, and what ended it."""

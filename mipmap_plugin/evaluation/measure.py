@@ -117,7 +117,7 @@ def warm_watch(show: Show, view: Camera) -> Stopwatch:
 
 def warm_up(model: Wrapped, scale: float, cameras: Sequence[Camera]) -> None:
     """One step on one view, so that what compiles at first use is not billed to an adaptation."""
-    model.adapt(scale, cameras=cameras[:1], views="given" if cameras else "orbit", extra_views=1, steps=1)
+    model.adapt(scale, cameras=cameras[:1], views="given" if cameras else "orbit", extra_views=1, steps=1, validation_views=2)
 
 
 def seen_before(judged: Sequence[Camera], adapted: Sequence[Camera]) -> list[Camera]:
