@@ -106,7 +106,7 @@ _RATES_OUT = LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, s
 
 # What more time buys at zoom-out: twice the steps, twice the views in each, five times the views. At zoom-in there is nothing to buy
 # without a network.
-_THOROUGH_OUT = dict(_DEFAULT_OUT, steps=800, views_per_step=8, warm_up=0.125, extra_views=1000)
+_THOROUGH_OUT = dict(_DEFAULT_OUT, steps=2500, views_per_step=8, warm_up=0.05, extra_views=1000)
 
 # Of a zoom-out's splats, times the scale: at x1/8 a tenth is left, at x1/4 a fifth. Nearer to the base, where fewer share a pixel, twice
 # the scale's square: half at x1/2.
