@@ -180,6 +180,59 @@ def test_a_long_splat_keeps_its_shape(backend):
     torch.testing.assert_close(drawn, backend.render(long, camera(), plain.effects(Effects(0))).alpha, atol=1e-6, rtol=0)
 
 
+# The largest splats
+
+
+def weight(dx: float, dy: float, across: float, down: float) -> float:
+    return 0.8 * math.exp(-(dx**2 / across + dy**2 / down) / 2)
+
+
+@BOTH
+@pytest.mark.parametrize(("viewer", "most"), [("spark", 512), ("gaussian-splats-3d", 1024), ("antimatter15", 1024)])
+def test_a_half_axis_is_no_longer_than_the_viewer_lets_it(backend, viewer, most):
+    """Root of eight standard deviations are a half-axis: its variance is at most most²/8, and the other's stays."""
+    effects = find_viewer(viewer).effects(Effects(0))
+    effects = replace(effects, screen_filter="classic", settings=replace(effects.settings, packing=None, picture_step=None))
+    wide = replace(camera(), width=2400, height=3, cx=1200.0, cy=1.5)
+    shown = backend.render(splat(1e7, 4.0, 0.8), wide, effects).alpha[1]
+    assert shown[1200 + most - 1].item() == pytest.approx(weight(most - 0.5, 0, most**2 / 8, 4), abs=1e-4)
+    assert shown[1200 + most + 1] == 0 < shown[1200 - most + 1]
+
+
+@BOTH
+def test_in_playcanvas_each_half_axis_fits_into_the_picture(backend):
+    # 21 px are the picture's shorter side: a variance of 21²/8 px² at most; at 45 degrees the other axis keeps 4 px².
+    shown, end = alpha(backend, "playcanvas", splat(900.0, 4.0, 0.8, turn=math.pi / 4)), math.exp(-4)
+    for x, y in ((3, 3), (6, 5), (2, -2)):
+        along, across = (x + y) / math.sqrt(2), (x - y) / math.sqrt(2)
+        whole = weight(along, across, SIZE**2 / 8, 4.075) / 0.8
+        assert shown[MIDDLE + y, MIDDLE + x].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+
+
+@BOTH
+def test_a_round_splat_fits_into_the_picture_too(backend):
+    shown, end = alpha(backend, "playcanvas", splat(900.0, 900.0, 0.8)), math.exp(-4)
+    whole = weight(6, 3, SIZE**2 / 8, SIZE**2 / 8) / 0.8
+    assert shown[MIDDLE + 3, MIDDLE + 6].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+
+
+@BOTH
+def test_webgpu_makes_the_whole_splat_smaller(backend):
+    # Of 900 px² across, 21²/8 are left, and of 90 down as large a share.
+    shown, end = alpha(backend, "playcanvas-webgpu", splat(900.0, 90.0, 0.8)), math.exp(-4)
+    share = SIZE**2 / 8 / 900.075
+    whole = weight(5, 2, 900.075 * share, 90.075 * share) / 0.8
+    assert shown[MIDDLE + 2, MIDDLE + 5].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+
+
+@BOTH
+def test_a_half_axis_at_its_limit_does_not_feel_its_length(backend):
+    leaves, splats = differentiable(splat(900.0, 4.0, 0.8))
+    alpha(backend, "playcanvas", splats)[MIDDLE + 2, MIDDLE + 4].backward()
+    across, down = leaves["scales"].grad[0, :2].abs().tolist()
+    assert across < 1e-4 * down
+
+
 # What a culled splat feels
 
 
@@ -380,10 +433,11 @@ def test_what_a_viewer_does_is_on_and_the_rest_is_off():
     for viewer in VIEWERS.names():
         told[viewer] = {part.name for part in explain(find_viewer(viewer).effects(Effects(0)), splat(1.0, 1.0)) if part.on}
     assert told["classic"] == {"screen filter"}
-    assert told["spark"] == {"screen filter", "compensation", "edge", "frame", "color limit", "order by distance", "packing", "rounded picture"}
-    assert told["playcanvas"] == {"screen filter", "edge", "size cull", "color limit", "packing", "rounded picture"}
+    web = {"screen filter", "edge", "size limit", "packing", "rounded picture"}
+    assert told["spark"] == web | {"compensation", "frame", "color limit", "order by distance"}
+    assert told["playcanvas"] == web | {"size cull", "color limit"}
     assert told["playcanvas-webgpu"] == told["playcanvas"] | {"contribution cull"}
-    assert told["gaussian-splats-3d"] == {"screen filter", "edge", "frame", "stretching", "packing", "rounded picture"}
+    assert told["gaussian-splats-3d"] == web | {"frame", "stretching"}
 
 
 def test_the_usual_viewers_ask_for_nothing_new():
@@ -438,7 +492,14 @@ def test_a_splat_that_fades_needs_an_end():
         RenderSettings(fades=True)
 
 
+@pytest.mark.parametrize("limit", [{"max_half_axis": 512.0}, {"fits_picture": True}])
+def test_a_half_axis_that_is_limited_needs_an_end(limit):
+    with pytest.raises(SettingsError, match="give radius"):
+        RenderSettings(**limit)
+
+
 def test_sizes_keep_their_meaning_under_supersampling():
+    assert find_viewer("spark").settings.finer(2).max_half_axis == 1024
     usual, culled = Effects(0, supersampling=3), find_viewer("playcanvas").effects(Effects(0, supersampling=3))
     assert culled.settings.finer(3).min_variance == pytest.approx(9 / 8)
     assert usual.settings.finer(3) is usual.settings

@@ -27,6 +27,8 @@ SETTINGS = {
     "boxed": "culling by size along x and y",
     "min_contribution": "culling by contribution",
     "least_spread": "stretching of round splats",
+    "max_half_axis": "a largest splat",
+    "fits_picture": "splats no larger than the picture",
     "packing": "packing",
     "frozen_beyond": "projection that is frozen elsewhere or nowhere",
     "frame": "leaving out by the center",

@@ -93,4 +93,5 @@ def least_alpha(feet: Footprint | PixelIntegral, settings: RenderSettings) -> Te
 
 def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral]:
     projected = project(gaussians, camera, effects.near_plane, effects.settings.frozen_beyond)
-    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings)
+    most = effects.settings.max_variance(camera.width, camera.height)
+    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings, most)

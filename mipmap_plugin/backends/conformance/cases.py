@@ -223,6 +223,9 @@ RULES = {
     "largest-color": RenderSettings(max_color=0.6),
     "distance": RenderSettings(radial=True),
     "frame": RenderSettings(frame=0.7, frozen_beyond=math.inf),
+    "half-axis": RenderSettings(radius=2.0, max_half_axis=5.0),
+    "half-axis-of-the-whole": RenderSettings(radius=2.0, max_half_axis=5.0, boxed=True),
+    "picture-size": RenderSettings(radius=20.0, fits_picture=True),
 }
 
 CASES: dict[str, Builder] = {

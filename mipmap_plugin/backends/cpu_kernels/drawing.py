@@ -111,6 +111,7 @@ def view_of(camera: Camera, effects: Effects, splats: Splats, gradients: bool) -
         boxed=settings.boxed,
         min_contribution=float(settings.min_contribution),
         least_spread=float(settings.least_spread),
+        max_variance=settings.max_variance(camera.width, camera.height),
         felt=gradients,
     )
 
