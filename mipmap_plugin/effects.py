@@ -73,6 +73,7 @@ class RenderSettings:
     max_color: float | None = None  # of a splat, in each channel
     color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are the nearest multiples
     radial: bool = False  # nearer is what lies nearer to the eye, instead of what lies less deep
+    bucketed: bool = False  # the order is that of PlayCanvas's buckets of depth (`backends.buckets`)
     min_variance: float = 0.0  # px², after dilation: a splat is culled whose variance along its longer axis is less,
     boxed: bool = False  # or, where this is set, the larger of those along x and y; `max_half_axis` then measures those too
     min_contribution: float = 0.0  # px², after dilation: a splat is culled whose opacity · sqrt(det) is less
@@ -87,6 +88,8 @@ class RenderSettings:
     def __post_init__(self) -> None:
         if self.fades and self.radius is None:
             raise SettingsError("a splat that fades needs the radius at which it is gone; give radius, such as 8**0.5")
+        if self.radial and self.bucketed:
+            raise SettingsError("the order is that of distances or that of buckets of depth; give radial or bucketed, not both")
         if self.radius is None and (self.fits_picture or self.max_half_axis < math.inf):
             raise SettingsError("half-axes that are limited need the radius at which they end; give radius, such as 8**0.5")
 
@@ -222,6 +225,7 @@ def _of_a_viewer(settings: RenderSettings) -> list[Effect]:
          "a splat is drawn wherever its center lies", "two comparisons a splat"),
         ("color limit", limit is not None, f"no color is above {limit or 0:g}", "colors have no upper bound", "a comparison a channel and splat"),
         ("order by distance", settings.radial, "the nearest to the eye is in front", "the least deep is in front", "a root a splat"),
+        ("coarse order", settings.bucketed, "splats of one bucket of depth lie in any order", "the order is exact", "a sort of all splats"),
         ("rounded picture", settings.picture_step is not None, "8 bits after each splat", "rounded once it is shown", "the image once more"),
         ("packing", rounded, "the viewer keeps splats rounded", "splats are kept exactly", "a rounding for each number of a splat"),
     ]

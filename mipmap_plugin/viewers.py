@@ -57,6 +57,7 @@ PLAYCANVAS = replace(
     min_alpha=1 / 255,
     fades=True,
     min_variance=PIXEL_SIZE,
+    bucketed=True,
     max_half_axis=1024.0,
     fits_picture=True,
     max_color=4.0,
@@ -95,7 +96,7 @@ BUILT_IN = (
     Viewer("playcanvas", "PlayCanvas and SuperSplat, WebGL", PLAYCANVAS_SOURCE, "classic", DILATION / 4, PLAYCANVAS),
     Viewer(
         "playcanvas-webgpu", "PlayCanvas and SuperSplat, WebGPU", "playcanvas 2.23.3, compute-gsplat-common, gsplat-hybrid-renderer",
-        "classic", DILATION / 4, replace(PLAYCANVAS, boxed=True, min_contribution=CONTRIBUTION),
+        "classic", DILATION / 4, replace(PLAYCANVAS, bucketed=False, boxed=True, min_contribution=CONTRIBUTION),
     ),
     Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS),
     Viewer(

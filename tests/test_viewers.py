@@ -10,6 +10,7 @@ import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
 from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.buckets import ranks
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.gsplat import GsplatBackend
 from mipmap_plugin.backends.inria import InriaBackend
@@ -328,6 +329,40 @@ def test_spark_sorts_by_distance(backend):
     assert first["spark"] > 0.5 > first["classic"]
 
 
+def test_buckets_are_finer_near_the_camera():
+    """A box 960 deep with the camera in its middle: 32 bins of 30 units, 1025 buckets for 209 weights.
+
+    The bin before the camera has 20 weights, 98 buckets of 0.31 units; eleven bins from it, it is 1 weight, 4 buckets of 7.5 units.
+    """
+    depths = torch.tensor([10.0, 10.5, 310.0, 310.5, 311.0])
+    means = torch.zeros(6, 3)
+    means[1:, 2], means[0, 2] = depths, 0.0
+    means[1:, 0] = torch.tensor([4.0, 3.0, 2.0, 1.0, 0.0])  # Morton's order is that of x
+    scales = torch.full((6, 3), 1e-3)
+    scales[0] = 240.0  # the box ends at two of them
+    found = ranks(Gaussians(means, torch.ones(6, 4), scales, torch.ones(6), torch.zeros(6, 1, 3)), camera())
+    assert found[1] < found[2] < min(found[3:])  # by depth
+    assert found[5] < found[4] < found[3]  # by x
+
+
+@BOTH
+def test_playcanvas_sees_no_order_within_a_bucket(backend):
+    """A box so deep that two splats lie in one bucket: the one of the lower cell along x is in front, though it lies behind."""
+    near, far = splat(40.0, 40.0, 1.0, 1.0, means=(0.01, 0.0, 10.0)), splat(40.0, 40.0, 1.0, 0.0, means=(-0.01, 0.0, 10.01))
+    large = replace(splat(1.0, 1.0, means=(0.0, 0.0, -50.0)), scales=torch.full((1, 3), 1e3))
+    drawn = {}
+    for others in ((), (large,)):
+        parts = (near, far, *others)
+        together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(near) if f.name != "covariances"))
+        drawn[len(parts)] = backend.render(together, camera(), find_viewer("playcanvas").effects(Effects(0))).image[MIDDLE, MIDDLE, 0].item()
+    assert drawn[2] > 0.9 and drawn[3] < 0.1
+
+
+def test_the_order_is_one_or_the_other():
+    with pytest.raises(SettingsError, match="give radial or bucketed"):
+        RenderSettings(radial=True, bucketed=True)
+
+
 # Pictures of 8 bits
 
 
@@ -435,8 +470,8 @@ def test_what_a_viewer_does_is_on_and_the_rest_is_off():
     assert told["classic"] == {"screen filter"}
     web = {"screen filter", "edge", "size limit", "packing", "rounded picture"}
     assert told["spark"] == web | {"compensation", "frame", "color limit", "order by distance"}
-    assert told["playcanvas"] == web | {"size cull", "color limit"}
-    assert told["playcanvas-webgpu"] == told["playcanvas"] | {"contribution cull"}
+    assert told["playcanvas"] == web | {"size cull", "color limit", "coarse order"}
+    assert told["playcanvas-webgpu"] == told["playcanvas"] - {"coarse order"} | {"contribution cull"}
     assert told["gaussian-splats-3d"] == web | {"frame", "stretching"}
 
 

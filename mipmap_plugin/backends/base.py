@@ -23,6 +23,7 @@ SETTINGS = {
     "max_color": "a largest color",
     "color_steps": "rounded colors",
     "radial": "splats in the order of their distance",
+    "bucketed": "splats in the order of buckets of depth",
     "min_variance": "culling by size",
     "boxed": "culling by size along x and y",
     "min_contribution": "culling by contribution",
@@ -37,7 +38,7 @@ SETTINGS = {
 
 # Of these, what screen filters that integrate have: the others are about a splat's weight at a point.
 OF_INTEGRALS = frozenset(
-    {"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "frozen_beyond", "frame", "packing"}
+    {"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "bucketed", "frozen_beyond", "frame", "packing"}
 )
 
 # Raised when `Backend.render` or the records below change in a way that an old backend cannot serve.
