@@ -97,6 +97,7 @@ BUILT_IN = (
     Viewer(
         "playcanvas-webgpu", "PlayCanvas and SuperSplat, WebGPU", "playcanvas 2.23.3, compute-gsplat-common, gsplat-hybrid-renderer",
         "classic", DILATION / 4, replace(PLAYCANVAS, bucketed=False, boxed=True, min_contribution=CONTRIBUTION),
+        unlike="amid splats much larger than the picture it shows something else here and there, 40 dB away",
     ),
     Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS),
     Viewer(
