@@ -77,10 +77,13 @@ class RenderSettings:
     max_color: float | None = None  # of a splat, in each channel
     color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are the nearest multiples
     radial: bool = False  # nearer is what lies nearer to the eye, instead of what lies less deep
+    bucketed: bool = False  # the order is that of PlayCanvas's buckets of depth (`backends.buckets`)
     min_variance: float = 0.0  # px², after dilation: a splat is culled whose variance along its longer axis is less,
-    boxed: bool = False  # or, where this is set, the larger of those along x and y
+    boxed: bool = False  # or, where this is set, the larger of those along x and y; `max_half_axis` then measures those too
     min_contribution: float = 0.0  # px², after dilation: a splat is culled whose opacity · sqrt(det) is less
     least_spread: float = 0.0  # px², after dilation: variances lie at least so far from their mean; a splat whose smaller one is then 0 is culled
+    max_half_axis: float = math.inf  # px, at `radius`: a longer half-axis is made so long; with `boxed` the whole splat is made smaller
+    fits_picture: bool = False  # nor is a half-axis longer than the picture's shorter side
     packing: Packing | None = None  # how coarsely splats are kept
     frozen_beyond: float = FRUSTUM_MARGIN  # infinity: the Jacobian is frozen nowhere
     frame: float = math.inf  # halves of the picture from its middle: a splat whose center lies beyond, along x or y, is not drawn
@@ -89,10 +92,19 @@ class RenderSettings:
     def __post_init__(self) -> None:
         if self.fades and self.radius is None:
             raise SettingsError("a splat that fades needs the radius at which it is gone; give radius, such as 8**0.5")
+        if self.radial and self.bucketed:
+            raise SettingsError("the order is that of distances or that of buckets of depth; give radial or bucketed, not both")
+        if self.radius is None and (self.fits_picture or self.max_half_axis < math.inf):
+            raise SettingsError("half-axes that are limited need the radius at which they end; give radius, such as 8**0.5")
 
     @property
     def culls(self) -> bool:
         return max(self.min_variance, self.min_contribution, self.least_spread) > 0
+
+    def max_variance(self, width: int, height: int) -> float:
+        """px²: the most that a splat's variances may be in a picture of this size, after dilation."""
+        longest = min(self.max_half_axis, width, height) if self.fits_picture else self.max_half_axis
+        return math.inf if self.radius is None else (longest / self.radius) ** 2
 
     def changed(self) -> list[str]:
         """The names of what is not as usual."""
@@ -106,7 +118,7 @@ class RenderSettings:
     def finer(self, n: int) -> RenderSettings:
         """The same for an image of n times as many pixels each way: areas in px² keep their size in pixels of the coarse one."""
         areas = {name: getattr(self, name) * n**2 for name in ("min_variance", "min_contribution", "least_spread")}
-        return replace(self, **areas) if self.culls else self
+        return replace(self, **areas, max_half_axis=self.max_half_axis * n) if self.culls or self.max_half_axis < math.inf else self
 
 
 USUAL = RenderSettings()
@@ -202,6 +214,9 @@ def _of_a_viewer(settings: RenderSettings) -> list[Effect]:
     which = "larger variance along x and y" if settings.boxed else "variance along its longer axis"
     culled = "not drawn is a splat whose"
     stretched = f"variances lie {spread:.3g} px² from their mean at least, and a splat that would end at 0 is not drawn"
+    largest = settings.fits_picture or settings.max_half_axis < math.inf
+    longest = [f"{settings.max_half_axis:g} px"] * (settings.max_half_axis < math.inf) + ["the picture's shorter side"] * settings.fits_picture
+    limited = f"a splat's half-axes are no longer than {' and '.join(longest)}"
     root, limit = "a root and a comparison a splat", settings.max_color
     rounded = settings.packing is not None or settings.color_steps is not None
     parts = [
@@ -209,10 +224,12 @@ def _of_a_viewer(settings: RenderSettings) -> list[Effect]:
         ("size cull", size > 0, f"{culled} {which} is below {size:.3g} px²", "no splat is too small to be drawn", root),
         ("contribution cull", light > 0, f"{culled} opacity · sqrt(det) is below {light:.3g} px²", "no splat gives too little", root),
         ("stretching", spread > 0, stretched, "round splats stay round", "two roots and four quotients a splat"),
+        ("size limit", largest, limited, "no splat is too large", "a root and two quotients a splat"),
         ("frame", settings.frame < math.inf, f"not drawn is a splat whose center lies {settings.frame:g} half pictures from the middle",
          "a splat is drawn wherever its center lies", "two comparisons a splat"),
         ("color limit", limit is not None, f"no color is above {limit or 0:g}", "colors have no upper bound", "a comparison a channel and splat"),
         ("order by distance", settings.radial, "the nearest to the eye is in front", "the least deep is in front", "a root a splat"),
+        ("coarse order", settings.bucketed, "splats of one bucket of depth lie in any order", "the order is exact", "a sort of all splats"),
         ("rounded picture", settings.picture_step is not None, "8 bits after each splat", "rounded once it is shown", "the image once more"),
         ("packing", rounded, "the viewer keeps splats rounded", "splats are kept exactly", "a rounding for each number of a splat"),
     ]

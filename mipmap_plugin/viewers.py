@@ -2,8 +2,7 @@
 
 Read in the sources of the versions named, which count variances in other units: where a viewer's focal length is viewport · projection, and
 so twice that of the picture, a variance of v there is v/4 px² here; where its covariances are four times as large besides, v/16. What every
-WebGL viewer has in common is `WEBGL`. What no record has: the limit of a splat's size (512 px in Spark, 1024 px or the picture's size in others),
-and the coarse order of depths in which PlayCanvas draws on WebGL.
+WebGL viewer has in common is `WEBGL`.
 """
 
 from __future__ import annotations
@@ -58,6 +57,9 @@ PLAYCANVAS = replace(
     min_alpha=1 / 255,
     fades=True,
     min_variance=PIXEL_SIZE,
+    bucketed=True,
+    max_half_axis=1024.0,
+    fits_picture=True,
     max_color=4.0,
     color_steps=(4 / 2047, 4 / 2047, 4 / 1023),
     packing=Packing(log_scales=(-12 + 21 / 255, 9.0, 21 / 255), quats="stereographic"),
@@ -84,7 +86,7 @@ BUILT_IN = (
         "spark", "Spark (three.js)", "@sparkjsdev/spark 2.2.0, SparkRenderer, vertex and fragment shader, packSplatEncoding",
         "mip", DILATION,
         replace(
-            WEBGL, frame=1.4, radial=True, max_color=1.0, color_steps=(1 / 255, 1 / 255, 1 / 255),
+            WEBGL, frame=1.4, max_half_axis=512.0, radial=True, max_color=1.0, color_steps=(1 / 255, 1 / 255, 1 / 255),
             packing=Packing(
                 opacity=(1 / 255, 2 / 255), color=1 / 255, bands=(1 / 63, 1 / 127, 1 / 31),
                 log_scales=(-12.0, 9.0, 21 / 254), quats="octahedral", half_means=True,
@@ -94,17 +96,20 @@ BUILT_IN = (
     Viewer("playcanvas", "PlayCanvas and SuperSplat, WebGL", PLAYCANVAS_SOURCE, "classic", DILATION / 4, PLAYCANVAS),
     Viewer(
         "playcanvas-webgpu", "PlayCanvas and SuperSplat, WebGPU", "playcanvas 2.23.3, compute-gsplat-common, gsplat-hybrid-renderer",
-        "classic", DILATION / 4, replace(PLAYCANVAS, boxed=True, min_contribution=CONTRIBUTION),
+        "classic", DILATION / 4, replace(PLAYCANVAS, bucketed=False, boxed=True, min_contribution=CONTRIBUTION),
+        unlike="amid splats much larger than the picture it shows something else here and there, 40 dB away",
     ),
     Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS),
     Viewer(
         "gaussian-splats-3d", "GaussianSplats3D", "@mkkellogg/gaussian-splats-3d 0.4.7, SplatMaterial3D",
-        "classic", DILATION, replace(WEBGL, frame=1.2, least_spread=0.1**0.5, packing=replace(EIGHT_BITS, downwards=True)), sh_degree=0,
+        "classic", DILATION,
+        replace(WEBGL, frame=1.2, max_half_axis=1024.0, least_spread=0.1**0.5, packing=replace(EIGHT_BITS, downwards=True)), sh_degree=0,
         unlike="degree 0 is its default, and 2 what it can be asked for",
     ),
     Viewer(
         "antimatter15", "antimatter15/splat", "antimatter15/splat ba182b5, main.js", "classic", 0.0,
-        replace(WEBGL, frame=1.2, packing=EIGHT_BITS), sh_degree=0, unlike="covariances are kept in float16; not compared with a picture",
+        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS), sh_degree=0,
+        unlike="covariances are kept in float16; not compared with a picture",
     ),
     Viewer(
         "cesium", "Cesium", "@cesium/engine 24.0.0, PrimitiveGaussianSplat shaders; cesium-wasm-utils, wasm-splats", "classic", DILATION / 16,

@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -74,6 +75,13 @@ def test_inspect_as_json(run, tmp_path):
     assert code == 0
     assert (facts["family"], facts["splats"], facts["cameras"]) == ("3dgs", 60, "none beside the checkpoint")
     assert isinstance(facts["effects"], list) and isinstance(facts["notes"], list)
+
+
+def test_inspect_says_how_far_viewers_are_from_training(run, model_folder):
+    pytest.importorskip("numba")
+    [line] = [line for line in run("inspect", model_folder)[1].splitlines() if line.startswith("viewers:")]
+    assert re.fullmatch(r"viewers: +spark .* dB, classic the same, antialiased .* dB, beside how it was trained, at x1 in 3 views", line)
+    assert "viewers:      not asked for" in run("inspect", model_folder, "--no-viewers")[1]
 
 
 def test_inspect_of_an_iteration(run, model_folder):

@@ -10,6 +10,7 @@ import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
 from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.buckets import ranks
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.gsplat import GsplatBackend
 from mipmap_plugin.backends.inria import InriaBackend
@@ -180,6 +181,59 @@ def test_a_long_splat_keeps_its_shape(backend):
     torch.testing.assert_close(drawn, backend.render(long, camera(), plain.effects(Effects(0))).alpha, atol=1e-6, rtol=0)
 
 
+# The largest splats
+
+
+def weight(dx: float, dy: float, across: float, down: float) -> float:
+    return 0.8 * math.exp(-(dx**2 / across + dy**2 / down) / 2)
+
+
+@BOTH
+@pytest.mark.parametrize(("viewer", "most"), [("spark", 512), ("gaussian-splats-3d", 1024), ("antimatter15", 1024)])
+def test_a_half_axis_is_no_longer_than_the_viewer_lets_it(backend, viewer, most):
+    """Root of eight standard deviations are a half-axis: its variance is at most most²/8, and the other's stays."""
+    effects = find_viewer(viewer).effects(Effects(0))
+    effects = replace(effects, screen_filter="classic", settings=replace(effects.settings, packing=None, picture_step=None))
+    wide = replace(camera(), width=2400, height=3, cx=1200.0, cy=1.5)
+    shown = backend.render(splat(1e7, 4.0, 0.8), wide, effects).alpha[1]
+    assert shown[1200 + most - 1].item() == pytest.approx(weight(most - 0.5, 0, most**2 / 8, 4), abs=1e-4)
+    assert shown[1200 + most + 1] == 0 < shown[1200 - most + 1]
+
+
+@BOTH
+def test_in_playcanvas_each_half_axis_fits_into_the_picture(backend):
+    # 21 px are the picture's shorter side: a variance of 21²/8 px² at most; at 45 degrees the other axis keeps 4 px².
+    shown, end = alpha(backend, "playcanvas", splat(900.0, 4.0, 0.8, turn=math.pi / 4)), math.exp(-4)
+    for x, y in ((3, 3), (6, 5), (2, -2)):
+        along, across = (x + y) / math.sqrt(2), (x - y) / math.sqrt(2)
+        whole = weight(along, across, SIZE**2 / 8, 4.075) / 0.8
+        assert shown[MIDDLE + y, MIDDLE + x].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+
+
+@BOTH
+def test_a_round_splat_fits_into_the_picture_too(backend):
+    shown, end = alpha(backend, "playcanvas", splat(900.0, 900.0, 0.8)), math.exp(-4)
+    whole = weight(6, 3, SIZE**2 / 8, SIZE**2 / 8) / 0.8
+    assert shown[MIDDLE + 3, MIDDLE + 6].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+
+
+@BOTH
+def test_webgpu_makes_the_whole_splat_smaller(backend):
+    # Of 900 px² across, 21²/8 are left, and of 90 down as large a share.
+    shown, end = alpha(backend, "playcanvas-webgpu", splat(900.0, 90.0, 0.8)), math.exp(-4)
+    share = SIZE**2 / 8 / 900.075
+    whole = weight(5, 2, 900.075 * share, 90.075 * share) / 0.8
+    assert shown[MIDDLE + 2, MIDDLE + 5].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+
+
+@BOTH
+def test_a_half_axis_at_its_limit_does_not_feel_its_length(backend):
+    leaves, splats = differentiable(splat(900.0, 4.0, 0.8))
+    alpha(backend, "playcanvas", splats)[MIDDLE + 2, MIDDLE + 4].backward()
+    across, down = leaves["scales"].grad[0, :2].abs().tolist()
+    assert across < 1e-4 * down
+
+
 # What a culled splat feels
 
 
@@ -273,6 +327,40 @@ def test_spark_sorts_by_distance(backend):
     wide = replace(camera(), width=120, cx=60.0)
     first = {name: backend.render(pair, wide, find_viewer(name).effects(Effects(0))).image[MIDDLE, 82, 0].item() for name in ("spark", "classic")}
     assert first["spark"] > 0.5 > first["classic"]
+
+
+def test_buckets_are_finer_near_the_camera():
+    """A box 960 deep with the camera in its middle: 32 bins of 30 units, 1025 buckets for 209 weights.
+
+    The bin before the camera has 20 weights, 98 buckets of 0.31 units; eleven bins from it, it is 1 weight, 4 buckets of 7.5 units.
+    """
+    depths = torch.tensor([10.0, 10.5, 310.0, 310.5, 311.0])
+    means = torch.zeros(6, 3)
+    means[1:, 2], means[0, 2] = depths, 0.0
+    means[1:, 0] = torch.tensor([4.0, 3.0, 2.0, 1.0, 0.0])  # Morton's order is that of x
+    scales = torch.full((6, 3), 1e-3)
+    scales[0] = 240.0  # the box ends at two of them
+    found = ranks(Gaussians(means, torch.ones(6, 4), scales, torch.ones(6), torch.zeros(6, 1, 3)), camera())
+    assert found[1] < found[2] < min(found[3:])  # by depth
+    assert found[5] < found[4] < found[3]  # by x
+
+
+@BOTH
+def test_playcanvas_sees_no_order_within_a_bucket(backend):
+    """A box so deep that two splats lie in one bucket: the one of the lower cell along x is in front, though it lies behind."""
+    near, far = splat(40.0, 40.0, 1.0, 1.0, means=(0.01, 0.0, 10.0)), splat(40.0, 40.0, 1.0, 0.0, means=(-0.01, 0.0, 10.01))
+    large = replace(splat(1.0, 1.0, means=(0.0, 0.0, -50.0)), scales=torch.full((1, 3), 1e3))
+    drawn = {}
+    for others in ((), (large,)):
+        parts = (near, far, *others)
+        together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(near) if f.name != "covariances"))
+        drawn[len(parts)] = backend.render(together, camera(), find_viewer("playcanvas").effects(Effects(0))).image[MIDDLE, MIDDLE, 0].item()
+    assert drawn[2] > 0.9 and drawn[3] < 0.1
+
+
+def test_the_order_is_one_or_the_other():
+    with pytest.raises(SettingsError, match="give radial or bucketed"):
+        RenderSettings(radial=True, bucketed=True)
 
 
 # Pictures of 8 bits
@@ -380,10 +468,11 @@ def test_what_a_viewer_does_is_on_and_the_rest_is_off():
     for viewer in VIEWERS.names():
         told[viewer] = {part.name for part in explain(find_viewer(viewer).effects(Effects(0)), splat(1.0, 1.0)) if part.on}
     assert told["classic"] == {"screen filter"}
-    assert told["spark"] == {"screen filter", "compensation", "edge", "frame", "color limit", "order by distance", "packing", "rounded picture"}
-    assert told["playcanvas"] == {"screen filter", "edge", "size cull", "color limit", "packing", "rounded picture"}
-    assert told["playcanvas-webgpu"] == told["playcanvas"] | {"contribution cull"}
-    assert told["gaussian-splats-3d"] == {"screen filter", "edge", "frame", "stretching", "packing", "rounded picture"}
+    web = {"screen filter", "edge", "size limit", "packing", "rounded picture"}
+    assert told["spark"] == web | {"compensation", "frame", "color limit", "order by distance"}
+    assert told["playcanvas"] == web | {"size cull", "color limit", "coarse order"}
+    assert told["playcanvas-webgpu"] == told["playcanvas"] - {"coarse order"} | {"contribution cull"}
+    assert told["gaussian-splats-3d"] == web | {"frame", "stretching"}
 
 
 def test_the_usual_viewers_ask_for_nothing_new():
@@ -438,7 +527,14 @@ def test_a_splat_that_fades_needs_an_end():
         RenderSettings(fades=True)
 
 
+@pytest.mark.parametrize("limit", [{"max_half_axis": 512.0}, {"fits_picture": True}])
+def test_a_half_axis_that_is_limited_needs_an_end(limit):
+    with pytest.raises(SettingsError, match="give radius"):
+        RenderSettings(**limit)
+
+
 def test_sizes_keep_their_meaning_under_supersampling():
+    assert find_viewer("spark").settings.finer(2).max_half_axis == 1024
     usual, culled = Effects(0, supersampling=3), find_viewer("playcanvas").effects(Effects(0, supersampling=3))
     assert culled.settings.finer(3).min_variance == pytest.approx(9 / 8)
     assert usual.settings.finer(3) is usual.settings

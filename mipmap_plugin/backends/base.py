@@ -23,10 +23,13 @@ SETTINGS = {
     "max_color": "a largest color",
     "color_steps": "rounded colors",
     "radial": "splats in the order of their distance",
+    "bucketed": "splats in the order of buckets of depth",
     "min_variance": "culling by size",
     "boxed": "culling by size along x and y",
     "min_contribution": "culling by contribution",
     "least_spread": "stretching of round splats",
+    "max_half_axis": "a largest splat",
+    "fits_picture": "splats no larger than the picture",
     "packing": "packing",
     "frozen_beyond": "projection that is frozen elsewhere or nowhere",
     "frame": "leaving out by the center",
@@ -35,7 +38,7 @@ SETTINGS = {
 
 # Of these, what screen filters that integrate have: the others are about a splat's weight at a point.
 OF_INTEGRALS = frozenset(
-    {"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "frozen_beyond", "frame", "packing"}
+    {"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "bucketed", "frozen_beyond", "frame", "packing"}
 )
 
 # Raised when `Backend.render` or the records below change in a way that an old backend cannot serve.

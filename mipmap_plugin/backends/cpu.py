@@ -7,6 +7,7 @@ import importlib.util
 import torch
 from torch.autograd.function import once_differentiable
 
+from mipmap_plugin.backends import buckets
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
 from mipmap_plugin.backends.packing import packed
 from mipmap_plugin.camera import Camera
@@ -18,7 +19,7 @@ NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
 
 
 # Which of `_Draw.forward`'s arguments the coefficients are.
-SH = 6
+SH = 7
 
 
 class CpuBackend:
@@ -36,7 +37,7 @@ class CpuBackend:
 
     def lacking(self, needs: Needs) -> list[str]:
         missing = [] if importlib.util.find_spec("numba") else [NO_NUMBA]
-        served = {"max_color", "color_steps", "radial", "frozen_beyond", "packing"}
+        served = {"max_color", "color_steps", "radial", "bucketed", "frozen_beyond", "packing"}
         changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - served
         fixed = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
         return missing + self.capabilities.lacking(needs) + fixed
@@ -48,7 +49,8 @@ class CpuBackend:
             raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
         packing = effects.settings.packing
         g = gaussians if packing is None else packed(gaussians, camera, packing)
-        image, alpha = _Draw.apply(camera, effects, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)
+        ranks = buckets.ranks(gaussians, camera).numpy() if effects.settings.bucketed else None
+        image, alpha = _Draw.apply(camera, effects, ranks, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)
         return Rendered(image, alpha)
 
 
@@ -65,9 +67,9 @@ def _drawing():
 
 class _Draw(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, camera, effects, *tensors):
+    def forward(ctx, camera, effects, ranks, *tensors):
         drawing, differentiated = _drawing(), any(ctx.needs_input_grad)
-        image, alpha, ctx.drawing = drawing.draw(drawing.splats_of(*tensors), camera, effects, gradients=differentiated)
+        image, alpha, ctx.drawing = drawing.draw(drawing.splats_of(*tensors), camera, effects, ranks, gradients=differentiated)
         ctx.save_for_backward(*tensors)
         return torch.from_numpy(image), torch.from_numpy(alpha)
 
@@ -79,4 +81,4 @@ class _Draw(torch.autograd.Function):
         grads = _drawing().draw_back(ctx.drawing, *d_frame, harmonics=ctx.needs_input_grad[SH])
         # What nobody asks for, and of the two ways to give a shape the one that was not taken, has no gradient, and no rows.
         pairs = zip(tensors, grads, strict=True)
-        return None, None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in pairs)
+        return None, None, None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in pairs)

@@ -58,3 +58,25 @@ def stretched(shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least
     cos, sin = least * (xy.square() - up.square()) / squared, least * 2 * xy * up / squared
     stretch = mean + cos, sin, mean - cos, mean.square() - least**2
     return tuple(torch.where(changed, new, old) for new, old in zip(stretch, shape, strict=True))  # type: ignore[return-value]
+
+
+def limited(shape: tuple[Tensor, Tensor, Tensor, Tensor], most: float, whole: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The shapes [N] of splats whose variances along their axes are at most `most` px²; `whole`: all of a splat shrinks, until those along
+    x and y are.
+
+    What becomes of the eigenvalues of a matrix M while its eigenvectors stay is a·M + b·1 (Cayley and Hamilton). With variances
+    long > most > short that is a = (most - short) / (long - short) and b = short · (long - most) / (long - short), sums without cancellation.
+    """
+    xx, xy, yy, det = shape
+    if whole:
+        a, b = most / torch.maximum(xx, yy).clamp_min(most), torch.zeros_like(xx)
+    else:
+        long = (xx + yy) / 2 + spread(shape)
+        short = det / torch.where(long > 0, long, 1.0)
+        one, both = (long > most) & (short < most), (long > most) & (short >= most)
+        apart = torch.where(one, long - short, 1.0)
+        a = torch.where(one, (most - short) / apart, torch.where(both, 0.0, 1.0))
+        b = torch.where(one, short * (long - most) / apart, torch.where(both, most, 0.0))
+    new = a * xx + b, a * xy, a * yy + b, a.square() * det + a * b * (xx + yy) + b.square()
+    changed = (a < 1) | (b > 0)
+    return tuple(torch.where(changed, limit, old) for limit, old in zip(new, shape, strict=True))  # type: ignore[return-value]

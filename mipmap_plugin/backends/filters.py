@@ -85,12 +85,18 @@ class Footprint:
 
 
 def footprint(
-    projected: Projected, opacities: Tensor, screen_filter: str, eps2d: float, settings: RenderSettings = USUAL
+    projected: Projected,
+    opacities: Tensor,
+    screen_filter: str,
+    eps2d: float,
+    settings: RenderSettings = USUAL,
+    max_variance: float = math.inf,
 ) -> Footprint | PixelIntegral:
     """What the screen filter, and a viewer's settings, make of splats.
 
     "classic" dilates by `eps2d` px²; "antialiased" and "mip" also scale the opacity so that the splat's light stays what it
     was; "analytic" and "window" dilate, and integrate the splat over each pixel or what is seen through it.
+    `max_variance`: px², that of `settings` in a picture of this size.
     """
     xx, yy = projected.xx + eps2d, projected.yy + eps2d
     det = projected.det + eps2d * (projected.xx + projected.yy) + eps2d**2  # = xx·yy - xy² without its cancellation
@@ -102,6 +108,8 @@ def footprint(
         opacities = opacities * (projected.det / det).clamp_min(LEAST_LIGHT[screen_filter] ** 2).sqrt()
     if settings.least_spread and gate is not None:
         shape = culls.stretched(shape, gate > 0.5, settings.least_spread)
+    if max_variance < math.inf:
+        shape = culls.limited(shape, max_variance, settings.boxed)
     xx, xy, yy, det = shape
     return Footprint(yy, xy / yy, det / yy, xx, opacities, w_end(settings), gate)
 

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from mipmap_plugin.backends import buckets
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
 from mipmap_plugin.backends.compositing import Splats, alone, composite
 from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
@@ -34,10 +35,11 @@ class ReferenceBackend:
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         settings = effects.settings
+        ranks = buckets.ranks(gaussians, camera) if settings.bucketed else None
         if settings.packing is not None:
             gaussians = packed(gaussians, camera, settings.packing)
         with torch.no_grad():
-            rows = drawn_rows(gaussians, camera, effects)
+            rows = drawn_rows(gaussians, camera, effects, ranks)
         gaussians = gaussians[rows]
         projected, feet = _footprints(gaussians, camera, effects)
         degree = min(effects.sh_degree, gaussians.sh_degree)
@@ -54,8 +56,8 @@ class ReferenceBackend:
         return Rendered(image, 1 - through)
 
 
-def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor:
-    """Indices of the splats that can touch the image, front to back.
+def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Tensor | None = None) -> Tensor:
+    """Indices of the splats that can touch the image, front to back: as `ranks` [N] ascend, where they are given.
 
     Found first and without gradients, so that a row that is not drawn, however broken, is in no gradient either.
     """
@@ -69,6 +71,7 @@ def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor
     drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & feet.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
     along = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1) if effects.settings.radial else projected.depths
+    along = along if ranks is None else ranks
     return rows[along[rows].argsort(stable=True)]
 
 
@@ -96,4 +99,5 @@ def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple
     if effects.screen_filter == SURFEL:
         return surfels(gaussians, camera, effects)
     projected = project(gaussians, camera, effects.near_plane, effects.settings.frozen_beyond)
-    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings)
+    most = effects.settings.max_variance(camera.width, camera.height)
+    return projected, footprint(projected, gaussians.opacities, effects.screen_filter, effects.eps2d, effects.settings, most)

@@ -12,15 +12,20 @@ from mipmap_plugin.models.health import examine
 from mipmap_plugin.wrap import wrap_model
 
 
-def inspect(checkpoint: Checkpoint, iteration: int | None = None, screen_filter: ScreenFilter | None = None, json: bool = False) -> None:
+def inspect(
+    checkpoint: Checkpoint, iteration: int | None = None, screen_filter: ScreenFilter | None = None, viewers: bool = True, json: bool = False
+) -> None:
     """Say what a checkpoint is, what it calls for, and what is wrong with it.
 
     Args:
         checkpoint: A PLY or a model folder.
         iteration: Which iteration of a model folder; the newest by default.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
+        viewers: Draw a few views as viewers on the web do, and say how far they are from those of training.
         json: Print JSON instead of sentences.
     """
+    from mipmap_plugin.evaluation.looks import looks
+
     model = load_model(checkpoint, iteration=iteration)
     wrapped = wrap_model(model, screen_filter=screen_filter)
     view = wrapped.views()[0]
@@ -34,6 +39,7 @@ def inspect(checkpoint: Checkpoint, iteration: int | None = None, screen_filter:
         "cameras": summary(wrapped.cameras),
         "effects": [str(effect) for effect in explain(wrapped.effects(), gaussians, effects_of(model))],
         "health": examine(model.bake(view) if isinstance(model, AnchorModel) else model).sentences() or ["nothing found"],
+        "viewers": looks(wrapped) if viewers else "not asked for",
         "notes": model.notes,
     }
     tell(facts, json)

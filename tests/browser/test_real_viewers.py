@@ -20,11 +20,11 @@ pytestmark = pytest.mark.browser
 
 WHITE = (1.0, 1.0, 1.0)
 
-# dB. What is left is rounding, and in PlayCanvas the coarse order of splats.
+# dB. What is left is rounding.
 ALIKE = 45.0
 
-# dB, amid splats larger than the picture and beside it: PlayCanvas shrinks the ones, and puts the others' neighbors in a coarser order.
-SURROUNDED = 39.0
+# dB, amid splats larger than the picture and beside it: 39 to 49 in PlayCanvas on WebGPU, for no known reason.
+SURROUNDED = {"playcanvas-webgpu": 42.0}
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_a_real_base_looks_as_we_say(browser: Browser, shared_data: Path, viewer
 def test_a_real_capture_looks_as_we_say(browser: Browser, shared_data: Path, viewer: str) -> None:
     capture = wrap_model(shared_data / "checkpoints" / "yashica-t4" / "yashica-t4-top8192.ply", background=WHITE)
     cameras = [camera.resized(160, 120) for camera in capture.views()[:2]]
-    assert likeness(browser, viewer, capture, cameras) > SURROUNDED
+    assert likeness(browser, viewer, capture, cameras) > SURROUNDED.get(viewer, ALIKE)
 
 
 def at(cameras: Sequence[Camera], scale: float) -> list[Camera]:
@@ -132,7 +132,6 @@ def at(cameras: Sequence[Camera], scale: float) -> list[Camera]:
 
 def likeness(browser: Browser, viewer: str, model: Wrapped, cameras: Sequence[Camera]) -> float:
     """dB between our render under a viewer's convention and the viewer's own picture, both of 8 bits; the mean of the views."""
-    pytest.importorskip("mipmap_plugin.viewers")
     real = browser.open(viewer, model.model.source).draw(cameras, model.background)
     ours = [model.render(camera, viewer=viewer).image.detach().clamp(0, 1).mul(255).round().div(255).numpy() for camera in cameras]
     return fmean(psnr(image, picture) for image, picture in zip(ours, real, strict=True))

@@ -48,9 +48,11 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
         "size cull": (False, "no splat is too small to be drawn"),
         "contribution cull": (False, "no splat gives too little"),
         "stretching": (False, "round splats stay round"),
+        "size limit": (False, "no splat is too large"),
         "frame": (False, "a splat is drawn wherever its center lies"),
         "color limit": (False, "colors have no upper bound"),
         "order by distance": (False, "the least deep is in front"),
+        "coarse order": (False, "the order is exact"),
         "rounded picture": (False, "rounded once it is shown"),
         "packing": (False, "splats are kept exactly"),
         "covariances": (False, "quaternions and scales suffice"),
@@ -67,11 +69,12 @@ def test_everything_on():
     of_model = [replace(effect, on=True) for effect in OF_OTHER_MODELS]
     everything = RenderSettings(
         radius=3.0, min_variance=1.0, min_contribution=1.0, least_spread=1.0, max_color=1.0, radial=True, packing=Packing(), picture_step=0.1,
-        frame=1.0,
+        frame=1.0, max_half_axis=1.0,
     )  # fmt: skip
     asked = Effects(1, "antialiased", 0.1, supersampling=4, settings=everything, outputs=("depth", "normals"))
     effects = explain(asked, given, of_model, recipe("paper", 4), 4)
-    assert all(effect.on for effect in effects)
+    assert [effect.name for effect in effects if not effect.on] == ["coarse order"]  # there is another already
+    assert told(Effects(settings=RenderSettings(bucketed=True)), splats)["coarse order"][0]
     reasons = {effect.name: effect.reason for effect in effects}
     assert [reasons[name] for name in ("supersampling", "covariances")] == ["16 samples a pixel", "the model gives them"]
     assert reasons["upsampler"] == "bicubic makes the truth from the base's image"

@@ -109,6 +109,14 @@ def ruled(rule: RenderSettings, seed: int = 1) -> HardCase:
     return case._replace(effects=replace(case.effects, settings=rule))
 
 
+def in_buckets() -> HardCase:
+    """A splat so large, behind the camera, that the depths of the others share few buckets."""
+    case = random_scene(1, "classic", DILATION)
+    first = torch.tensor(0)
+    rows = {name: getattr(case.gaussians, name).index_put((first,), value) for name, value in _row(means=(0.0, 0.0, -5.0), scales=1e3).items()}
+    return HardCase(replace(case.gaussians, **rows), case.camera, replace(case.effects, settings=RenderSettings(bucketed=True)))
+
+
 def covariances_given(screen_filter: str, broken: bool = False) -> HardCase:
     gaussians = crowd()
     given = covariances(gaussians)
@@ -239,6 +247,9 @@ RULES = {
     "largest-color": RenderSettings(max_color=0.6),
     "distance": RenderSettings(radial=True),
     "frame": RenderSettings(frame=0.7, frozen_beyond=math.inf),
+    "half-axis": RenderSettings(radius=2.0, max_half_axis=5.0),
+    "half-axis-of-the-whole": RenderSettings(radius=2.0, max_half_axis=5.0, boxed=True),
+    "picture-size": RenderSettings(radius=20.0, fits_picture=True),
 }
 
 CASES: dict[str, Builder] = {
@@ -264,6 +275,7 @@ CASES: dict[str, Builder] = {
         if viewer.eps2d or not name.startswith("needle")  # without any dilation its width is lost in float32
     },
     "rule-rounded-picture": in_a_rounded_picture,
+    "rule-buckets": in_buckets,
     **{f"rule-{name}": partial(ruled, rule) for name, rule in RULES.items()},
     "nan-in-covariances": partial(covariances_given, "classic", broken=True),
     **{

@@ -108,3 +108,54 @@ def pull_stretched(view, shape, changed, d_shape):
         select(changed, 0.5 * (d_mean - d_half), d_yy),
         select(changed, 0.0, d_det),
     )
+
+
+@inner
+def limited(view, shape):
+    """The shapes of splats that are made smaller where they are too large: a·shape + b·1."""
+    a, b, _, _, _ = factors(view, shape)
+    return scaled(shape, a, b)
+
+
+@inner
+def scaled(shape, a, b):
+    xx, xy, yy, det = shape
+    return a * xx + b, a * xy, a * yy + b, a * a * det + a * b * (xx + yy) + b * b
+
+
+@inner
+def factors(view, shape):
+    """The numbers a and b of `limited`; where only the longer axis is too long; and the variances along both."""
+    xx, xy, yy, det = shape
+    most, half = view.max_variance, 0.5 * (xx - yy)
+    long = maximum(xx, yy) if view.boxed else 0.5 * (xx + yy) + sqrt(half * half + xy * xy)
+    short = det / long
+    large = long > most
+    nothing = xx * 0
+    if view.boxed:
+        return select(large, most / long, 1.0), nothing, large, long, short
+    one = both(large, short < most)
+    per_apart = 1 / select(one, long - short, 1.0)
+    a = select(one, (most - short) * per_apart, select(large, nothing, 1.0))
+    return a, select(one, short * (long - most) * per_apart, select(large, most, nothing)), one, long, short
+
+
+@inner
+def pull_limited(view, shape, d_limited):
+    """The gradient of a shape before it was limited."""
+    xx, xy, yy, det = shape
+    d_xx, d_xy, d_yy, d_det = d_limited
+    most, half = view.max_variance, 0.5 * (xx - yy)
+    a, b, one, long, short = factors(view, shape)
+    d_a = d_xx * xx + d_xy * xy + d_yy * yy + d_det * (2 * a * det + b * (xx + yy))
+    d_b = d_xx + d_yy + d_det * (a * (xx + yy) + 2 * b)
+    d_xx, d_xy, d_yy, d_det = a * (d_xx + b * d_det), a * d_xy, a * (d_yy + b * d_det), a * a * d_det
+    if view.boxed:
+        d_long = select(one, 0 - d_a * a / long, 0.0)
+        return d_xx + select(xx >= yy, d_long, 0.0), d_xy, d_yy + select(xx >= yy, 0.0, d_long), d_det
+    per_apart = 1 / select(one, long - short, 1.0)
+    d_short = select(one, (d_b * long - d_a) * (long - most) * per_apart * per_apart, 0.0)
+    d_long = select(one, (d_b * short - d_a) * a * per_apart, 0.0) - d_short * short / long
+    per_spread = select(one, 2 * d_long * per_apart, 0.0)
+    lean = 0.5 * per_spread * half
+    return d_xx + 0.5 * d_long + lean, d_xy + per_spread * xy, d_yy + 0.5 * d_long - lean, d_det + d_short / long

@@ -34,8 +34,13 @@ class Drawing(NamedTuple):
     limits: Limits
 
 
-def draw(splats: Splats, camera: Camera, effects: Effects, *, gradients: bool = True) -> tuple[np.ndarray, np.ndarray, Drawing]:
-    """The image [H, W, 3], alpha [H, W] and what to remember of them. gradients: whether `draw_back` will be asked for."""
+def draw(
+    splats: Splats, camera: Camera, effects: Effects, ranks: np.ndarray | None = None, *, gradients: bool = True
+) -> tuple[np.ndarray, np.ndarray, Drawing]:
+    """The image [H, W, 3], alpha [H, W] and what to remember of them. ranks: [N] int32, front to back, instead of depths.
+
+    gradients: whether `draw_back` will be asked for.
+    """
     view = view_of(camera, effects, splats, gradients)
     limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, effects.settings.picture_step or 0.0)
     count, (height, width) = len(splats.means), camera.size
@@ -45,7 +50,7 @@ def draw(splats: Splats, camera: Camera, effects: Effects, *, gradients: bool = 
     threads = team(count + width * height)
     threads.share(projection.project, count, view, splats, table, depths, counts)
     np.cumsum(counts, out=slots[1:])
-    lists = sorting.tile_lists(table, depths, slots, width, height, threads)
+    lists = sorting.tile_lists(table, depths if ranks is None else ranks, slots, width, height, threads)
     if view.seen == SEEN_IN_WINDOW:
         threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, shown)
     else:
@@ -111,6 +116,7 @@ def view_of(camera: Camera, effects: Effects, splats: Splats, gradients: bool) -
         boxed=settings.boxed,
         min_contribution=float(settings.min_contribution),
         least_spread=float(settings.least_spread),
+        max_variance=settings.max_variance(camera.width, camera.height),
         felt=gradients,
     )
 

@@ -143,6 +143,8 @@ def fill_point(view, x, y, shape, opacity, light, block):
         drawn = drawn if view.felt else both(drawn, there)
         if view.least_spread > 0:
             shape, _ = culling.stretched(view, shape, there)
+    if view.max_variance < math.inf:
+        shape = culling.limited(view, shape)
     # alpha = whole·(w - faded), which ends where it is `end`
     whole = shown * (1 / (1 - view.faded))
     floor, end = whole * view.faded, maximum(shown * view.cut, view.min_alpha)

@@ -3,6 +3,8 @@
 # numba gives calls and operators a meaning of its own.
 # mypy: ignore-errors
 
+import math
+
 import numpy as np
 from numba import types
 
@@ -136,7 +138,7 @@ def pull_shape(view, flat, opacity, pull):
         return pull_integral(view, flat, dilated, opacity, pull)
     if view.culls:
         return pull_culled(view, flat, dilated, light, opacity, pull)
-    d_dilated, d_x, d_y = pull_ellipse(dilated, pull)
+    d_dilated, d_x, d_y = pull_limited(view, dilated, pull)
     light_pull = get(pull, col.SUM)
     d_flat = ellipses.pull_screen_filter(view, flat, dilated, light, d_dilated, light_pull / light)
     return d_flat, light_pull / opacity, d_x, d_y
@@ -149,14 +151,23 @@ def pull_culled(view, flat, dilated, light, opacity, pull):
     light_pull = select(drawn, gate_pull, 0.0)
     if view.least_spread > 0:
         shape, changed = culling.stretched(view, dilated, drawn)
-        d_shape, d_x, d_y = pull_ellipse(shape, pull)
+        d_shape, d_x, d_y = pull_limited(view, shape, pull)
         d_dilated = culling.pull_stretched(view, dilated, changed, d_shape)
     else:
-        d_dilated, d_x, d_y = pull_ellipse(dilated, pull)
+        d_dilated, d_x, d_y = pull_limited(view, dilated, pull)
     d_gated, d_opacity = culling.pull_gate(view, dilated, opacity, gate_pull)
     d_dilated = d_dilated[0] + d_gated[0], d_dilated[1] + d_gated[1], d_dilated[2] + d_gated[2], d_dilated[3] + d_gated[3]
     d_flat = ellipses.pull_screen_filter(view, flat, dilated, light, d_dilated, light_pull / light)
     return d_flat, light_pull / opacity + d_opacity, d_x, d_y
+
+
+@inner
+def pull_limited(view, shape, pull):
+    """Gradients of ellipses, before they are made smaller where they are too large, and of their places on the image."""
+    if view.max_variance == math.inf:
+        return pull_ellipse(shape, pull)
+    d_limited, d_x, d_y = pull_ellipse(culling.limited(view, shape), pull)
+    return culling.pull_limited(view, shape, d_limited), d_x, d_y
 
 
 @inner

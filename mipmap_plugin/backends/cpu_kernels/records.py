@@ -43,6 +43,7 @@ class View(NamedTuple):
     boxed: bool
     min_contribution: float  # px²
     least_spread: float  # px²
+    max_variance: float  # px²; infinite: splats may be of any size
     felt: bool  # whether splats that are culled are listed, for their gradient
 
 

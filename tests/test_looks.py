@@ -1,0 +1,55 @@
+"""What `inspect` says of viewers."""
+
+import re
+from statistics import fmean
+
+import pytest
+import tiny
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.evaluation import looks
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.wrap import Wrapped
+
+
+def loaded(tmp_path, **options) -> Wrapped:
+    pytest.importorskip("numba")
+    return wrap_model(tiny.folder(tmp_path / "model", tiny.cameras(6), **options))
+
+
+def decibels(sentence: str) -> dict[str, float]:
+    return {name: float(number) for name, number in re.findall(r"(\S+) ([\d.]+) dB", sentence)}
+
+
+def test_each_viewer_is_as_far_from_training_as_its_pictures_are(tmp_path):
+    model = loaded(tmp_path)
+    views = [model.cameras[nth] for nth in (0, 2, 4)]
+    told = decibels(looks.looks(model))
+    assert list(told) == ["spark", "playcanvas", "gaussian-splats-3d", "antialiased"]  # classic is the same
+    for viewer, number in told.items():
+        assert number == pytest.approx(fmean(psnr(model.render(v, viewer=viewer).image, model.render(v).image) for v in views), abs=0.051)
+
+
+def test_what_was_trained_with_compensation_looks_wrong_in_a_classic_viewer(tmp_path):
+    model = loaded(tmp_path, trained=TrainedScale("antialiased"))
+    told = looks.looks(model)
+    assert "antialiased the same" in told and decibels(told)["classic"] < decibels(told)["spark"]
+
+
+def test_fewer_views_are_drawn_of_more_splats_and_none_of_too_many(tmp_path, monkeypatch):
+    model = loaded(tmp_path)
+    monkeypatch.setattr(looks, "SPLATS", 119)
+    assert looks.looks(model).endswith("at x1 in 1 view")
+    monkeypatch.setattr(looks, "SPLATS", 59)
+    monkeypatch.setattr(model, "render", None)  # nothing is drawn
+    assert looks.looks(model).startswith("not drawn: 60 splats on 768 pixels take too long")
+
+
+def test_a_slow_backend_draws_nothing(tmp_path):
+    model = wrap_model(tiny.folder(tmp_path / "model"), backend="reference")
+    assert looks.looks(model).startswith("not drawn: the reference backend takes too long")
+
+
+def test_what_no_viewer_opens_is_said(tmp_path):
+    assert looks.looks(wrap_model(tiny.model(), cameras=tiny.cameras(1))) == "no viewer opens it as it is"
