@@ -73,6 +73,12 @@ class Camera:
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
+    def window(self, width: int, height: int) -> Camera:
+        """The middle `width` x `height` px of the same view, or as much of it as there is."""
+        width, height = min(width, self.width), min(height, self.height)
+        left, top = (self.width - width) // 2, (self.height - height) // 2
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
     def moved(self, similarity: Tensor) -> Camera:
         """The same view after all of the world, this camera included, was moved by `similarity` [4, 4]: turned, sized and shifted."""
         turned_and_sized = similarity[:3, :3].to("cpu", torch.float64)

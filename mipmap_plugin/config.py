@@ -92,7 +92,7 @@ _PAPER = dict(
     densify_gradient=2e-4, reset_opacity_at=2,
 )  # fmt: skip
 
-_INSTANT = dict(steps=0)
+_INSTANT = dict(steps=0, validation_views=4)
 
 # A classic file dilates by more than an image filter does, so sharpness has to come from colors that depend on the view: bands
 # above 0 move as fast as the base color, towards hundreds of views, or held-out views gain nothing by it. Rates are so bold that
@@ -120,7 +120,7 @@ WHOLE_RATES = 0.25
 # base does not, and adds the kernel's ringing. So the image is shrunk and compared with the base itself, at gentle rates. Centers
 # stay: moving them gains 0.02 dB on lego, and steps of a third of a pixel cost 5 dB on flowers.
 _DEFAULT_IN = dict(
-    steps=200, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
+    steps=200, validation_views=8, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
     rates=LearningRates(opacities=0.02, networks=5e-4),
 )  # fmt: skip
 

@@ -145,7 +145,7 @@ class Wrapped:
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = real.cameras if real else self.cameras
-        target = self._target(viewer)
+        target = self.target(viewer)
         needs = replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings)
         backend, why = choose_backend(self._backend, replace(needs, gradients=config.steps > 0 or config.merge_to < 1))
         if config.steps:
@@ -166,7 +166,7 @@ class Wrapped:
             refuse_output(beside, True, parts, is_file=True)
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 
-    def _target(self, viewer: str | None) -> Effects:
+    def target(self, viewer: str | None) -> Effects:
         """How the adapted file is rendered. Raises SettingsError for a viewer that does not open the files of this family."""
         if viewer is not None:
             if self.trained.keeps_filter or not same_for_all_views(self.model):

@@ -92,7 +92,7 @@ class Session:
         self.scale, self.config, self.viewer = scale, config, base.viewer
         self.seconds, self.peak = {"optimization": 0.0}, Peak(self.base.parameters()["means"].device)
         views, self.which = choose_views(cameras, self.base.parameters()["means"], config)
-        self.views, validation = hold_back(cameras, views, self.base.parameters()["means"], config)
+        self.views, validation = hold_back(cameras, views, self.base.parameters()["means"], scale, config)
         self.which += f", {len(views) - len(self.views)} of them kept for validation" if len(self.views) < len(views) else ""
         if getattr(self.base, "moves", False):
             self.views, when = with_times(self.views, config.seed)
@@ -138,7 +138,8 @@ class Session:
         why = "" if best == last else f", for {last} shows {found[last]:.2f} dB where it shows {found[best]:.2f}"
         curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=found[last], gaussians=_rows(states[last]))]
         report = self._report(states[best], curve, ended_by, f"{best}{why}", found)
-        return Adapted(states[best], report, self.backend, self.effects, self.state, [*self.views, *self.validation.steering, *self.validation.choosing])
+        seen = [*self.views, *self.validation.steering, *self.validation.choosing]
+        return Adapted(states[best], report, self.backend, self.effects, self.state, seen)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists, and what ended it."""

@@ -25,6 +25,9 @@ from mipmap_plugin.scenes.trajectories import jittered
 # Of the given cameras one in so many may be kept back for validation, where a policy leaves the choice of views to us.
 KEPT_BACK = 16
 
+# px: how much of a view is judged at most, along each side, so that judging large images stays cheap.
+WINDOW = 768
+
 # What sets the seed of views that are drawn for validation apart from that of views to adapt to.
 OTHER_SEED = 7919
 
@@ -72,9 +75,17 @@ class Validation:
         return [name for name, each in found.items() if each >= best - HARDLY][-1], found
 
 
-def hold_back(cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, config: AdaptConfig) -> tuple[list[Camera], list[Camera]]:
+def hold_back(
+    cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, scale: float, config: AdaptConfig
+) -> tuple[list[Camera], list[Camera]]:
     """The `views` that are adapted to, and those of validation: of the given cameras, where a policy chooses among enough of them, and
-    others from the region that they span; without cameras a part of another orbit."""
+    others from the region that they span; without cameras a part of another orbit. Of large images the middle is judged."""
+    left, judged = _hold_back(cameras, views, means, config)
+    most = max(1, round(WINDOW / max(1.0, scale)))
+    return left, [view.window(most, most) for view in judged]
+
+
+def _hold_back(cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, config: AdaptConfig) -> tuple[list[Camera], list[Camera]]:
     count, generator = config.validation_views, torch.Generator().manual_seed(config.seed + OTHER_SEED)
     if config.views == "orbit" or not cameras:
         others, _ = choose_views(cameras, means, config.model_copy(update={"views": "orbit", "extra_views": count, "seed": config.seed + OTHER_SEED}))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import tyro
+
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.outputs import adapted_path
@@ -20,6 +22,7 @@ def adapt(
     scale: Scales,
     output: Path | None = None,
     recipe: Recipe = "default",
+    viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     views: ViewPolicy | None = None,
     cameras: Path | None = None,
     steps: int | None = None,
@@ -35,13 +38,15 @@ def adapt(
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
-    """Make a checkpoint that looks right at another scale, in any viewer.
+    """Make a checkpoint that looks right at another scale, in the viewer that it is opened in.
 
     Args:
         checkpoint: A PLY or a model folder.
         scale: Target focal length over base focal length, such as 1/4 or 4. May be given several times.
-        output: Where to write; by default beside the checkpoint, as NAME_x0.25. Several scales: a folder for all of them.
-        recipe: default; paper (the published code, quirk by quirk); instant (closed form only).
+        output: Where to write; by default beside the checkpoint, as NAME_x0.25. Several scales or viewers: a folder for all of them.
+        recipe: default; thorough (more steps and views); instant (closed form only); paper (the published code, quirk by quirk).
+        viewer: What the file is for: classic (INRIA, gsplat, nerfstudio), spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown
+            name lists them all. May be given several times, for a file each. Without it the file is drawn as 3DGS draws, without compensation.
         views: Which views to adapt to; by default what the recipe says.
         cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         steps: Optimizer steps at most.
@@ -60,15 +65,17 @@ def adapt(
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
     chosen: dict[str, Any] = dict(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     settings = {name: value for name, value in chosen.items() if value is not None}
-    scales = each_once(scale)
-    targets = [adapted_path(checkpoint, output, each, len(scales) > 1) for each in scales]
-    for each, target in zip(scales, targets, strict=True):
+    viewers: list[str | None] = [*dict.fromkeys(viewer)] or [None]
+    wanted = [(each, name) for each in each_once(scale) for name in viewers]
+    targets = [adapted_path(checkpoint, output, *each, several=len(wanted) > 1) for each in wanted]
+    for (each, name), target in zip(wanted, targets, strict=True):
         config = make_config(recipe, each, seed=seed, **settings)
+        wrapped.target(name)
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0)
     real = None if images is None else load_scene(images)
     reports = []
-    for each, target in zip(scales, targets, strict=True):
-        adapted = wrapped.adapt(each, recipe=recipe, seed=seed, images=real, resume=state_path(target), **settings)
+    for (each, name), target in zip(wanted, targets, strict=True):
+        adapted = wrapped.adapt(each, recipe=recipe, viewer=name, seed=seed, images=real, resume=state_path(target), **settings)
         saved = adapted.save(target, overwrite=overwrite)
         reports.append({"file": str(saved), **adapted.report.model_dump()})
         if not json:
@@ -78,7 +85,11 @@ def adapt(
 
 
 def _print(saved: Path, report: Report) -> None:
-    print(f"x{report.scale:g}: {saved}")
+    print(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {saved}")
+    db = ", ".join(f"{name} {found:.2f}" for name, found in report.validation.items())
+    print(f"  holds {report.returned} (dB on views that nothing was adapted to: {db})")
+    if report.viewer is None:
+        print("  made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio); for others give --viewer spark, supersplat, ...")
     print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
     if report.peak_memory_mib is not None:
         print(f"  at most {report.peak_memory_mib:,.0f} MiB on the GPU")

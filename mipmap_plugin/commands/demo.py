@@ -9,14 +9,20 @@ import tyro
 from mipmap_plugin.commands.types import Scale
 
 
-def demo(output: Path = Path("mipmap-demo"), scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (), overwrite: bool = False) -> None:
+def demo(
+    output: Path = Path("mipmap-demo"),
+    scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (),
+    viewer: str | None = None,
+    overwrite: bool = False,
+) -> None:
     """Adapt the embedded scene at x1/4 and x4, write before/after pictures and print a table.
 
     Args:
         scale: Other scales, instead of 1/4 and 4; may be given several times.
+        viewer: What the files are for: spark, playcanvas (or supersplat), ...
         output: The folder for the pictures.
         overwrite: Replace files that exist there.
     """
     from mipmap_plugin.demo.run import run_demo
 
-    print(run_demo(output, scale or (0.25, 4.0), overwrite=overwrite))
+    print(run_demo(output, scale or (0.25, 4.0), viewer, overwrite=overwrite))

@@ -9,12 +9,12 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.exchange import WRITTEN
 
 
-def adapted_path(checkpoint: Path, output: Path | None, scale: float, several: bool) -> Path:
-    """Beside the checkpoint as NAME_x0.25, or `output`, which is a folder for all where there are several scales."""
+def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:
+    """Beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark, or `output`, which is a folder for all where there are several."""
     checkpoint_name = checkpoint.resolve().name
     known = (*WRITTEN, ".ply") if checkpoint.is_file() or checkpoint.suffix == ".ply" else ()
     suffix = next((ending for ending in known if checkpoint_name.lower().endswith(ending)), "")
-    name = f"{checkpoint_name[: len(checkpoint_name) - len(suffix)]}_x{scale:g}{suffix}"
+    name = f"{checkpoint_name[: len(checkpoint_name) - len(suffix)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{suffix}"
     if output is None:
         return checkpoint.resolve().parent / name
     return output / name if several else output

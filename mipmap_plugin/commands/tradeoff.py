@@ -18,6 +18,7 @@ def tradeoff(
     output: Path,
     images: Path | None = None,
     recipe: tyro.conf.UseAppendAction[tuple[Recipe, ...]] = (),
+    viewer: str | None = None,
     steps: tyro.conf.UseAppendAction[tuple[int, ...]] = (),
     backend: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     supersampling: tyro.conf.UseAppendAction[tuple[int, ...]] = (),
@@ -41,6 +42,7 @@ def tradeoff(
         output: The folder for the results.
         images: Folder of the scene with real images (protocol P3). Without it the base itself is the truth; every axis and table says which.
         recipe: default and paper, if none is given.
+        viewer: What files are adapted for, and draws them and the base: spark, playcanvas (or supersplat), ...
         steps: Optimizer steps at most, one run for each; what each recipe says, if none is given.
         backend: What to adapt and render with; auto, if none is given.
         supersampling: N for N x N samples a pixel, finer than the base's pixels left out; 2, 4 and 8, if none is given.
@@ -59,7 +61,8 @@ def tradeoff(
     from mipmap_plugin.evaluation.tradeoff_run import run
 
     refuse(output, picture, overwrite)
-    plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed)
+    plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     model, scene = wrap(checkpoint, None, background, "auto", screen_filter), None if images is None else load_scene(images)
+    model.target(viewer)
     found = run(model, scene, each_once(scale), plan, views, output, picture=picture, overwrite=overwrite)
     tell(facts(found, complete=True), json) if json else print("\n\n".join(table(each) for each in found))

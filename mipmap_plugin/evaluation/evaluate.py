@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.measure import FILTERS, Show, rivals, seen_before, warm_up, warm_watch
+from mipmap_plugin.evaluation.measure import FILTERS, Show, base_in, rivals, seen_before, warm_up, warm_watch
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, not_exposed, test_views
@@ -73,11 +73,17 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return fmean(known) if len(known) == len(values) else None
 
 
-def training_free_rows(model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic", without: Sequence[str] = ()) -> list[Row]:
-    """The base as it is, and everything that shows it better without adapting (`measure.rivals`). `without`: filters that are left out."""
+def training_free_rows(
+    model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic", without: Sequence[str] = (), viewer: str | None = None
+) -> list[Row]:
+    """The base as it is, and everything that shows it better without adapting (`measure.rivals`).
+
+    `without`: filters that are left out. `viewer`: whose picture of the base has a row too.
+    """
     count = len(model.model.gaussians(model.any_camera()))
     filters = [name for name in FILTERS if name not in without]
     found = rivals(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
+    found += [base_in(viewer, model, scale)] if viewer else []
     return [judge.row(rival.name, scale, rival.show, gaussians=count) for rival in found]
 
 
@@ -98,7 +104,7 @@ def _of_appearance(model: SplatModel, appearance: str) -> list[str]:
 
 
 def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:
-    """An adapted model, rendered as any classic viewer renders its file."""
+    """An adapted model, rendered as the viewer that it was made for renders its file."""
     report = adapted.report
     facts = dict(adapt_seconds=report.seconds["total"], gaussians=report.gaussians_after, adapted_on=report.views, ended_by=report.ended_by)
     return judge.row(name, report.scale, lambda camera: adapted.render(camera.zoomed(report.scale)).image, **facts)
@@ -117,19 +123,19 @@ def evaluate(
 
     Once on the checkpoint's training poses, and around them if the recipe says so; the honest row, for a user zooms to views that nobody adapted
     to. It is called "held out" only if none of the judged poses was among them, else it says how many were. And once "scored": adapted on the very
-    views that are judged, as the paper does.
+    views that are judged, as the paper does. `settings` are those of `Wrapped.adapt`; with a `viewer` its picture of the base has a row too.
     """
     scene = model.place(scene)
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
     judged = test_views(scene, model.cameras[0], model.background)
     judge = Judge(judged, PROTOCOLS[protocol], perceptual, scene.source.name)
-    rows = []
+    viewer, rows = settings.get("viewer"), []
     for scale in scales:
-        rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"))
-        if recipes and scale != 1:
+        rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
+        if recipes and (scale != 1 or viewer):
             warm_up(model, scale, model.cameras)
-        for name, on in product(recipes if scale != 1 else [], ("train", "scored")):
+        for name, on in product(recipes if scale != 1 or viewer else [], ("train", "scored")):
             adapted = model.adapt(scale, recipe=name, **(settings | _views(name, on, judged)))
             rows.append(adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judged, adapted)}", adapted, judge))
     return rows

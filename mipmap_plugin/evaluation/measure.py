@@ -90,6 +90,12 @@ def rivals(
     return found
 
 
+def base_in(viewer: str, model: Wrapped, scale: float) -> Rival:
+    """The base as a viewer draws it. Raises SettingsError for an unknown one, and BackendUnavailable."""
+    backend = model.backend(viewer=viewer)[0].name
+    return Rival(f"{BASE} in {viewer}", "base", backend, lambda view: model.render(view.zoomed(scale), viewer=viewer).image)
+
+
 def _drawn(model: Wrapped, camera: Camera, scale: float, screen_filter: str | None, n: int) -> Tensor:
     """The base's view of `camera`, the mean of n x n samples a pixel; filters that know of the zoom keep their size in pixels of the output."""
     if n == 1:

@@ -19,7 +19,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import Recipe
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.measure import BASE, FILTERS, RESIZED, Kind, Rival, Show, rivals, warm_up, warm_watch
+from mipmap_plugin.evaluation.measure import BASE, FILTERS, RESIZED, Kind, Rival, Show, base_in, rivals, warm_up, warm_watch
 from mipmap_plugin.evaluation.tradeoff_truth import Yardstick
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.wrap import Adapted, Wrapped
@@ -81,6 +81,7 @@ class Plan:
     renderers: bool = True  # the settings of RENDERERS, on the first run's model
     repeats: int = 3
     seed: int = 0  # of the first repeat; each has the next
+    viewer: str | None = None  # what files are adapted for, and the base is drawn by too
 
     def __post_init__(self) -> None:
         if self.repeats < 1 or any(n < 2 for n in self.supersampling):
@@ -117,6 +118,7 @@ def on_backend(model: Wrapped, name: str) -> Wrapped:
 def _rivals(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> list[Rival]:
     """Everything that needs no adapting, but what is the truth itself."""
     found = rivals(model, scale, yardstick.shrink_by, filters=_filters(model), samples=plan.supersampling)
+    found += [base_in(plan.viewer, model, scale)] if plan.viewer else []
     return [rival for rival in found if not (yardstick.is_resized_base and rival.name == RESIZED)]
 
 
@@ -162,7 +164,7 @@ def _run(
     runs, ends = [], []
     for repeat in range(plan.repeats):
         settings: dict[str, Any] = {"seed": plan.seed + repeat} | ({} if steps is None else {"steps": steps})
-        runs.append(adapted := model.adapt(scale, recipe=recipe, cameras=yardstick.adapt_on, observe=look, **settings))
+        runs.append(adapted := model.adapt(scale, recipe=recipe, viewer=plan.viewer, cameras=yardstick.adapt_on, observe=look, **settings))
         report = adapted.report
         end = Point(scale, "adapted", _name(recipe, steps), adapted.backend.name, report.gaussians_after, ended_by=report.ended_by)
         ends.append(_judged(replace(end, adapt_seconds=Spread.of([report.seconds["total"]])), _shows(adapted, scale), yardstick, 1))

@@ -179,7 +179,7 @@ def test_measuring_is_not_billed(monkeypatch):
     slow = replace(yardstick, psnr=lambda *pair: passes(1000, yardstick.psnr(*pair)))
     points = list(measure(model, slow, 1 / 4, replace(PLAN, repeats=1)))
     assert points[0].ms_per_frame.median == points[-1].ms_per_frame.median == 1000
-    assert 6 <= points[-1].adapt_seconds.median < 100
+    assert 6 <= points[-1].adapt_seconds.median < 1000  # its own looks at validation views are
 
 
 def test_the_first_use_of_a_backend_is_not_billed(monkeypatch):
