@@ -48,7 +48,15 @@ def test_fewer_views_are_drawn_of_more_splats_and_none_of_too_many(tmp_path, mon
 
 def test_a_slow_backend_draws_nothing(tmp_path):
     model = wrap_model(tiny.folder(tmp_path / "model"), backend="reference")
-    assert looks.looks(model).startswith("not drawn: the reference backend takes too long")
+    assert looks.looks(model).startswith("not drawn: only the reference backend can, which takes too long")
+
+
+def test_where_training_drew_what_only_a_slow_backend_draws_nothing_is_drawn(tmp_path, monkeypatch):
+    model = loaded(tmp_path)
+    own = wrap_model(model.model, backend="reference").backend()
+    chosen = model.backend
+    monkeypatch.setattr(model, "backend", lambda *, viewer=None, **options: chosen(viewer=viewer, **options) if viewer else own)
+    assert looks.looks(model).startswith("not drawn")
 
 
 def test_what_no_viewer_opens_is_said(tmp_path):

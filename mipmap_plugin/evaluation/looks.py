@@ -27,8 +27,8 @@ def looks(wrapped: Wrapped) -> str:
     count, pixels = len(model.gaussians(views[0])), views[0].width * views[0].height
     if not same_for_all_views(model) or getattr(model.source, "suffix", "") != ".ply":
         return "no viewer opens it as it is"
-    if wrapped.backend(viewer=VIEWERS[0])[0].name == "reference":
-        return "not drawn: the reference backend takes too long; pip install 'mipmap-plugin[cpu]'"
+    if "reference" in (wrapped.backend()[0].name, wrapped.backend(viewer=VIEWERS[0])[0].name):
+        return "not drawn: only the reference backend can, which takes too long; `mipmap-plugin backends` says what others lack"
     most = min(VIEWS, len(views), SPLATS // max(1, count), PIXELS // pixels)
     if most == 0:
         return f"not drawn: {count:,} splats on {pixels:,} pixels take too long; `mipmap-plugin render --viewer NAME` draws them"
