@@ -40,6 +40,8 @@ from mipmap_plugin.models.outputs import REPORT
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
 
+AS_IT_IS = "the base as it is"
+
 # What a zoom-in is validated against: the base's own image, whatever it is adapted to.
 AS_THE_BASE = {"compare_at": "base", "quantize_truth": False}
 
@@ -109,16 +111,19 @@ class Session:
         self.validation = Validation(validation[::2], validation[1::2], scale, asked, self._show, config.resize)
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
+        if self.scale == 1 and self.effects == self.trained:
+            why = "scale 1, at which the base is right as it is"
+            return Adapted(self.fresh(), self._report(self.fresh(), [], why, AS_IT_IS, {}), self.backend, self.effects)
         began = time.perf_counter()
         with self.phase("compilation"):
             warm(self.backend, self.base.gaussians(self.views[0]), (self.trained, self.effects), gradients=self.config.steps > 0)
         as_it_is = self.fresh()
         student, start = Start(self).best()
-        states = {"the base as it is": as_it_is, f"the start, {start}": student.copy()}
+        states = {AS_IT_IS: as_it_is, f"the start, {start}": student.copy()}
         curve: list[CurvePoint] = []
-        ended_by = "scale 1, at which the base is right as it is" if self.nothing_to_do else "0 steps"
+        ended_by = "0 steps"
         self.seconds["total"] = time.perf_counter() - began
-        if self.config.steps and not self.nothing_to_do:
+        if self.config.steps:
             run, ended_by = self._optimize(student, resume, observe)
             curve, best = run.curve, self.fresh()
             run.steering.best.put_into(best)
@@ -182,10 +187,6 @@ class Session:
         """dB of a model on the views that steer the run."""
         with self.phase("validation"):
             return self.validation.steer(model)
-
-    @property
-    def nothing_to_do(self) -> bool:
-        return self.scale == 1 and self.effects == self.trained
 
     def _render(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         """What a step sees: without the rounding of a viewer's file and picture, which is noise to it and a third of its time."""

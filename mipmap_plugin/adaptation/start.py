@@ -39,7 +39,7 @@ class Start:
     def best(self) -> tuple[SplatModel, str]:
         """A model to begin with, and what it is."""
         of, config, base = self._of, self._of.config, self._of.fresh()
-        if of.nothing_to_do or not (config.closed_form or config.merge_to < 1):
+        if not (config.closed_form or config.merge_to < 1):
             return base, "the base"
         with of.phase("blend weights"):
             weights = self._weights(base) if self._weighs or config.merge_to < 1 else None
