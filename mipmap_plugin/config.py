@@ -69,7 +69,7 @@ class AdaptConfig(BaseModel):
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
     warm_up: float = Field(0.0, ge=0, le=1, description="Share of the steps over which rates rise, as far as validation views allow.")
     gathering: float = Field(0.0, ge=0, le=1, description="Fraction of the run during which new views are introduced; each costs a render.")
-    validation_views: int = Field(16, ge=2, description="Views not adapted to: half steer the run, half choose what it returns.")
+    validation_views: int = Field(16, ge=2, description="Views not adapted to, at most: half steer the run, half choose what it returns.")
     returns: Literal["best", "last"] = Field("best", description="The best state on validation views, base and start included, or the last.")
     prune_every: int = Field(100, gt=0, description="Steps between two prunings.")
     min_opacity: float = Field(0.005, ge=0, lt=1, description="Splats below it are pruned.")
@@ -92,7 +92,7 @@ _PAPER = dict(
     densify_gradient=2e-4, reset_opacity_at=2,
 )  # fmt: skip
 
-_INSTANT = dict(steps=0, validation_views=4)
+_INSTANT = dict(steps=0)
 
 # A classic file dilates by more than an image filter does, so sharpness has to come from colors that depend on the view: bands
 # above 0 move as fast as the base color, towards hundreds of views, or held-out views gain nothing by it. Rates are so bold that
@@ -120,7 +120,7 @@ WHOLE_RATES = 0.25
 # base does not, and adds the kernel's ringing. So the image is shrunk and compared with the base itself, at gentle rates. Centers
 # stay: moving them gains 0.02 dB on lego, and steps of a third of a pixel cost 5 dB on flowers.
 _DEFAULT_IN = dict(
-    steps=200, validation_views=8, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
+    steps=200, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
     rates=LearningRates(opacities=0.02, networks=5e-4),
 )  # fmt: skip
 

@@ -21,6 +21,7 @@ from mipmap_plugin.adaptation import resume
 from mipmap_plugin.adaptation.session import Adapted
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.magic import SPLAT_RECORD
 from mipmap_plugin.models.state_dict import read_state_dict
 from mipmap_plugin.scenes import load_scene
@@ -65,7 +66,7 @@ def open_images(path: Path) -> None:
 def open_placed(path: Path) -> None:
     """A checkpoint, and a scene seen in its frame."""
     model = load_model(path)
-    assert model.as_trained(tiny.cameras(2), None)
+    assert model.as_trained(tiny.cameras(2), Taken())
 
 
 def open_state(path: Path) -> None:

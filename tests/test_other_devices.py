@@ -69,7 +69,7 @@ def test_growing_is_judged_and_undone_there(enough, monkeypatch):
     register_upsampler("mine", lambda image, size: resize(image, size, "lanczos"), replace=True)
     agreements = iter([0.0, *[0.0 if enough else -1.0] * 9])
     monkeypatch.setattr(growing, "decibel", lambda _: next(agreements))
-    grown = dict(recipe="thorough", upsampler="mine", steps=5, prune_every=2, densify_gradient=1e-12, min_opacity=0.0)
+    grown = dict(recipe="thorough", upsampler="mine", steps=5, prune_every=2, densify_gradient=1e-12, min_opacity=0.0, returns="last")
     with pretended.pretending():
         model = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference")
         there = model.adapt(2, **grown)

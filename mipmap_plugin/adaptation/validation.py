@@ -25,6 +25,10 @@ from mipmap_plugin.scenes.trajectories import jittered
 # Of the given cameras one in so many may be kept back for validation, where a policy leaves the choice of views to us.
 KEPT_BACK = 16
 
+# For so many views that steps draw there is one of validation, so that it takes a tenth of the time at most; but never fewer than `LEAST`.
+STEPS_EACH = 25
+LEAST = 4
+
 # px: how much of a view is judged at most, along each side, so that judging large images stays cheap.
 WINDOW = 768
 
@@ -86,7 +90,8 @@ def hold_back(
 
 
 def _hold_back(cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, config: AdaptConfig) -> tuple[list[Camera], list[Camera]]:
-    count, generator = config.validation_views, torch.Generator().manual_seed(config.seed + OTHER_SEED)
+    count = min(config.validation_views, max(LEAST, config.steps * config.views_per_step // STEPS_EACH))
+    generator = torch.Generator().manual_seed(config.seed + OTHER_SEED)
     if config.views == "orbit" or not cameras:
         others, _ = choose_views(cameras, means, config.model_copy(update={"views": "orbit", "extra_views": count, "seed": config.seed + OTHER_SEED}))
         return list(views), others

@@ -188,8 +188,9 @@ class VanillaModel:
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """What `save` would refuse about `path`, before anything is done for it. Raises OutputExists, OutputError."""
-        host = None if path.suffix.lower() == ".ply" else self._origin.host
-        holds = host.holds(path) if host else None if path.suffix.lower() == ".ply" else "point_cloud"
+        a_file = path.suffix.lower() == ".ply" or is_written(path)
+        host = None if a_file else self._origin.host
+        holds = host.holds(path) if host else None if a_file else "point_cloud"
         refuse_parts(path, overwrite, self.source, self.folder, holds)
 
     def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
