@@ -108,7 +108,7 @@ class Session:
             self.which += f", {len(self.views)} of them upsampled"
         self.state: StateFile | None = None
         asked = PseudoTruth(self.base, self.backend, self.trained, scale, config.model_copy(update=AS_THE_BASE if scale > 1 else {}))
-        self.validation = Validation(validation[::2], validation[1::2], scale, asked, self._show, config.resize)
+        self.validation = Validation(validation[::2], validation[1::2], scale, asked, _shows(self.backend, self.effects), config.resize)
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         if self.scale == 1 and self.effects == self.trained:
@@ -192,9 +192,6 @@ class Session:
         """What a step sees: without the rounding of a viewer's file and picture, which is noise to it and a third of its time."""
         return self.backend.render(gaussians, camera, self._smooth).image
 
-    def _show(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        return self.backend.render(gaussians, camera, self.effects).image
-
     @property
     def _white(self) -> bool:
         return self.effects.background == (1.0, 1.0, 1.0)
@@ -242,6 +239,11 @@ def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects,
     if matrix is not None:
         rendered = replace(rendered, image=exposed(rendered.image, matrix))
     return replace(rendered, effects=explain(effects, gaussians, effects_of(model)))
+
+
+def _shows(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
+    """What a camera sees. It knows of no session, which would else outlive its run, and hold on to the state's file."""
+    return lambda gaussians, camera: backend.render(gaussians, camera, effects).image
 
 
 def _rows(model: SplatModel) -> int:

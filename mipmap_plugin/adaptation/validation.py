@@ -61,13 +61,13 @@ class Validation:
 
     @torch.no_grad()
     def decibels(self, model: SplatModel, views: Sequence[Camera]) -> float:
-        """PSNR of each view, of an image as it is displayed, and then the mean."""
+        """PSNR of each view, of an image as it is displayed, and then the mean; 0 without views."""
         total = 0.0
         for view in views:
             camera = view.zoomed(self.scale)
             image = self.render(model.gaussians(camera), camera).clamp(0, 1)
             total += decibel(float(difference_from(self.truth(view), image, self.resize).square().mean()))
-        return total / len(views)
+        return total / max(1, len(views))
 
     def steer(self, model: SplatModel) -> float:
         return self.decibels(model, self.steering)
@@ -84,8 +84,10 @@ def hold_back(
 ) -> tuple[list[Camera], list[Camera]]:
     """The `views` that are adapted to, and those of validation: of the given cameras, where a policy chooses among enough of them, and
     others from the region that they span; without cameras a part of another orbit. Of large images the middle is judged."""
+    if scale > WINDOW:  # one pixel of the base is larger than what is judged at most, and shows next to nothing
+        return list(views), []
     left, judged = _hold_back(cameras, views, means, config)
-    most = max(1, round(WINDOW / max(1.0, scale)))
+    most = round(WINDOW / max(1.0, scale))
     return left, [view.window(most, most) for view in judged]
 
 

@@ -45,8 +45,7 @@ def adapt(
         scale: Target focal length over base focal length, such as 1/4 or 4. May be given several times.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. Several scales or viewers: a folder for all of them.
         recipe: default; thorough (more steps and views); instant (closed form only); paper (the published code, quirk by quirk).
-        viewer: What the file is for: classic (INRIA, gsplat, nerfstudio), spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown
-            name lists them all. May be given several times, for a file each. Without it the file is drawn as 3DGS draws, without compensation.
+        viewer: What the file is for: classic (INRIA, gsplat, nerfstudio; the default), spark, supersplat, ...; several: a file each.
         views: Which views to adapt to; by default what the recipe says.
         cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         steps: Optimizer steps at most.
@@ -65,23 +64,29 @@ def adapt(
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
     chosen: dict[str, Any] = dict(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     settings = {name: value for name, value in chosen.items() if value is not None}
-    viewers: list[str | None] = [*dict.fromkeys(viewer)] or [None]
-    wanted = [(each, name) for each in each_once(scale) for name in viewers]
+    wanted = _wanted(scale, viewer)
     targets = [adapted_path(checkpoint, output, *each, several=len(wanted) > 1) for each in wanted]
     for (each, name), target in zip(wanted, targets, strict=True):
         config = make_config(recipe, each, seed=seed, **settings)
         wrapped.target(name)
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0)
     real = None if images is None else load_scene(images)
+    settings |= dict(recipe=recipe, seed=seed, images=real)
     reports = []
     for (each, name), target in zip(wanted, targets, strict=True):
-        adapted = wrapped.adapt(each, recipe=recipe, viewer=name, seed=seed, images=real, resume=state_path(target), **settings)
+        adapted = wrapped.adapt(each, viewer=name, resume=state_path(target), **settings)
         saved = adapted.save(target, overwrite=overwrite)
         reports.append({"file": str(saved), **adapted.report.model_dump()})
         if not json:
             _print(saved, adapted.report)
     if json:
         tell(reports, json)
+
+
+def _wanted(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:
+    """Each scale with each viewer, none twice."""
+    names: list[str | None] = [*dict.fromkeys(viewers)] or [None]
+    return [(scale, name) for scale in each_once(scales) for name in names]
 
 
 def _print(saved: Path, report: Report) -> None:

@@ -68,8 +68,7 @@ def evaluate(
     _refuse(checkpoint, images, output, overwrite)
     perceptual = Perceptual(lpips, lpips_weights) if lpips else None
     settings = {name: value for name, value in dict(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer).items() if value is not None}
-    rows: list[Any] = []
-    notes: dict[str, None] = {}  # each once, in their order
+    rows, notes = list[Any](), dict[str, None]()  # notes each once, in their order
     for each, folder in zip(checkpoint, images, strict=True):
         wrapped, scene = wrap(each, None, background, backend, screen_filter), _scene(folder, appearance)
         rows += evaluation.evaluate(wrapped, scene, each_once(scale), recipe, protocol, perceptual, **settings)

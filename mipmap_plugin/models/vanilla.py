@@ -17,7 +17,7 @@ from mipmap_plugin.errors import CheckpointError, SettingsError, ShapeError
 from mipmap_plugin.files import sha256
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
+from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters, unit_quaternions
 from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
 from mipmap_plugin.models.exchange import is_written, write_exchange
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
@@ -249,19 +249,6 @@ def read_splats(found: Checkpoint, kind: type[Splats]) -> Splats:
     if "fused" in found.path.stem and model.trained.screen_filter == "classic" and screen_filter is None:
         model.notes.append(FUSED)
     return without_poison(model)
-
-
-def unit_quaternions(quats: Tensor) -> Tensor:
-    """[N, 4] -> [N, 4] of length 1, with a finite gradient everywhere; a zero quaternion becomes the identity.
-
-    Dividing by the largest component first keeps the squares in range. It is taken as a constant, which is exact: the
-    result does not depend on it.
-    """
-    largest = quats.detach().abs().amax(dim=1, keepdim=True)
-    is_zero = largest < torch.finfo(quats.dtype).tiny
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    scaled = torch.where(is_zero, identity, quats / torch.where(is_zero, 1.0, largest))
-    return scaled / scaled.norm(dim=1, keepdim=True)
 
 
 def without_poison(model: Splats) -> Splats:

@@ -93,7 +93,9 @@ def test_a_full_disk_when_the_finished_model_is_saved_leaves_its_state(tmp_path,
         done.save(tmp_path / "new.ply")
     assert state.exists()
     again = model.adapt(1 / 4, steps=3, resume=state)
-    assert again.report.curve == done.report.curve
+    assert [point.model_copy(update={"seconds": 0.0}) for point in again.report.curve] == [
+        point.model_copy(update={"seconds": 0.0}) for point in done.report.curve
+    ]
     assert again.save(tmp_path / "new.ply").read_bytes() == done.save(tmp_path / "other.ply").read_bytes()
     assert not state.exists()
 
@@ -161,7 +163,7 @@ torch.set_num_threads(1)
 resume.KEEP_EVERY_S = 0.0
 render, calls = ReferenceBackend.render, []
 def counted(self, gaussians, *scene):
-    calls.append(gaussians.means.requires_grad)
+    calls.append(gaussians.means.requires_grad and torch.is_grad_enabled() and scene[0].width > 1)  # in a step
     if sum(calls) == {call}:
         os.kill(os.getpid(), signal.SIGKILL)
     return render(self, gaussians, *scene)
