@@ -6,13 +6,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mipmap_plugin.adaptation.closed_form import THINNEST, closed_form, pixel_size
+from mipmap_plugin.adaptation.closed_form import CLEAR_OF_CULLS, THINNEST, closed_form, needs_nothing, pixel_size
 from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.backends.filters import keeps_light
+from mipmap_plugin.backends.filters import footprint, keeps_light
+from mipmap_plugin.backends.projection import project
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, Effects
+from mipmap_plugin.effects import DILATION, SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.viewers import find_viewer
 
 BACKEND = ReferenceBackend()
 DEPTH, FOCAL = 4.0, 40.0
@@ -132,3 +134,63 @@ def test_zoom_in_of_an_analytic_base_shrinks_to_its_picture():
     splat = disc(1.5, 0.8)
     large = show(splat, 3, 0.0, "analytic")
     torch.testing.assert_close(resize(large, (VIEW.height, VIEW.width), "box"), show(splat, 1, 0.0, "analytic"), atol=2e-3, rtol=0)
+
+
+# Targets that compensate, and targets that cull
+
+
+def drawn_by(viewer: str) -> Effects:
+    return find_viewer(viewer).effects(Effects(0))
+
+
+def light(splat: Gaussians, scale: float, effects: Effects) -> float:
+    """px², over 2π: what a splat adds to an image."""
+    shown = footprint(project(splat, VIEW.zoomed(scale), effects.near_plane), splat.opacities, effects.screen_filter, effects.eps2d)
+    return float(shown.opacities * (shown.yy * shown.across).sqrt())
+
+
+@pytest.mark.parametrize("viewer", ["spark", "antialiased"])
+@pytest.mark.parametrize("scale", [1 / 2, 1 / 8])
+@pytest.mark.parametrize("size", [(2.0, 0.8), (0.3, 0.05), (0.05, 0.02)])
+@pytest.mark.parametrize("opacity", [0.7, 0.05])
+def test_a_target_that_compensates_shows_each_splats_light(viewer, scale, size, opacity):
+    splat, target = disc(*size, opacity), drawn_by(viewer)
+    new = adapted(splat, scale, target=target)
+    assert light(new, scale, target) == pytest.approx(light(splat, 1, Effects(0)) * scale**2, rel=1e-6)
+    assert new.opacities <= 1
+
+
+MIP = Effects(0, "mip", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("base", "target", "nothing"),
+    [
+        (MIP, MIP, True),
+        (Effects(0, "antialiased"), Effects(0, "antialiased"), True),
+        (MIP, Effects(0, "analytic", 0.1), True),  # which does what a pixel does, whatever the base's filter was
+        (MIP, Effects(0, "mip", 0.3), False),
+        (Effects(0, "antialiased"), MIP, False),
+        (Effects(0), Effects(0), False),
+        (MIP, Effects(0), False),
+        (Effects(0), MIP, False),
+        (Effects(0, SURFEL), Effects(0, SURFEL), False),
+    ],
+)
+@pytest.mark.parametrize("scale", [1 / 4, 4])
+def test_what_needs_nothing(base, target, nothing, scale):
+    assert needs_nothing(scale, base, target) == nothing
+
+
+@pytest.mark.parametrize("size", [(0.8, 0.8), (3.0, 0.05), (0.01, 0.01)])
+def test_the_two_longer_axes_stay_clear_of_a_viewers_cull(size):
+    target = drawn_by("playcanvas")
+    variances = (adapted(disc(*size), 1 / 8, target=target).scales[0] / (8 * PIXEL)).square()
+    least = CLEAR_OF_CULLS * (target.settings.min_variance - target.eps2d)
+    assert (variances[:2] >= least * (1 - 1e-9)).all() and variances[2] < least
+
+
+def test_a_splat_that_a_viewer_would_cull_is_seen():
+    splat, target = disc(0.8, 0.8), drawn_by("playcanvas")
+    shown = [BACKEND.render(each, VIEW.zoomed(1 / 8), target).image.max() for each in (splat, adapted(splat, 1 / 8, target=target))]
+    assert shown[0] == 0 and shown[1] > 0.01

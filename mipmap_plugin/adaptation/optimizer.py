@@ -41,12 +41,11 @@ def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float,
 
 
 def take_back(model: SplatModel, optimizer: torch.optim.Adam, snapshot: Snapshot) -> None:
-    """Let the model hold the snapshot; its moments begin at 0."""
-    put_back(model, optimizer, snapshot.rows)
-    with torch.no_grad():
-        for name, tensor in model.shared_parameters().items():
-            tensor.copy_(snapshot.shared[name])
-            optimizer.state.pop(tensor, None)
+    """Let the model hold the snapshot, in its own leaves where it has as many rows; Adam begins anew."""
+    if len(model.parameters()["means"]) != len(snapshot.rows["means"]):
+        put_back(model, optimizer, snapshot.rows)
+    snapshot.put_into(model)
+    optimizer.state.clear()  # moments at 0 whose steps went on being counted would make the first step three times too long
 
 
 def put_back(model: SplatModel, optimizer: torch.optim.Adam, before: Mapping[str, Tensor]) -> None:

@@ -200,7 +200,7 @@ class Session:
         """Names what a run depends on, so that a state is never resumed as another run."""
         poses = [[view.width, view.height, view.fx, view.fy, view.time, *view.viewmat.flatten().tolist()] for view in self.views]
         base = self.base.digest or _digest(self.base)
-        facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.trained), poses]
+        facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.trained), asdict(self.effects), poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:

@@ -1,0 +1,79 @@
+"""The start: the best of base, closed form and merged splats, as validation views have it."""
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation import start
+from mipmap_plugin.adaptation.validation import Validation
+from mipmap_plugin.wrap import wrap_model
+
+SCALE, COUNT = 1 / 4, 80
+
+
+def adapted(count=COUNT, scale=SCALE, **settings):
+    model = wrap_model(tiny.model(count), cameras=tiny.cameras(), backend="reference")
+    return model.adapt(scale, **{"steps": 0, "merge_to": 1.0, "extra_views": 4, **settings})
+
+
+def start_of(report) -> str:
+    return next(name for name in report.validation if name.startswith("the start, ")).removeprefix("the start, ")
+
+
+def test_the_closed_form_is_where_a_run_starts():
+    assert start_of(adapted().report) == "the closed form"
+
+
+def test_the_base_is_chosen_where_the_closed_form_is_worse(monkeypatch):
+    monkeypatch.setattr(start, "closed_form", lambda gaussians, *_: (10 * gaussians.scales, gaussians.opacities))
+    result = adapted(scale=4)
+    assert start_of(result.report) == "the base"
+    assert torch.equal(result.model.parameters()["scales"], tiny.model(COUNT).parameters()["scales"])
+
+
+def test_the_base_is_where_a_run_starts_without_a_closed_form():
+    assert start_of(adapted(closed_form=False).report) == "the base"
+
+
+@pytest.fixture
+def a_decibel_a_splat(monkeypatch):
+    """Every splat less costs 1 dB; the base is worse than anything."""
+    tried = []
+
+    def steer(self, model):
+        tried.append(len(model))
+        return -100.0 if len(tried) == 1 else float(len(model))
+
+    monkeypatch.setattr(Validation, "steer", steer)
+    return tried
+
+
+def test_merging_is_refused_where_it_costs_too_much(a_decibel_a_splat):
+    report = adapted(merge_to=0.5, merging_costs=0.5).report
+    assert (start_of(report), report.gaussians_after) == ("the closed form", COUNT)
+    assert a_decibel_a_splat[:2] == [COUNT, COUNT] and a_decibel_a_splat[2:] == sorted(a_decibel_a_splat[2:])
+    assert len(a_decibel_a_splat) == 5  # fewer and fewer were merged, in vain
+
+
+def test_merging_is_done_as_far_as_it_may_cost(a_decibel_a_splat):
+    all_of_it = adapted(merge_to=0.5, merging_costs=COUNT / 2).report
+    assert (start_of(all_of_it), len(a_decibel_a_splat)) == ("the closed form of merged splats", 3)
+    a_decibel_a_splat.clear()
+    less = adapted(merge_to=0.5, merging_costs=COUNT - all_of_it.gaussians_after - 1).report
+    assert start_of(less) == "the closed form of merged splats"
+    assert all_of_it.gaussians_after < less.gaussians_after < COUNT
+
+
+def test_merged_splats_that_are_worse_than_the_base_are_not_begun_with(monkeypatch):
+    monkeypatch.setattr(Validation, "steer", lambda self, model: float(len(model)))
+    report = adapted(merge_to=0.5, merging_costs=COUNT).report
+    assert (start_of(report), report.gaussians_after) == ("the base", COUNT)
+
+
+def test_phases_are_named():
+    seconds = adapted(merge_to=0.5).report.seconds
+    phases = ["compilation", "blend weights", "closed form", "merging", "validation"]
+    assert all(seconds[phase] > 0 for phase in phases)
+    assert seconds["total"] == pytest.approx(sum(seconds[phase] for phase in phases), rel=0.2)
+    assert "merging" not in adapted().report.seconds
+    assert "closed form" not in adapted(closed_form=False).report.seconds

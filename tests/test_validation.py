@@ -1,0 +1,310 @@
+"""Validation: which views judge, how a model is judged, and that a run returns nothing worse than what it was given."""
+
+import math
+import signal
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation import loop, start
+from mipmap_plugin.adaptation.optimizer import make_optimizer, take_back
+from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.snapshot import Snapshot
+from mipmap_plugin.adaptation.validation import FIRST, GENTLER, HARDLY, HARM, KEPT_BACK, WINDOW, Steering, Validation, hold_back
+from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.config import recipe
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.wrap import Interrupted, wrap_model
+
+MEANS = tiny.gaussians().means
+SCALE = 1 / 4
+
+# So bold that every step does harm.
+BOLD = {name: 1000 * rate for name, rate in recipe("default", SCALE).rates.model_dump().items()}
+HARMFUL = dict(steps=6, extra_views=2, check_every=2, merge_to=1.0, warm_up=0, patience=None, rates=BOLD)
+MANY = 2 * KEPT_BACK  # cameras, of which two are kept back
+
+
+def wrapped(count=40, cameras=None):
+    return wrap_model(tiny.model(count), cameras=cameras or tiny.cameras(), backend="reference")
+
+
+def same(model, other) -> bool:
+    return all(torch.equal(tensor, other.parameters()[name]) for name, tensor in model.parameters().items())
+
+
+# Views
+
+
+def held_back(cameras, policy, scale=SCALE, **settings):
+    config = recipe("default", scale, **{"views": policy, "extra_views": 8, **settings})
+    views, _ = choose_views(cameras, MEANS, config)
+    return hold_back(cameras, views, MEANS, scale, config)
+
+
+def poses(views):
+    return {tuple(view.viewmat.flatten().tolist()) for view in views}
+
+
+@pytest.mark.parametrize("policy", ["given", "train", "test", "jittered", "orbit"])
+def test_no_view_of_validation_is_adapted_to(policy):
+    cameras = tiny.cameras(MANY) + tiny.cameras(MANY, seed=2, split="test")
+    left, judged = held_back(cameras, policy)
+    assert len(judged) == len(poses(judged)) == 16
+    assert left and not poses(left) & poses(judged)
+
+
+@pytest.mark.parametrize(("policy", "kept"), [("train", 2), ("jittered", 2), ("given", 0), ("test", 0), ("orbit", 0)])
+def test_given_cameras_are_kept_back_only_where_the_choice_is_ours(policy, kept):
+    cameras = tiny.cameras(MANY) + tiny.cameras(MANY, seed=2, split="test")
+    wanted, _ = choose_views(cameras, MEANS, recipe("default", SCALE, views=policy, extra_views=8))
+    left, judged = held_back(cameras, policy)
+    assert len(poses(cameras) & poses(judged)) == len(wanted) - len(left) == kept
+
+
+def test_few_cameras_are_all_adapted_to():
+    left, judged = held_back(tiny.cameras(KEPT_BACK - 1), "train")
+    assert len(left) == KEPT_BACK - 1 and len(judged) == 16
+
+
+def test_cameras_that_are_kept_back_choose_and_do_not_steer():
+    cameras = tiny.cameras(MANY)
+    _, judged = held_back(cameras, "train")
+    assert not poses(cameras) & poses(judged[::2])
+    assert len(poses(cameras) & poses(judged[1::2])) == 2
+
+
+def test_no_more_cameras_are_kept_back_than_half_of_the_validation_views():
+    left, judged = held_back(tiny.cameras(MANY), "train", validation_views=2)
+    assert (len(left), len(judged)) == (MANY - 1, 2)
+
+
+def test_without_cameras_validation_has_an_orbit_of_its_own(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
+    left, judged = held_back([], "jittered")
+    assert (len(left), len(judged)) == (8, 16) and not poses(left) & poses(judged)
+
+
+@pytest.mark.parametrize(("scale", "most"), [(1 / 4, WINDOW), (1, WINDOW), (4, WINDOW // 4), (1e4, 1)])
+def test_a_window_bounds_what_is_judged(scale, most):
+    views = tiny.cameras(width=3 * WINDOW, height=2 * WINDOW)
+    _, judged = held_back(views, "given", scale)
+    assert {view.size for view in judged} == {(most, most)}
+    assert judged[0].fx == views[0].fx and judged[0].cx == pytest.approx(most / 2, abs=0.5)  # the middle
+
+
+def test_a_seed_chooses_the_views():
+    cameras = tiny.cameras(MANY)
+    first, again, other = (held_back(cameras, "jittered", seed=seed)[1] for seed in (3, 3, 4))
+    assert poses(first) == poses(again) != poses(other)
+
+
+# Judging
+
+
+def judge(truth, views=2):
+    """A validation for which a "model" is the brightness of each view."""
+    cameras = tiny.cameras(views)
+    shown = lambda brightness, camera: torch.full((*camera.size, 3), brightness[[view.name for view in cameras].index(camera.name)])  # noqa: E731
+    return Validation(cameras, cameras, 1.0, lambda view: torch.full((*view.size, 3), truth), shown, "area")
+
+
+def shows(*brightness):
+    return SimpleNamespace(gaussians=lambda camera: brightness)
+
+
+def test_decibels_are_the_mean_of_each_view_as_it_is_displayed():
+    by_hand = (-10 * math.log10(0.1**2) - 10 * math.log10(0.5**2)) / 2  # 1.7 is displayed as 1
+    assert judge(0.5).steer(shows(0.6, 1.7)) == pytest.approx(by_hand, abs=1e-4)
+
+
+def test_the_best_state_is_chosen_and_every_score_is_told():
+    states = {"base": shows(0.1, 0.1), "best": shows(0.01, 0.01), "last": shows(1.0, 1.0)}
+    name, found = judge(0.0).choose(states)
+    assert name == "best"
+    assert found == pytest.approx({"base": 20.0, "best": 40.0, "last": 0.0}, abs=1e-3)
+
+
+@pytest.mark.parametrize(("worse_db", "chosen"), [(0.0, "later"), (HARDLY / 2, "later"), (2 * HARDLY, "earlier")])
+def test_of_equals_the_later_is_chosen(worse_db, chosen):
+    later = 0.1 * 10 ** (worse_db / 20)
+    assert judge(0.0).choose({"earlier": shows(0.1, 0.1), "later": shows(later, later)})[0] == chosen
+
+
+# Steering
+
+
+def steering(**more) -> Steering:
+    return Steering(30.0, 30.0, Snapshot.of(tiny.model(2)), **more)
+
+
+def test_boldness_rises_by_the_same_factor_in_each_step_of_the_warm_up():
+    config = recipe("default", SCALE, warm_up=0.5)
+    risen = [steering().boldness(progress, config) for progress in (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)]
+    assert risen == pytest.approx([FIRST, FIRST**0.75, FIRST**0.5, FIRST**0.25, 1, 1, 1])
+    assert steering().boldness(0.0, recipe("default", SCALE, warm_up=0)) == 1
+
+
+def test_boldness_does_not_rise_above_the_ceiling():
+    config, capped = recipe("default", SCALE, warm_up=0.5), steering(ceiling=0.25)
+    assert [capped.boldness(progress, config) for progress in (0.0, 0.5, 1.0)] == pytest.approx([FIRST, 0.25, 0.25])
+
+
+def test_harm_is_less_than_the_start_by_more_than_a_choice_of_views_makes():
+    assert not steering().harms(30 - HARM + 1e-6)
+    assert steering().harms(30 - HARM - 1e-6)
+
+
+def test_what_is_taken_back_goes_on_with_gentler_steps():
+    run = steering()
+    run.take_back(0.5)
+    run.take_back(run.ceiling)
+    assert (run.ceiling, run.undone) == (0.5 * GENTLER**2, 2)
+
+
+@pytest.mark.parametrize("rows", [5, 3])
+def test_what_is_taken_back_is_held_and_adam_begins_anew(rows):
+    student, other = tiny.model(5).copy(), tiny.model(rows, seed=1)
+    optimizer = make_optimizer(student, recipe("default", 4, rates={"opacities": 0.1}), pixel=1.0)
+    before, wanted = student.parameters()["opacities"], other.parameters()["opacities"]
+
+    def step():
+        student.parameters()["opacities"].grad = torch.ones_like(student.parameters()["opacities"])
+        optimizer.step()
+
+    for _ in range(3):
+        step()
+    take_back(student, optimizer, Snapshot.of(other))
+    assert same(other, student) and (student.parameters()["opacities"] is before) == (rows == 5)
+    step()
+    torch.testing.assert_close(student.parameters()["opacities"].detach(), wanted - 0.1)  # the first step of Adam is its rate
+
+
+@pytest.mark.parametrize(("found", "best_db", "step"), [(31.0, 31.0, 7), (30 - HARDLY / 2, 30.0, 7), (30 - 2 * HARDLY, 30.0, 0)])
+def test_a_state_is_kept_unless_it_is_worse(found, best_db, step):
+    run, student = steering(), tiny.model(2, seed=1)
+    run.keep(found, 7, student)
+    assert (run.best_db, run.best_step) == (best_db, step)
+    assert torch.equal(run.best.rows["means"], student.parameters()["means"]) == (step == 7)
+
+
+# Whole runs
+
+
+def from_the_base(model, image, camera, scale):
+    """dB, against the base: of a zoom-out supersampled, of a zoom-in as it is."""
+    if scale < 1:
+        return psnr(image, model.render(camera.zoomed(scale), scale, "scaled", supersampling=4).image)
+    return psnr(resize(image, camera.size, "area"), model.render(camera).image)
+
+
+@pytest.mark.parametrize("steered", [True, False])
+@pytest.mark.parametrize("scale", [1 / 4, 4])
+def test_harmful_steps_return_nothing_worse_than_the_base_and_the_start(monkeypatch, scale, steered):
+    if not steered:
+        monkeypatch.setattr(Steering, "harms", lambda self, found: False)
+    model = wrapped()
+    started, adapted = model.adapt(scale, **{**HARMFUL, "steps": 0}), model.adapt(scale, **HARMFUL)
+    for camera in tiny.cameras(3, seed=9):  # of neither set
+        small = camera.zoomed(scale)
+        images = model.render(small).image, started.render(small).image, adapted.render(small).image
+        base, first, final = (from_the_base(model, image, camera, scale) for image in images)
+        assert final >= max(base, first) - HARM
+
+
+def test_a_report_says_which_state_was_returned_and_why(monkeypatch):
+    monkeypatch.setattr(Steering, "harms", lambda self, found: False)
+    report = wrapped().adapt(SCALE, **HARMFUL).report
+    found, name = report.validation, "the state after step 0"
+    assert list(found) == ["the base as it is", "the start, the closed form", name, "the last state"]
+    assert found["the last state"] < found[name] - 3
+    assert report.returned == f"{name}, for the last state shows {found['the last state']:.2f} dB where it shows {found[name]:.2f}"
+
+
+def test_steps_that_were_taken_back_are_marked():
+    model = wrapped()
+    adapted = model.adapt(SCALE, **HARMFUL)
+    assert [(point.step, point.taken_back) for point in adapted.report.curve] == [(0, False), (2, True), (4, True), (6, True)]
+    assert len({point.validation_db for point in adapted.report.curve}) == 1  # what the run went on with each time
+    assert same(adapted.model, model.adapt(SCALE, **{**HARMFUL, "steps": 0}).model)
+
+
+def test_a_run_goes_on_gently_after_harm():
+    boldly = {name: 30 * rate for name, rate in recipe("default", SCALE).rates.model_dump().items()}
+    points = wrapped().adapt(SCALE, **{**HARMFUL, "steps": 40, "rates": boldly}).report.curve
+    assert points[1].taken_back and not points[-1].taken_back
+    assert points[-1].validation_db > points[0].validation_db + 1
+
+
+def test_the_last_state_is_returned_where_it_is_asked_for():
+    report = wrapped().adapt(SCALE, returns="last", **HARMFUL).report
+    assert report.returned == "the last state"
+    assert report.validation["the last state"] < report.validation["the start, the closed form"] - 3
+    assert not any(point.taken_back for point in report.curve)
+
+
+@pytest.mark.parametrize("closed_form", [True, False])
+def test_a_budget_of_nothing_returns_the_start(closed_form):
+    model, settings = wrapped(), dict(merge_to=1.0, closed_form=closed_form)
+    adapted = model.adapt(SCALE, time_budget_s=1e-6, **settings)
+    assert [point.step for point in adapted.report.curve] == [0]
+    assert same(adapted.model, model.adapt(SCALE, steps=0, **settings).model)
+    assert same(adapted.model, model.model) != closed_form
+
+
+@pytest.mark.parametrize(
+    ("settings", "steps"),
+    [(dict(steps=5, check_every=3), [0, 3, 5]), (dict(steps=3, check_every=50), [0, 3]), (dict(steps=9, check_every=2, target_db=0.0), [0, 2])],
+)
+def test_a_curve_has_its_first_and_its_last_point(settings, steps):
+    report = wrapped().adapt(SCALE, **{"extra_views": 0, "warm_up": 0, **settings}).report
+    assert [point.step for point in report.curve] == steps
+    assert (report.curve[0].psnr_db, report.curve[-1].psnr_db is None) == (None, False)
+
+
+def test_a_run_that_ends_between_two_checks_is_looked_at_all_the_same(monkeypatch):
+    reasons = iter([None, None, "enough"])
+    monkeypatch.setattr(loop, "reason_to_stop", lambda curve, seconds, config: next(reasons))
+    report = wrapped().adapt(SCALE, steps=9, check_every=50, extra_views=0, warm_up=0).report
+    assert (report.ended_by, [point.step for point in report.curve]) == ("enough", [0, 2])
+
+
+def with_extras() -> VanillaModel:
+    """A model with a column that 3DGS does not know."""
+    return VanillaModel(tiny.model(40).parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)}))
+
+
+@pytest.mark.parametrize("at", [2, 3, 5])  # at a check that takes back, and between two
+@pytest.mark.parametrize("pruned", [True, False])
+def test_a_resumed_run_takes_back_as_the_whole_one_did(tmp_path, at, pruned):
+    settings = {**HARMFUL, "prune_every": 1 if pruned else 50, "min_opacity": 0.4, "steps": 7, "check_every": 2}
+    model = wrap_model(with_extras(), cameras=tiny.cameras(), backend="reference")
+    whole = model.adapt(SCALE, **settings)
+    with pytest.raises(Interrupted):
+        model.adapt(SCALE, resume=tmp_path / "run", observe=lambda step, *_: step == at and signal.raise_signal(signal.SIGINT), **settings)
+    resumed = model.adapt(SCALE, resume=tmp_path / "run", **settings)
+    assert any(point.taken_back for point in whole.report.curve)
+    facts = [[(p.step, p.psnr_db, p.validation_db, p.gaussians, p.taken_back) for p in each.report.curve] for each in (whole, resumed)]
+    assert facts[0] == facts[1]
+    files = [each.save(tmp_path / f"{number}.ply") for number, each in enumerate((whole, resumed))]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert ("confidence" in read_ply(files[0]).columns) != pruned
+
+
+def test_the_closed_form_alone_is_judged_too(monkeypatch):
+    report = wrapped().adapt(SCALE, recipe="instant").report
+    assert report.validation["the start, the closed form"] > report.validation["the base as it is"] + 3
+    assert report.returned == "the start, the closed form"
+
+
+def test_a_start_that_is_worse_than_the_base_is_not_returned(monkeypatch):
+    monkeypatch.setattr(start.Start, "best", lambda self: (tiny.model(40, seed=5), "another scene"))
+    model = wrapped()
+    adapted = model.adapt(SCALE, recipe="instant")
+    assert adapted.report.returned.startswith("the base as it is, for the start, another scene shows ")
+    assert same(adapted.model, model.model)

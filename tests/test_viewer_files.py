@@ -1,0 +1,84 @@
+"""Files made for a viewer: adapted as it draws, and named after it."""
+
+import signal
+
+import pytest
+import tiny
+
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.tags import provenance_of
+from mipmap_plugin.wrap import Interrupted, wrap_model
+
+BRIEF = dict(steps=2, extra_views=2, merge_to=1.0, warm_up=0)
+
+
+def wrapped(**trained):
+    return wrap_model(tiny.model(40, TrainedScale(**trained)), cameras=tiny.cameras(), backend="reference")
+
+
+@pytest.mark.parametrize("viewer", ["spark", "playcanvas"])
+def test_an_adapted_model_is_drawn_as_its_viewer_does(viewer):
+    model = wrapped()
+    adapted = model.adapt(1 / 4, viewer=viewer, **BRIEF)
+    assert adapted.effects == model.effects(viewer=viewer) != model.effects()
+    assert (adapted.model.trained.screen_filter, adapted.model.trained.eps2d) == (adapted.effects.screen_filter, adapted.effects.eps2d)
+
+
+def test_the_report_and_the_file_say_what_viewer_they_are_for(tmp_path):
+    adapted = wrapped().adapt(1 / 4, viewer="spark", **BRIEF)
+    assert adapted.report.viewer == "spark"
+    assert provenance_of(read_ply(adapted.save(tmp_path / "new.ply")).comments)["viewer"] == "spark"
+    assert wrapped().adapt(1 / 4, recipe="instant").report.provenance()["viewer"] is None
+
+
+def test_an_unknown_viewer_is_told_the_known_ones():
+    with pytest.raises(SettingsError, match=r"there is no 'sparc'; known are .*playcanvas.*spark"):
+        wrapped().adapt(1 / 4, viewer="sparc")
+
+
+def test_files_of_a_family_that_keeps_its_filter_are_for_no_viewer():
+    with pytest.raises(SettingsError, match="3dgs: its files are opened by its own project alone; leave the viewer spark out"):
+        wrapped(keeps_filter=True).adapt(1 / 4, viewer="spark")
+
+
+@pytest.mark.parametrize("viewer", ["spark", "playcanvas"])
+def test_at_scale_one_a_viewer_comes_closer_to_the_bases_own_picture(viewer):
+    model = wrapped()
+    adapted = model.adapt(1, viewer=viewer, steps=10, extra_views=8)
+    for camera in tiny.cameras(3, seed=9):  # that nothing was adapted to
+        own, naive, new = model.render(camera).image, model.render(camera, viewer=viewer).image, adapted.render(camera).image
+        assert psnr(new, own) > psnr(naive, own) + 1
+
+
+def test_a_run_for_one_viewer_is_not_resumed_for_another(tmp_path):
+    def stop(step, *_):
+        if step == 1:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        wrapped().adapt(1 / 4, viewer="spark", resume=tmp_path / "run", observe=stop, **BRIEF)
+    with pytest.raises(SettingsError, match="belongs to another base, other settings or other views"):
+        wrapped().adapt(1 / 4, viewer="playcanvas", resume=tmp_path / "run", **BRIEF)
+
+
+def test_the_command_writes_a_file_for_each_viewer_and_says_what_it_holds(tmp_path, capsys):
+    base = tiny.folder(tmp_path / "base", tiny.cameras(3))
+    words = ["adapt", base, "--scale", "1/4", "--viewer", "spark", "--viewer", "playcanvas", "--steps", "2", "--views", "given"]
+    assert main([*map(str, words), "--backend", "reference"]) == 0
+    out = capsys.readouterr().out
+    for viewer in ("spark", "playcanvas"):
+        ply = tmp_path / f"base_x0.25_{viewer}" / "point_cloud/iteration_30000/point_cloud.ply"
+        assert provenance_of(read_ply(ply).comments)["viewer"] == viewer
+        assert f"x0.25 in {viewer}: {ply}" in out
+    assert out.count("  holds the ") == out.count("(dB on views that nothing was adapted to: the base as it is ") == 2
+    assert "give --viewer" not in out
+
+
+def test_the_command_says_whom_a_file_without_a_viewer_is_for(tmp_path, capsys):
+    words = ["adapt", tiny.folder(tmp_path / "base", tiny.cameras(3)), "--scale", "1/4", "--recipe", "instant", "--backend", "reference"]
+    assert main([str(word) for word in words]) == 0
+    assert "made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio); for others give --viewer spark" in capsys.readouterr().out
