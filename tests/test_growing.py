@@ -133,11 +133,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one(judged, monkeypatch, tmp_path
     whole = adapted()
     render, calls = ReferenceBackend.render, []
 
-    def interrupting(self, gaussians, *scene):
-        calls.append(gaussians.means.requires_grad)
+    def interrupting(self, gaussians, camera, effects):
+        calls.append(gaussians.means.requires_grad and torch.is_grad_enabled() and camera.width > 1)  # in a step
         if sum(calls) == pressed and calls[-1]:
             signal.raise_signal(signal.SIGINT)
-        return render(self, gaussians, *scene)
+        return render(self, gaussians, camera, effects)
 
     judged(*agreements)
     with monkeypatch.context() as patched:

@@ -235,8 +235,8 @@ def test_steps_that_were_taken_back_are_marked():
 
 
 def test_a_run_goes_on_gently_after_harm():
-    boldly = {name: 30 * rate for name, rate in recipe("default", SCALE).rates.model_dump().items()}
-    points = wrapped().adapt(SCALE, **{**HARMFUL, "steps": 40, "rates": boldly}).report.curve
+    boldly = {name: 10 * rate for name, rate in recipe("default", SCALE).rates.model_dump().items()}
+    points = wrapped().adapt(SCALE, **{**HARMFUL, "steps": 16, "decay": 1.0, "rates": boldly}).report.curve
     assert points[1].taken_back and not points[-1].taken_back
     assert points[-1].validation_db > points[0].validation_db + 1
 
