@@ -14,7 +14,7 @@ from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenF
 from mipmap_plugin.config import Recipe, ResizeFilter, ViewPolicy
 from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import state_path
+from mipmap_plugin.wrap import Adapted, state_path
 
 
 def adapt(
@@ -62,8 +62,7 @@ def adapt(
         json: Print the reports as JSON.
     """
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
-    chosen: dict[str, Any] = dict(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
-    settings = {name: value for name, value in chosen.items() if value is not None}
+    settings = _given(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     wanted = _wanted(scale, viewer)
     targets = [adapted_path(checkpoint, output, *each, several=len(wanted) > 1) for each in wanted]
     for (each, name), target in zip(wanted, targets, strict=True):
@@ -75,12 +74,21 @@ def adapt(
     reports = []
     for (each, name), target in zip(wanted, targets, strict=True):
         adapted = wrapped.adapt(each, viewer=name, resume=state_path(target), **settings)
-        saved = adapted.save(target, overwrite=overwrite)
-        reports.append({"file": str(saved), **adapted.report.model_dump()})
-        if not json:
-            _print(saved, adapted.report)
+        reports.append(_saved(adapted, target, overwrite, quiet=json))
     if json:
         tell(reports, json)
+
+
+def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:
+    """The report of an adapted model that is saved, and told of unless `quiet`."""
+    saved = adapted.save(target, overwrite=overwrite)
+    if not quiet:
+        _print(saved, adapted.report)
+    return {"file": str(saved), **adapted.report.model_dump()}
+
+
+def _given(**chosen: Any) -> dict[str, Any]:
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def _wanted(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:

@@ -45,7 +45,7 @@ def evaluate(
         images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images), one for each checkpoint.
         scale: Target over base, such as 1/4 or 4; 1 is the base itself. May be given several times.
         recipe: Adapt with this recipe, once on the checkpoint's training views and once on those that are judged; may be given several times.
-        viewer: What files are adapted for, and draws them and the base: spark, playcanvas (or supersplat), ...
+        viewer: What files are adapted for, and draws them and the base: spark, supersplat, ...
         protocol: The truth at another scale: P1 box, cut off; P3 Pillow's bicubic on 8 bits; P4 the folders images_2, images_4, ... of COLMAP.
         lpips: Also measure LPIPS, with AlexNet or VGG; vgg-01 feeds images in 0..1, which is not LPIPS' definition but what the papers do.
         lpips_weights: The backbone's weights, as torchvision saves them; by default they are downloaded, once.
@@ -63,7 +63,6 @@ def evaluate(
     """
     from mipmap_plugin.evaluation import evaluate as evaluation
     from mipmap_plugin.evaluation.perceptual import Perceptual
-    from mipmap_plugin.evaluation.report import records
 
     _refuse(checkpoint, images, output, overwrite)
     perceptual = Perceptual(lpips, lpips_weights) if lpips else None
@@ -74,10 +73,16 @@ def evaluate(
         rows += evaluation.evaluate(wrapped, scene, each_once(scale), recipe, protocol, perceptual, **settings)
         notes |= dict.fromkeys(evaluation.notes(wrapped, scale, appearance))
     rows += evaluation.means(rows) if len(checkpoint) > 1 else []
-    facts = {"rows": records(rows), "notes": list(notes)}
+    facts = _facts(rows, [*notes])
     if output:
         write_json(output, facts, overwrite)
     tell(facts, json) if json else _print_tables(_title(checkpoint, images, protocol), rows, [*notes], published, each_once(scale))
+
+
+def _facts(rows: Sequence[Any], notes: Sequence[str]) -> dict[str, Any]:
+    from mipmap_plugin.evaluation.report import records
+
+    return {"rows": records(rows), "notes": list(notes)}
 
 
 def _scene(folder: Path, appearance: str) -> Scene:
