@@ -90,12 +90,17 @@ def test_without_cameras_validation_has_an_orbit_of_its_own(monkeypatch):
     assert (len(left), len(judged)) == (8, 16) and not poses(left) & poses(judged)
 
 
-@pytest.mark.parametrize(("scale", "most"), [(1 / 4, WINDOW), (1, WINDOW), (4, WINDOW // 4), (1e4, 1)])
+@pytest.mark.parametrize(("scale", "most"), [(1 / 4, WINDOW), (1, WINDOW), (4, WINDOW // 4), (WINDOW, 1)])
 def test_a_window_bounds_what_is_judged(scale, most):
     views = tiny.cameras(width=3 * WINDOW, height=2 * WINDOW)
     _, judged = held_back(views, "given", scale)
     assert {view.size for view in judged} == {(most, most)}
     assert judged[0].fx == views[0].fx and judged[0].cx == pytest.approx(most / 2, abs=0.5)  # the middle
+
+
+def test_where_one_pixel_of_the_base_is_more_than_is_judged_nothing_is():
+    views = tiny.cameras()
+    assert held_back(views, "given", 2 * WINDOW) == (views, [])
 
 
 def test_a_seed_chooses_the_views():
