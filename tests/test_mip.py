@@ -173,7 +173,7 @@ def test_filters_that_no_camera_sees_are_refused():
 
 
 def test_a_fused_file_is_told_apart(tmp_path):
-    """It has the columns of 3DGS: known by the options around it, or by what the user says; adapted, it is for any viewer."""
+    """It has the columns of 3DGS: known by the options around it, or by what the user says; adapted, it is for renderers that know no 3D filter."""
     plain = {name: column for name, column in splats().items() if name != "filter_3D"}
     inside = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras())
     assert inside.model.family == "3dgs" and (inside.effects().screen_filter, inside.effects().eps2d) == ("mip", 0.1)

@@ -21,7 +21,7 @@ from mipmap_plugin.wrap import Wrapped
 Show = Callable[[Camera], Tensor]  # a camera of the base scale -> [h, w, 3]
 Kind = Literal["base", "filter", "supersampling", "adapted", "renderer"]
 
-BASE = "base"  # as it is, as any viewer shows its file
+BASE = "base"  # as it is, as a renderer of its training draws it
 RESIZED = "base, resized"
 
 # Screen filters that need no training, for the rows beside the base as it is.

@@ -36,7 +36,7 @@ def milliseconds(point: Point) -> float:
 
 
 def files(points: Sequence[Point]) -> list[Point]:
-    """What any viewer shows: the base as it is, and what adapting made of it."""
+    """What a renderer without other filters shows: the base as it is, and what adapting made of it."""
     return [point for point in points if point.kind in ("base", "adapted")]
 
 

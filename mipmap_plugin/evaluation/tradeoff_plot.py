@@ -48,7 +48,7 @@ def draw(path: Path, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
 
 
 def _seconds(axes: Any, each: Tradeoff, colors: dict[str, Any]) -> None:
-    """What any viewer shows, against the seconds it took to make; what needs a renderer of its own is a line across."""
+    """What a renderer without other filters shows, against the seconds it took to make; what needs a renderer of its own is a line across."""
     for point in each.points:
         if point.kind in ("filter", "supersampling"):
             axes.axhline(point.psnr_db.median, color=colors[point.name], linestyle=":", linewidth=1)
