@@ -29,7 +29,7 @@ class TrainedScale:
     resolution: float = -1  # INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px
     background: tuple[float, float, float] | None = None  # linear RGB; None: the checkpoint does not say
     near_plane: float = NEAR_PLANE  # world units
-    keeps_filter: bool = False  # an adapted file is for its own project, and keeps this filter; else it is classic, or for a viewer that was asked for
+    keeps_filter: bool = False  # an adapted file is for its own project, and keeps this filter; else it is classic, or for a viewer
 
 
 class SplatModel(Protocol):
