@@ -66,7 +66,7 @@ Made by
     mipmap-plugin tradeoff {RUNS[name]} --output DIR
 
 which `python benchmarks/tradeoff.py DATA` runs. Medians (and the whole range) of three runs with seeds of their own, on one thread of a busy
-machine. What has 0 s needs a renderer that has it; the adapted file needs only one that draws as 3DGS does. `s` and `ms`: on the Pareto front of seconds
+machine. What has 0 s needs a renderer that has it; the adapted file needs one that draws as 3DGS does. `s` and `ms`: on the Pareto front of seconds
 to adapt, of milliseconds a frame. Every point, also those on the way: [tradeoff_{name}.json](tradeoff_{name}.json).
 
 {lines[0]}
