@@ -67,7 +67,7 @@ class AdaptConfig(BaseModel):
     decay: float = Field(1.0, gt=0, le=1, description="Every rate ends at this share of itself, falling along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's: how long it remembers gradients and their squares.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
-    warm_up: float = Field(0.0, ge=0, le=1, description="Share of the steps over which rates rise, as far as validation views allow.")
+    warm_up: float = Field(0.0, ge=0, le=1, description="Fraction of the steps during which rates rise, as far as validation views allow.")
     gathering: float = Field(0.0, ge=0, le=1, description="Fraction of the run during which new views are introduced; each costs a render.")
     validation_views: int = Field(16, ge=2, description="Views not adapted to, at most: half steer the run, half choose what it returns.")
     returns: Literal["best", "last"] = Field("best", description="The best state on validation views, base and start included, or the last.")
@@ -97,14 +97,15 @@ _INSTANT = dict(steps=0)
 # A classic file dilates by more than an image filter does, so sharpness has to come from colors that depend on the view: bands
 # above 0 move as fast as the base color, towards hundreds of views, or held-out views gain nothing by it. Rates are so bold that
 # most is gained while they fall; a memory for the last twenty squares instead of a thousand lets so short a run follow. There is no
-# knee to stop at before they have fallen. The first steps need few views to know where to go, and too many to know what a direction
-# shows: warming up, a tenth of `paper`'s time has 0.8 dB more (lego at x1/2 and x1/4), and the end is the same.
+# knee to stop at before they have fallen. What is bold follows from the scene: rates rise during the warm-up until validation views say that
+# steps do harm (`validation`): never on lego and chair, sooner or later on real captures. The loss is PSNR's, so that a few views that are
+# far off, next to floaters, do not decide for all.
 _DEFAULT_OUT = dict(
     steps=600, loss="psnr", decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=3, gathering=0.5, warm_up=0.1, extra_views=250,
 )  # fmt: skip
 _RATES_OUT = LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4)
 
-# What more time buys at zoom-out: twice the steps, twice the views in each, five times the views. At zoom-in there is nothing to buy
+# What more time buys at zoom-out: four times the steps, of eight views each, and four times the views. At zoom-in there is nothing to buy
 # without a network.
 _THOROUGH_OUT = dict(_DEFAULT_OUT, steps=2500, views_per_step=8, warm_up=0.05, extra_views=1000)
 

@@ -6,14 +6,16 @@ itself has to become
 
     Σ' = Σ + e·ρ² - e'·(ρ/s)².
 
-Zoom-out (s < 1) narrows, and an axis cannot become narrower than nothing: what is left too wide is paid for in opacity.
+Zoom-out (s < 1) narrows, and an axis cannot become narrower than nothing: what is left too wide is paid for in opacity. A target that
+compensates pays for width by itself, and takes from a thin splat nearly all of its opacity: there an axis becomes narrower by no more than
+the opacity can rise for, so that the splat adds as much to an image as before. One that leaves small splats out gets none so small.
 
 Zoom-in (s > 1) widens, but less than that: the pictures that a base was trained on are averages over pixels, which is p = 1/12 px² of
 variance, and so should be those that it is to show. The world is what Σ + e·ρ² is the average of, so that e and e' are each less by p, and
 opacity rises by the area that is lost (+0.3 dB after the default steps on photographs of lego and chair at x2 and x4).
 
-A file whose own filter keeps each splat's light needs nothing, at zoom-in where the base has such a filter too: that filter does what
-a pixel does, view by view. Wider splats would cost a base of Mip-Splatting 10 dB against the truth at x4.
+A file that is drawn by the base's own filter needs nothing where that filter compensates: it does what a pixel does, view by view. Wider
+splats would cost a base of Mip-Splatting 10 dB against the truth at x4.
 
 The distance is that of the closest view, which saw the finest detail that training could hold (as the 3D filter of Mip-Splatting
 argues); the mean distance costs 0.3 to 0.7 dB at zoom-in on lego and the demo scene.

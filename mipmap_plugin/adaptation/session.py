@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
 from mipmap_plugin.adaptation.resume import Keeper
 from mipmap_plugin.adaptation.start import Start, warm
 from mipmap_plugin.adaptation.state_file import StateFile
-from mipmap_plugin.adaptation.validation import HARM, Validation, hold_back
+from mipmap_plugin.adaptation.validation import HARM, WINDOW, Validation, hold_back
 from mipmap_plugin.adaptation.views import choose_views, evenly, with_times
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
@@ -125,10 +125,18 @@ class Session:
         self.seconds["total"] = time.perf_counter() - began
         if self.config.steps:
             run, ended_by = self._optimize(student, resume, observe)
-            curve, best = run.curve, self.fresh()
-            run.steering.best.put_into(best)
-            states |= {f"the state after step {run.steering.best_step}": best, "the last state": student}
+            curve, states = run.curve, states | self._reached(run)
         return self._returned(states, curve, ended_by)
+
+    def _reached(self, run: Run) -> dict[str, SplatModel]:
+        """The best state of a run and its last, where these are others than the start and than each other."""
+        step, states = run.steering.best_step, {}
+        if 0 < step < run.step:
+            states[f"the state after step {step}"] = best = self.fresh()
+            run.steering.best.put_into(best)
+        if not run.curve[-1].taken_back:  # else it is the best
+            states["the last state"] = run.student
+        return states
 
     def _returned(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """The best of the states on views that have not steered the run, or the last where that is asked for."""
@@ -142,6 +150,8 @@ class Session:
             best = last  # what the base's own image cannot tell is what a network is asked for
         why = "" if best == last else f", for {last} shows {found[last]:.2f} dB where it shows {found[best]:.2f}"
         curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=found[last], gaussians=_rows(states[last]))]
+        if not self.validation.choosing:
+            why, found = f", not judged: at this scale one pixel of the base is more than {WINDOW} px", {}
         report = self._report(states[best], curve, ended_by, f"{best}{why}", found)
         seen = [*self.views, *self.validation.steering, *self.validation.choosing]
         return Adapted(states[best], report, self.backend, self.effects, self.state, seen)

@@ -83,8 +83,9 @@ def hold_back(
     cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, scale: float, config: AdaptConfig
 ) -> tuple[list[Camera], list[Camera]]:
     """The `views` that are adapted to, and those of validation: of the given cameras, where a policy chooses among enough of them, and
-    others from the region that they span; without cameras a part of another orbit. Of large images the middle is judged."""
-    if scale > WINDOW:  # one pixel of the base is larger than what is judged at most, and shows next to nothing
+    others from the region that they span; without cameras those of another orbit. Of large images the middle is judged, and nothing
+    where one pixel of the base is larger than that."""
+    if scale > WINDOW:
         return list(views), []
     left, judged = _hold_back(cameras, views, means, config)
     most = round(WINDOW / max(1.0, scale))
@@ -113,7 +114,6 @@ class Steering:
     best: Snapshot
     best_step: int = 0
     ceiling: float = 1.0  # of every rate, where larger ones have done harm
-    undone: int = 0  # how many times steps were taken back
 
     @classmethod
     def begin(cls, student: SplatModel, validation: Validation) -> Steering:
@@ -129,7 +129,7 @@ class Steering:
         return found < self.start_db - HARM
 
     def take_back(self, boldness: float) -> None:
-        self.ceiling, self.undone = GENTLER * boldness, self.undone + 1
+        self.ceiling = GENTLER * boldness
 
     def keep(self, found: float, step: int, student: SplatModel) -> None:
         if found >= self.best_db - HARDLY:

@@ -100,7 +100,7 @@ def _wanted(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, 
 def _print(saved: Path, report: Report) -> None:
     print(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {saved}")
     db = ", ".join(f"{name} {found:.2f}" for name, found in report.validation.items())
-    print(f"  holds {report.returned} (dB on views that nothing was adapted to: {db})")
+    print(f"  holds {report.returned}{f' (dB on views that nothing was adapted to: {db})' if db else ''}")
     if report.viewer is None:
         print("  made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio); for others give --viewer spark, supersplat, ...")
     print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
