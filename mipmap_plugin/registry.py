@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -16,7 +18,7 @@ class Registry:
     registered here wins over an installed one, so that no package can shadow a built-in.
     """
 
-    def __init__(self, group: str, builtins: dict[str, str]) -> None:
+    def __init__(self, group: str, builtins: Mapping[str, Any]) -> None:
         self.group = group
         self._targets: dict[str, Any] = dict(builtins)
 
@@ -25,6 +27,15 @@ class Registry:
         if not replace and self._targets.get(name, target) != target:
             raise SettingsError(f"{self.group}: the name {name!r} is taken; pass replace=True to override it")
         self._targets[name] = target
+
+    @contextmanager
+    def temporarily(self, **targets: Any) -> Iterator[None]:
+        """Register `targets` by name until the block ends, whatever had these names; then everything is as it was before."""
+        before, self._targets = self._targets, {**self._targets, **targets}
+        try:
+            yield
+        finally:
+            self._targets = before
 
     def names(self) -> list[str]:
         """All known names, registered and installed, sorted."""
@@ -35,13 +46,13 @@ class Registry:
         if name not in self._targets and name not in self._installed():
             raise SettingsError(f"{self.group}: there is no {name!r}; known are {', '.join(self.names())}")
         target = self._targets.get(name) or self._installed()[name]
-        return _load(name, target) if isinstance(target, str) else target
+        return load_target(name, target) if isinstance(target, str) else target
 
     def _installed(self) -> dict[str, str]:
         return {e.name: e.value for e in entry_points(group=self.group)}
 
 
-def _load(name: str, target: str) -> Any:
+def load_target(name: str, target: str) -> Any:
     module, _, attribute = target.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)

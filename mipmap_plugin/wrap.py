@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -26,11 +26,11 @@ from mipmap_plugin.files import refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_background, check_image, check_scale
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import SplatModel, TrainedScale, exposures_of, same_for_all_views
+from mipmap_plugin.models.base import Placed, SplatModel, TrainedScale
 from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
-from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
+from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import REPORT, parts_of
 from mipmap_plugin.scenes import Scene, model_cameras
 from mipmap_plugin.viewers import find_viewer
@@ -109,7 +109,7 @@ class Wrapped:
         """Raises SettingsError where no splat can be smoothed, or nothing says by how much."""
         if not self.cameras:
             raise SettingsError("the 3D filter follows from the cameras, and this checkpoint has none; give --cameras")
-        if gaussians.covariances is not None or isinstance(self.model, MipModel):
+        if gaussians.covariances is not None or self.model.traits.smoothed:
             raise SettingsError(f"{self.model.family}: its splats have no scales of their own, or a 3D filter already; leave filter_3d out")
         scales, opacities = smooth_3d(gaussians.scales, gaussians.opacities, filter_3d_of(gaussians.means, self.cameras))
         return replace(gaussians, scales=scales, opacities=opacities)
@@ -137,9 +137,9 @@ class Wrapped:
         Raises SettingsError and BackendUnavailable.
         """
         check_scale(scale)
-        if not hasattr(self.model, "rebuild") and settings.setdefault("merge_to", 1.0) < 1:
+        if not self.model.traits.same_for_all_views and settings.setdefault("merge_to", 1.0) < 1:
             raise SettingsError(f"{self.model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
-        if images is not None and exposures_of(self.model).changed:
+        if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adapting to them does not know (exposure.json); leave them out")
         config = make_config(recipe, scale, **settings)
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
@@ -158,10 +158,7 @@ class Wrapped:
         """Raise what saving an adapted model to `path` would raise at the end, as far as it can be known, before any work."""
         report, source = path.with_name(path.name + REPORT), self.model.source
         parts = parts_of(source, self.model.folder)
-        if hasattr(self.model, "refuse_output"):
-            self.model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
-        else:
-            refuse_output(path, overwrite, parts)
+        self.model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
         for beside in (report, state_path(path)):
             refuse_output(beside, True, parts, is_file=True)
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
@@ -169,7 +166,7 @@ class Wrapped:
     def target(self, viewer: str | None) -> Effects:
         """How the adapted file is rendered. Raises SettingsError for a viewer that does not open the files of this family."""
         if viewer is not None:
-            if self.trained.keeps_filter or not same_for_all_views(self.model):
+            if self.trained.keeps_filter or not self.model.traits.same_for_all_views:
                 raise SettingsError(f"{self.model.family}: its files are opened by its own project alone; leave the viewer {viewer} out")
             return self.effects(viewer=viewer)
         return self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)
@@ -232,11 +229,11 @@ def _loaded(path: str | Path, backend: str) -> SplatModel:
 
 def placed(model: SplatModel, scene: Scene) -> Scene:
     """The scene as the model was trained on it: gsplat and splatfacto have a frame and a size of their own. Raises SceneError."""
-    if getattr(model, "host", None) is None:
+    if not model.traits.placed:
         return scene
     scene = scene.original()
     taken = Taken(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
-    return scene.with_cameras(model.as_trained(scene.cameras, taken))  # type: ignore[attr-defined]
+    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, taken))
 
 
 def state_path(output: Path) -> Path:

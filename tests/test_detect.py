@@ -7,10 +7,10 @@ import pytest
 import torch
 from ply_files import splat_columns, write, write_model_folder, write_splats
 
-from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
-from mipmap_plugin.models import MODELS, load_model, register_model
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.models import load_model
 from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args
-from mipmap_plugin.models.detect import FAMILIES, detect
+from mipmap_plugin.models.detect import detect
 
 
 def f4(*names: str) -> dict[str, np.ndarray]:
@@ -151,24 +151,6 @@ def test_folder_with_one_ply_and_with_several(tmp_path):
         detect(tmp_path)
     named = write_splats(tmp_path / "point_cloud.ply")
     assert detect(tmp_path).path == named
-
-
-def test_a_registered_family_is_loaded(tmp_path, monkeypatch):
-    monkeypatch.setattr(MODELS, "_targets", dict(MODELS._targets))
-    path = write(tmp_path / "a.ply", FAMILY_COLUMNS["spacetime"])
-    with pytest.raises(CheckpointError, match="SpacetimeGaussians checkpoint"):
-        load_model(path)
-    register_model("spacetime", lambda path, iteration: (path, iteration))
-    assert load_model(path) == (path, None)
-    with pytest.raises(SettingsError, match="replace=True"):
-        register_model("spacetime", "other.module:load")
-    register_model("spacetime", "no_such_module:load", replace=True)
-    with pytest.raises(PluginError, match="no_such_module"):
-        load_model(path)
-
-
-def test_every_registered_family_has_a_name():
-    assert set(MODELS.names()) <= set(FAMILIES)
 
 
 def test_cfg_args_of_every_shape(tmp_path):

@@ -126,7 +126,7 @@ def test_a_project_that_divides_a_bent_scene_divides_what_is_left_of_it(tmp_path
     scene = colmap_scene(tmp_path, "OPENCV")
     write_image(tmp_path / "images_2" / names(1)[0], photograph("OPENCV", LENSES["OPENCV"], (WIDTH // 2, HEIGHT // 2)))
     model = load_model(gsplat_folder(tmp_path / "r", splats(), normalized="false"))
-    model.host.options["data_factor"] = 2
+    model._origin.host.options["data_factor"] = 2
     [camera], [whole] = placed(model, scene).cameras, scene.cameras
     assert camera.fx == pytest.approx(whole.fx / 2, rel=0.01)
     assert camera.width == pytest.approx(whole.width / 2, abs=1)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, same_for_all_views
+from mipmap_plugin.models.base import SplatModel
 
 
 class Activation:
@@ -20,7 +20,7 @@ class Activation:
     """
 
     def __init__(self, model: SplatModel, *, share: bool) -> None:
-        self._model, self._shares = model, share and same_for_all_views(model)
+        self._model, self._shares = model, share and model.traits.same_for_all_views
         self._splats: Gaussians | None = None
         self._leaves: Gaussians | None = None
 

@@ -17,7 +17,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, enlarges
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, same_for_all_views
+from mipmap_plugin.models.base import SplatModel
 
 # The share of a GPU's memory that images of the truth leave to the rest.
 LEFT_FREE = 0.5
@@ -88,7 +88,7 @@ class PseudoTruth:
 
     def _splats(self, camera: Camera) -> Gaussians:
         """The base's splats, activated once where they look the same to every camera: a fifth of a small image's time."""
-        if self._activated is None or not same_for_all_views(self._base):
+        if self._activated is None or not self._base.traits.same_for_all_views:
             self._activated = self._base.gaussians(camera)
         return self._activated
 

@@ -33,7 +33,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.files import together, write_json
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, effects_of, exposures_of
+from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.outputs import REPORT
 
@@ -96,7 +96,7 @@ class Session:
         views, self.which = choose_views(cameras, self.base.parameters()["means"], config)
         self.views, validation = hold_back(cameras, views, self.base.parameters()["means"], scale, config)
         self.which += f", {len(views) - len(self.views)} of them kept for validation" if len(self.views) < len(views) else ""
-        if getattr(self.base, "moves", False):
+        if self.base.traits.moves:
             self.views, when = with_times(self.views, config.seed)
             validation, _ = with_times(validation, config.seed)
             self.which += f", {when}"
@@ -239,7 +239,7 @@ class Session:
 @torch.no_grad()
 def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None) -> Rendered:
     """What the model, its splats changed by `form`, shows to a camera, and the effects that it called for. Raises SettingsError."""
-    matrix = exposures_of(model).of(camera) if effects.exposure else None
+    matrix = model.traits.exposures.of(camera) if effects.exposure else None
     gaussians = model.gaussians(camera) if form is None else form(model.gaussians(camera))
     rendered = supersample.render(backend, gaussians, camera, effects)
     if effects.outputs:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel, same_for_all_views
+from mipmap_plugin.models.base import Rebuilt, SplatModel
 
 if TYPE_CHECKING:
     from mipmap_plugin.adaptation.session import Session
@@ -33,7 +33,7 @@ class Start:
     def __init__(self, session: Session) -> None:
         self._of, self._views = session, evenly(session.views, WEIGHED_VIEWS)
         filters_do_it = needs_nothing(session.scale, session.trained, session.effects)
-        self._weighs = session.differentiates and same_for_all_views(session.base) and session.scale <= 1 and not filters_do_it
+        self._weighs = session.differentiates and session.base.traits.same_for_all_views and session.scale <= 1 and not filters_do_it
 
     @torch.no_grad()
     def best(self) -> tuple[SplatModel, str]:
@@ -73,7 +73,7 @@ class Start:
             filled.append(light)
             return merged
 
-        student.rebuild(fewer)  # type: ignore[attr-defined]
+        cast(Rebuilt, student).rebuild(fewer)
         return filled[0]
 
     def _form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,6 @@ from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import refuse_output, refuse_unwritable
-from mipmap_plugin.models.base import exposures_of
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.scenes.images import write_array, write_image
 from mipmap_plugin.wrap import Wrapped
@@ -69,7 +68,7 @@ def render(
         for path in (picture, *(_beside(picture, name) for name in outputs)):
             refuse_output(path, overwrite, parts, is_file=True)
         if exposure:
-            exposures_of(wrapped.model).of(camera)  # before anything is written
+            wrapped.model.traits.exposures.of(camera)  # before anything is written
     refuse_unwritable(pictures[0])
     for camera, picture in zip(views, pictures, strict=True):
         shown = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, filter_3d, outputs=outputs, exposure=exposure, viewer=viewer)

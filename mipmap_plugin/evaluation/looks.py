@@ -7,7 +7,6 @@ from statistics import fmean
 import torch
 
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr
-from mipmap_plugin.models.base import same_for_all_views
 from mipmap_plugin.wrap import Wrapped
 
 VIEWERS = ("spark", "playcanvas", "gaussian-splats-3d", "classic", "antialiased")
@@ -25,7 +24,7 @@ def looks(wrapped: Wrapped) -> str:
     """
     model, views = wrapped.model, wrapped.views()
     count, pixels = len(model.gaussians(views[0])), views[0].width * views[0].height
-    if not same_for_all_views(model) or getattr(model.source, "suffix", "") != ".ply":
+    if not model.traits.same_for_all_views or model.source is None or model.source.suffix != ".ply":
         return "no viewer opens it as it is"
     if "reference" in (wrapped.backend()[0].name, wrapped.backend(viewer=VIEWERS[0])[0].name):
         return "not drawn: only the reference backend can, which takes too long; `mipmap-plugin backends` says what others lack"

@@ -22,7 +22,7 @@ from mipmap_plugin.adaptation.photographs import as_sampled
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.models.base import SplatModel, exposures_of
+from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.scenes.images import image_size, pillow_bicubic, read_image
 
@@ -134,5 +134,5 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
 
 def not_exposed(model: SplatModel) -> list[str]:
     """That photographs have exposures of their own, in a sentence, where the model knows of them; none is applied in judging."""
-    exposures = exposures_of(model)
+    exposures = model.traits.exposures
     return [f"{exposures.found()}, which is not applied here: part of every difference from a photograph is exposure"] if exposures.changed else []

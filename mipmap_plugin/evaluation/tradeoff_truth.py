@@ -88,7 +88,7 @@ def _held_out(model: Wrapped) -> tuple[list[Camera], list[Camera]]:
         judged, train = model.cameras[::HOLD_OUT], rest
     else:
         judged, train = jittered(model.cameras, HOLD_OUT, generator), model.cameras
-    return (with_times(judged, JUDGES_SEED)[0] if getattr(model.model, "moves", False) else judged), train
+    return (with_times(judged, JUDGES_SEED)[0] if model.model.traits.moves else judged), train
 
 
 def _others(cameras: list[Camera], judged: list[Camera]) -> list[Camera]:

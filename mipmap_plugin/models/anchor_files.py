@@ -18,7 +18,7 @@ from mipmap_plugin.models.anchor_networks import Weights, check_networks, read_n
 from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.cfg_args import format_cfg_args
 from mipmap_plugin.models.columns import NORMAL, POSITION, QUATERNION, numbered, stacked
-from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
+from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.ply import read_ply
@@ -50,9 +50,7 @@ def read_anchors(path: str | Path, family: str, iteration: int | None) -> Anchor
 
     Raises CheckpointError for what is damaged, incomplete, or of another family.
     """
-    found = detect(path, iteration=iteration)
-    if found.family != family:
-        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
+    found = detect_as(path, (family,), iteration=iteration)
     ply = read_ply(found.path)
     parameters, carried = to_parameters(ply.columns, found.path)
     weights, companions = read_networks(found.path.parent)

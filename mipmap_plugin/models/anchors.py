@@ -21,7 +21,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.anchor_decoding import Anchors, decode
 from mipmap_plugin.models.anchor_files import AnchorFile, cfg_text, needs_views, refuse_others, to_columns, write_beside
 from mipmap_plugin.models.anchor_networks import appearance_size, packed, refuse_infinite
-from mipmap_plugin.models.base import CARRIED
+from mipmap_plugin.models.base import CARRIED, Traits
 from mipmap_plugin.models.columns import QUATERNION
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import write_folder
@@ -56,16 +56,20 @@ class AnchorModel(ABC):
     def __len__(self) -> int:
         return len(self._parameters["means"])
 
-    def effects(self) -> list[Effect]:
+    @property
+    def traits(self) -> Traits:
+        return Traits(effects=self._effects())
+
+    def _effects(self) -> tuple[Effect, ...]:
         products = sum(held.numel() for name, held in self.shared_parameters().items() if held.dim() == 2 and not name.startswith("appearance"))
         size = appearance_size(self._weights)
         told = f"the embedding has {size} numbers a training view" if size else "the model has no embedding"
         inputs = f"{size or ''} more inputs of the color network".strip()
         decoding = f"{products:,} multiplications an anchor in view, of {len(self):,}, for each image"
-        return [
+        return (
             Effect("view-dependent geometry", True, "splats are decoded from anchors for each camera", decoding),
             Effect("appearance embedding", size > 0, told, inputs),
-        ]
+        )
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """The splats of the anchors in view, activated: SH of degree 0, opacities above 0."""

@@ -14,6 +14,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effect
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
+from mipmap_plugin.models.hosts import Taken
 
 # The name, among a model's parameters, of columns that go with their rows when rows are removed, and that never move: an anchor's
 # level, for example.
@@ -32,6 +33,22 @@ class TrainedScale:
     keeps_filter: bool = False  # an adapted file is for its own project, and keeps this filter; else it is classic, or for a viewer
 
 
+@dataclass(frozen=True)
+class Traits:
+    """What a model is, beyond answering a camera with Gaussians. Nobody asks for anything else about its family."""
+
+    same_for_all_views: bool = False  # its rows are splats, which every camera sees alike: it offers `rebuild`, and they may be merged
+    moves: bool = False  # its Gaussians follow the camera's time
+    smoothed: bool = False  # its splats carry a 3D filter already, or have none that one could be added to
+    placed: bool = False  # it was trained in a frame or at a size of its own: it offers `as_trained`
+    exposures: Exposures = NO_EXPOSURES  # what training made of the colors for each photograph
+    effects: tuple[Effect, ...] = ()  # what it does for a camera before any splat is drawn, of `effects.OF_OTHER_MODELS`
+
+
+# The names that parameters may have, each with a learning rate of its own (`config.LearningRates`); the first has to be among them.
+PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN", "offsets", "features", CARRIED)
+
+
 class SplatModel(Protocol):
     """What any family offers to be rendered, adapted and saved. A Protocol: plug-ins need no base class.
 
@@ -45,11 +62,16 @@ class SplatModel(Protocol):
     folder: Path | None  # the model folder around it
     digest: str  # sha256 of the file, hexadecimal; "" when made in memory, as a copy is
 
+    @property
+    def traits(self) -> Traits:
+        """What the model is; it never changes."""
+
     def gaussians(self, camera: Camera) -> Gaussians:
         """The splats that this camera sees, differentiable in `parameters()`."""
 
     def parameters(self) -> dict[str, Tensor]:
-        """What adaptation may move, by name; row i of each belongs to the same splat. A deformation network is never among them."""
+        """What adaptation may move, by a name of PARAMETERS, "means" [N, 3] among them; row i of each belongs to the same splat (or anchor).
+        A deformation network is never among them."""
 
     def copy(self) -> SplatModel:
         """An independent model with leaf parameters of its own that require gradients; this one stays as it is."""
@@ -66,36 +88,46 @@ class SplatModel(Protocol):
         `views` are there for families whose splats exist only for a camera. Only ever called on a copy.
         """
 
-    # Optional: a family may offer
-    #     refuse_output(path: Path, *, overwrite: bool, networks_move: bool) -> None
-    # which raises what `save` would raise for that path, so that nobody works in vain. A family whose rows are splats that look the same
-    # to every camera offers
-    #     rebuild(form: Callable[[Gaussians], Gaussians]) -> None
-    # which holds what `form` makes of its splats instead of them. Without it, splats are never merged. A family whose photographs
-    # were exposed differently has
-    #     exposures: Exposures
-
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
         """[N], 0..1, without gradient: how much each row of the parameters can show; rows that show nothing may be pruned."""
 
     def to(self, device: torch.device | str) -> SplatModel:
         """A copy on another device."""
 
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool) -> None:
+        """Raise what `save` would raise for that path, as far as it can be known, so that nobody works in vain."""
+
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
         """Write the model in the format it came in, atomically; return the file written. Raises OutputExists."""
 
 
-def same_for_all_views(model: SplatModel) -> bool:
-    """Whether the model says that every camera sees the same splats, by offering `rebuild`."""
-    return hasattr(model, "rebuild")
+class Rebuilt(SplatModel, Protocol):
+    """A model with the trait `same_for_all_views`."""
+
+    def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
+        """Hold what `form` makes of its splats instead of them. Only ever called on a copy."""
+
+
+class Placed(SplatModel, Protocol):
+    """A model with the trait `placed`."""
+
+    def as_trained(self, cameras: Sequence[Camera], taken: Taken) -> list[Camera]:
+        """Views of the photographs' scene in the frame and at the size that the model was trained in. Raises SceneError."""
+
+
+def lacking(model: Any) -> list[str]:
+    """What an object lacks to be a SplatModel, by name; [] for one that is."""
+    asked = [*_members(SplatModel)]
+    if isinstance(traits := getattr(model, "traits", None), Traits):
+        asked += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed
+    return [name for name in asked if not hasattr(model, name)]
+
+
+def _members(protocol: type) -> list[str]:
+    """The attributes and methods that a protocol asks for."""
+    return [*protocol.__annotations__, *(name for name in vars(protocol) if not name.startswith("_"))]
 
 
 def effects_of(model: SplatModel) -> list[Effect]:
-    """What a model does for a camera before any splat is drawn, as its method `effects` says: of `effects.OF_OTHER_MODELS`, those that
-    it has. A family that has none needs no such method."""
-    return [exposures_of(model).effect(), *getattr(model, "effects", list)()]
-
-
-def exposures_of(model: SplatModel) -> Exposures:
-    """By what training changed the colors for each photograph; nothing in most families."""
-    return getattr(model, "exposures", NO_EXPOSURES)
+    """What a model does for a camera before any splat is drawn, its exposures among them."""
+    return [model.traits.exposures.effect(), *model.traits.effects]

@@ -8,21 +8,24 @@ from pathlib import Path
 import torch
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.models.detect import FAMILIES, detect, exchange_kind
+from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.exchange import EXCHANGE, as_ply
+from mipmap_plugin.models.families import find_family
+from mipmap_plugin.models.family import Files
 from mipmap_plugin.models.vanilla import OPACITY_MARGIN, VanillaModel, read_vanilla
 
 
 def load_exchanged(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     """Load an SPZ, SOG (a file or a folder), KSPLAT, SPLAT or compressed PLY. Raises CheckpointError."""
     file = detect(path, iteration=iteration).path
-    kind = exchange_kind(file)
-    if kind is None:
+    files = Files(file)
+    kind = "compressed" if files.compressed else files.kind
+    if kind not in EXCHANGE:
         raise CheckpointError(f"{file} is in no exchange format; give an SPZ, SOG, KSPLAT, SPLAT or compressed PLY")
     with as_ply(file, kind) as ply:
         found = detect(ply)
         if found.family != "3dgs":
-            raise CheckpointError(f"{file}: its splats are of {FAMILIES[found.family]}, not read from this format; give its own file")
+            raise CheckpointError(f"{file}: its splats are of {find_family(found.family).title}, not read from this format; give its own file")
         model = read_vanilla(replace(found, folder=None)).coming_from(file)
     certain = torch.tensor(OPACITY_MARGIN).logit().abs().item()
     model.parameters()["opacities"].clamp_(-certain, certain)  # 8 bits hold 0 and 1, whose logits are infinite

@@ -17,9 +17,10 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import CheckpointError, SceneError, ShapeError
 from mipmap_plugin.files import new_folder, sha256
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.detect import GSPLAT_FILE, detect
+from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.gsplat_frame import normalized_frame
 from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.places import GSPLAT
 from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.tags import render_mode
@@ -116,10 +117,10 @@ def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaMod
 
 def rank_files(path: Path) -> list[Path]:
     """The files of the same step as `path`, in the order of their ranks. Raises CheckpointError when one between is missing."""
-    name = re.fullmatch(GSPLAT_FILE, path.name)
+    name = re.fullmatch(GSPLAT[1], path.name)
     if not name or name["rank"] is None:
         return [path]
-    siblings = (re.fullmatch(GSPLAT_FILE, file.name) for file in path.absolute().parent.iterdir())
+    siblings = (re.fullmatch(GSPLAT[1], file.name) for file in path.absolute().parent.iterdir())
     ranks = {int(each["rank"]): path.with_name(each.string) for each in siblings if each and each["rank"] and each["step"] == name["step"]}
     if len(ranks) <= max(ranks):
         missing = next(rank for rank in count() if rank not in ranks)

@@ -13,9 +13,10 @@ from torch.nn.functional import grid_sample, linear, relu
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.detect import detect, is_coarse
+from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.moving import MovingModel, read_canonical
+from mipmap_plugin.models.places import is_coarse
 from mipmap_plugin.models.state_dict import read_state_dict, require
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 

@@ -26,7 +26,7 @@ class Host(Protocol):
 
     @property
     def family(self) -> str:
-        """A key of `detect.FAMILIES`."""
+        """A name in `families.FAMILIES`."""
 
     def write(self, path: Path, parameters: dict[str, Tensor], comments: Sequence[str], *, overwrite: bool) -> Path:
         """Write raw `parameters`, named as VanillaModel's, to a file or a result folder, atomically; return the file with the splats.

@@ -11,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.models import gsplat, splatfacto
 from mipmap_plugin.models.anchor_networks import NEEDED, Weights
-from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale
+from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, lacking
 from mipmap_plugin.models.scaffold import scaffold_in_memory
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
@@ -68,6 +68,8 @@ def adopt(model: Any) -> SplatModel:
     for networks that do not fit their anchors.
     """
     if callable(getattr(model, "gaussians", None)):
+        if lacks := lacking(model):
+            raise SettingsError(f"this {_name(model)} has gaussians() as a model has, but lacks {', '.join(lacks)}; see mipmap_plugin.models.base")
         return _sound(model)
     found = [what for name, what in MORE.items() if hasattr(model, name)]
     if found == [MORE["_anchor"]] and _is_scaffold(model):

@@ -17,7 +17,7 @@ from mipmap_plugin.files import no_file
 # Bytes that tell every format here apart; a .splat file has no magic and is judged by its first records.
 HEAD = 64 * 1024
 
-# Bytes of a zip member that are looked at for names; the pickle of a gsplat or splatfacto checkpoint has a few kB.
+# Bytes of a pickle that are looked at for names; the pickle of a gsplat or splatfacto checkpoint has a few kB.
 MAX_PICKLE = 16 * 1024 * 1024
 
 # A splat in a .splat file (antimatter15/splat); its quaternion is wxyz around 128.
@@ -71,18 +71,16 @@ def kind_of(path: Path) -> str:
     return "splat" if _plausible_splat(head, size) else "unknown"
 
 
-def names_in_torch_file(path: Path, wanted: tuple[str, ...]) -> set[str]:
-    """Which of these words stand in a torch file's pickle, which is searched as bytes and never unpickled."""
-    if zipfile.is_zipfile(path):
-        with _archive(path) as archive:
-            pickles = [name for name in archive.namelist() if name.endswith("data.pkl")]
-            if not pickles:
-                return set()
-            with archive.open(pickles[0]) as file:
-                text = file.read(MAX_PICKLE)
-    else:
-        text = read_head(path, MAX_PICKLE)
-    return {word for word in wanted if word.encode() in text}
+def pickle_of(path: Path) -> bytes:
+    """The first bytes of a torch file's pickle, to be searched and never unpickled; none where there is none. Raises CheckpointError."""
+    if not zipfile.is_zipfile(path):
+        return read_head(path, MAX_PICKLE)
+    with _archive(path) as archive:
+        pickles = [name for name in archive.namelist() if name.endswith("data.pkl")]
+        if not pickles:
+            return b""
+        with archive.open(pickles[0]) as file:
+            return file.read(MAX_PICKLE)
 
 
 def _inflated(head: bytes) -> bytes:

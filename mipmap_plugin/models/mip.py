@@ -19,8 +19,8 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE, Effect
 from mipmap_plugin.errors import CheckpointError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import CARRIED, TrainedScale
-from mipmap_plugin.models.detect import detect, not_loaded
+from mipmap_plugin.models.base import CARRIED, TrainedScale, Traits
+from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.health import LARGEST, drop
 from mipmap_plugin.models.outputs import finite
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
@@ -56,7 +56,6 @@ class MipModel:
             raise ShapeError(f"{COLUMN}: expected shape [{len(splats)}], got {list(filter_3d.shape)}")
         self.family, self.splats, self.filter_3d = family, splats, filter_3d
         self.source, self.folder, self.digest, self.notes = splats.source, splats.folder, splats.digest, splats.notes
-        self.exposures = splats.exposures
 
     @property
     def trained(self) -> TrainedScale:
@@ -69,9 +68,11 @@ class MipModel:
     def __len__(self) -> int:
         return len(self.splats)
 
-    def effects(self) -> list[Effect]:
+    @property
+    def traits(self) -> Traits:
         told = f"the file gives one for each of {len(self):,} splats" if self._smooths else "the file gives one, but its project does not apply it"
-        return [Effect("3D filter", self._smooths, told, "three roots a splat")]
+        effect = Effect("3D filter", self._smooths, told, "three roots a splat")
+        return Traits(smoothed=True, exposures=self.splats.traits.exposures, effects=(effect,))
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated and smoothed. `camera` is not looked at."""
@@ -136,9 +137,7 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
 
     Raises CheckpointError for what is damaged, of another family, or no checkpoint.
     """
-    found = detect(path, iteration=iteration)
-    if found.family not in SCREEN_FILTERS:
-        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
+    found = detect_as(path, tuple(SCREEN_FILTERS), iteration=iteration)
     splats = read_vanilla(found)
     unsound = torch.from_numpy(~(splats.extras[COLUMN] >= 0) | (splats.extras[COLUMN] == torch.inf))
     if unsound.all():

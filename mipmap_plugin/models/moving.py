@@ -14,8 +14,10 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.detect import FAMILIES, detect, network_of, not_loaded
+from mipmap_plugin.models.base import TrainedScale, Traits
+from mipmap_plugin.models.detect import detect_as
+from mipmap_plugin.models.families import find_family
+from mipmap_plugin.models.places import network_of
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 
 # Views whose moments tell how opaque a splat ever gets; each costs one pass through the field.
@@ -44,7 +46,6 @@ class MovingModel:
     def __init__(self, family: str, canonical: VanillaModel, field: Field) -> None:
         self.family, self.canonical, self.field = family, canonical, field
         self.source, self.folder, self.digest, self.notes = canonical.source, canonical.folder, canonical.digest, canonical.notes
-        self.exposures = canonical.exposures
 
     @property
     def trained(self) -> TrainedScale:
@@ -62,8 +63,10 @@ class MovingModel:
         """Whether time changes anything; `adaptation.views` then spreads times over cameras that have none."""
         return not self.field.is_still
 
-    def effects(self) -> list[Effect]:
-        return [Effect("time", self.moves, "a field moves the splats" if self.moves else "the field changes no splat", self.field.cost)]
+    @property
+    def traits(self) -> Traits:
+        effect = Effect("time", self.moves, "a field moves the splats" if self.moves else "the field changes no splat", self.field.cost)
+        return Traits(moves=self.moves, exposures=self.canonical.traits.exposures, effects=(effect,))
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """All splats at the time of `camera`, 0 if it has none."""
@@ -125,11 +128,10 @@ class MovingModel:
 
 def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:
     """The splats of a moving scene before anything moves them, and the file of their network. Raises CheckpointError."""
-    found = detect(path, iteration=iteration)
-    if found.family != family:
-        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
+    found = detect_as(path, (family,), iteration=iteration)
     if Path(path).is_file():
         raise CheckpointError(f"{path} is one part of a moving scene, whose network lies beside it; give the model folder that holds both")
     canonical = read_vanilla(found)
-    canonical.notes += [f"the network that moves the splats ({FAMILIES[family]}) is frozen: they adapt as they are before they move", TIMELESS]
+    title = find_family(family).title
+    canonical.notes += [f"the network that moves the splats ({title}) is frozen: they adapt as they are before they move", TIMELESS]
     return canonical, network_of(found.path, family)

@@ -44,9 +44,9 @@ class OctreeModel(AnchorModel):
             raise CheckpointError(f"{self.source}: its anchors lie in {self._levels:,} levels of detail; the file is damaged, so export it again")
         self.notes.append(f"{self._levels} levels of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
 
-    def effects(self) -> list[Effect]:
+    def _effects(self) -> tuple[Effect, ...]:
         told = f"{self._levels} of them, chosen by distance and zoom ({self._to_level})"
-        return [*super().effects(), Effect("levels of detail", self._levels > 1, told, f"a distance and a logarithm an anchor, of {len(self):,}")]
+        return (*super()._effects(), Effect("levels of detail", self._levels > 1, told, f"a distance and a logarithm an anchor, of {len(self):,}"))
 
     def wanted_levels(self, camera: Camera) -> Tensor:
         """[N] the level that `camera` asks for at each anchor, with a fraction where levels fade."""

@@ -17,14 +17,15 @@ from mipmap_plugin.errors import CheckpointError, OutputError, SceneError, Shape
 from mipmap_plugin.files import new_folder, sha256
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import C0
-from mipmap_plugin.models.detect import RESULTS, detect
+from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.places import SPLATFACTO
 from mipmap_plugin.models.tags import render_mode
 from mipmap_plugin.models.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.models.vanilla import OPACITY_MARGIN, Origin, VanillaModel, without_poison
 from mipmap_plugin.models.yaml_scalars import read_scalars, with_scalar
 
-PLACE, FILE = RESULTS["splatfacto"]
+PLACE, FILE = SPLATFACTO
 
 # Where a state dict keeps the splats: with gauss_params since version 1.1, with `module` after a training on several GPUs.
 KEY = r"(?:module\.)?_model\.(?:module\.)?(?:gauss_params\.)?(means|scales|quats|features_dc|features_rest|opacities)"

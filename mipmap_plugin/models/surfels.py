@@ -16,11 +16,10 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import LOW_PASS, SURFEL
-from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SCALE, to_parameters
-from mipmap_plugin.models.detect import detect, not_loaded
+from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.hexplane import quaternion_product
 from mipmap_plugin.models.vanilla import MIN_SCALE, VanillaModel, read_splats
 
@@ -71,10 +70,7 @@ def load_surfels(path: str | Path, *, iteration: int | None = None) -> SurfelMod
 
     Raises CheckpointError for what is damaged, of another family, or no checkpoint.
     """
-    found = detect(path, iteration=iteration)
-    if found.family != "2dgs":
-        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
-    model = read_splats(found, SurfelModel)
+    model = read_splats(detect_as(path, ("2dgs",), iteration=iteration), SurfelModel)
     model.trained = flat_trained(model.trained)
     model.notes.append(NOTE)
     return model

@@ -16,9 +16,9 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import CheckpointError, SettingsError, ShapeError
 from mipmap_plugin.files import sha256
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters, unit_quaternions
-from mipmap_plugin.models.detect import Checkpoint, detect, not_loaded
+from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exchange import is_written, write_exchange
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
@@ -70,10 +70,10 @@ class VanillaModel:
         _check(parameters)
         self._parameters = dict(parameters)
         self._origin = origin
-        self.host = origin.host
         if origin.host:
             self.family = origin.host.family
-        self.source, self.folder, self.digest, self.exposures = origin.source, origin.folder, origin.digest, origin.exposures
+        self.source, self.folder, self.digest = origin.source, origin.folder, origin.digest
+        self.traits = Traits(same_for_all_views=True, placed=origin.host is not None, exposures=origin.exposures)
         self.trained = trained
         self.notes: list[str] = list(notes)
 
@@ -221,10 +221,7 @@ def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaMo
 
     Raises CheckpointError for what is damaged, of another family, or no checkpoint.
     """
-    found = detect(path, iteration=iteration)
-    if found.family != "3dgs":
-        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
-    return read_vanilla(found)
+    return read_vanilla(detect_as(path, ("3dgs",), iteration=iteration))
 
 
 def read_vanilla(found: Checkpoint) -> VanillaModel:
@@ -241,7 +238,7 @@ def read_splats(found: Checkpoint, kind: type[Splats]) -> Splats:
     origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, ply.comments, extras, read_exposures(found.folder))
     model = kind(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
     del ply  # as large as the model, and no longer needed by what follows
-    model.notes += companion_notes(options, model.sh_degree, model.exposures, screen_filter)
+    model.notes += companion_notes(options, model.sh_degree, model.traits.exposures, screen_filter)
     if screen_filter:
         model.notes.append(f"the header says that the splats were trained {screen_filter}, so they are rendered so")
     if extras:

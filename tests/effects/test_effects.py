@@ -151,7 +151,7 @@ def test_a_3d_filter_is_applied_where_its_project_does(tmp_path):
     columns = ply_files.splat_columns(5, 0) | {"filter_3D": np.full(5, 0.01, np.float32)}
     files = {family: ply_files.write(tmp_path / f"{family}.ply", columns) for family in ("mip", "analytic")}
     models = {family: MipModel(family, load_mip(file).splats, torch.full((5,), 0.01)) for family, file in files.items()}
-    assert {family: [effect.on for effect in model.effects()] for family, model in models.items()} == {"mip": [True], "analytic": [False]}
+    assert {family: [effect.on for effect in model.traits.effects] for family, model in models.items()} == {"mip": [True], "analytic": [False]}
 
 
 # Who carries them

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -10,7 +11,6 @@ import torch
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation import session
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.models.base import exposures_of
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.models.moving import MovingModel
@@ -54,7 +54,7 @@ def test_a_view_is_shown_by_the_exposure_of_its_name(tmp_path):
 @pytest.mark.parametrize(("written", "asked"), [("view_1.JPG", "view_1"), ("a/view.1.png", "a/view.1"), ("view.1", "view.1")])
 def test_a_name_may_lack_its_suffix(tmp_path, written, asked):
     model = base(tmp_path / "a", {"other.png": IDENTITY, written: WARM})
-    assert exposures_of(model.model).of(replace(model.cameras[0], name=asked)).tolist() == WARM
+    assert model.model.traits.exposures.of(replace(model.cameras[0], name=asked)).tolist() == WARM
 
 
 def test_a_view_of_another_name_is_refused(tmp_path):
@@ -113,8 +113,8 @@ def test_an_adapted_model_keeps_them_and_its_folder_too(tmp_path):
 
 def test_families_around_the_splats_of_3dgs_have_theirs(tmp_path):
     splats = base(tmp_path / "a", {"view_1": WARM}).model
-    around = [MipModel("mip", splats, torch.ones(len(splats))), MovingModel("deformable", splats, None)]
-    assert [model.exposures is splats.exposures for model in around] == [True, True]
+    around = [MipModel("mip", splats, torch.ones(len(splats))), MovingModel("deformable", splats, SimpleNamespace(is_still=True, cost=""))]
+    assert [model.traits.exposures is splats.traits.exposures for model in around] == [True, True]
 
 
 def test_images_that_were_exposed_differently_are_not_adapted_to(tmp_path):

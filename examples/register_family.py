@@ -1,0 +1,42 @@
+"""Bring your own family of checkpoints: splats in a NumPy archive, here.
+
+    python examples/register_family.py scene.npz 1/4
+
+A package makes it known without any call, by an entry point in its pyproject.toml:
+
+    [project.entry-points."mipmap_plugin.models"]
+    npz = "my_package.npz:FAMILY"
+
+and tests it with mipmap_plugin.models.conformance.ModelSuite, as its backends with BackendSuite.
+"""
+
+from __future__ import annotations
+
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mipmap_plugin import register_model, wrap_model
+from mipmap_plugin.models import CERTAIN, Family, Files, Match
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
+
+NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
+
+
+def recognize(files: Files) -> Match | None:
+    return Match(CERTAIN, "its arrays") if files.kind == "zip" and files.path.suffix == ".npz" else None
+
+
+def load(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
+    with np.load(path) as arrays:  # an adapted model is saved as a PLY, which any viewer opens
+        return VanillaModel({name: torch.from_numpy(arrays[name]) for name in NAMES}, origin=Origin(source=Path(path)))
+
+
+FAMILY = Family("npz", "splats in a NumPy archive", recognize, api_version=1, load=load)
+
+if __name__ == "__main__":
+    register_model("npz", FAMILY)
+    print(wrap_model(sys.argv[1]).adapt(float(Fraction(sys.argv[2]))).save("adapted.ply"))

@@ -1,0 +1,124 @@
+"""A pytest suite for the authors of families: every step that a checkpoint goes through here. This module alone needs pytest."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.base import PARAMETERS, SplatModel, lacking
+from mipmap_plugin.scenes.trajectories import orbit
+from mipmap_plugin.wrap import Wrapped, wrap_model
+
+# What formats round off, in steps of an image.
+SAME = 1 / 255
+
+
+class ModelSuite:
+    """Subclass it in a test file, say where a checkpoint of your family lies, and pytest checks the family::
+
+        class TestMine(ModelSuite):
+            family = "mine"
+
+            @pytest.fixture
+            def checkpoint(self, tmp_path):
+                return write_a_small_one(tmp_path / "scene.mine")
+    """
+
+    family: str
+    cameras: Sequence[Camera] = ()  # none: small views of an orbit
+    saved_as = "saved"  # the file or folder that an adapted model is saved to
+    scale = 1 / 2
+    device = "cpu"  # where it is taken to
+    settings: dict[str, Any] = dict(steps=2, extra_views=2, merge_to=1.0)  # of adapting  # noqa: RUF012
+
+    @pytest.fixture
+    def checkpoint(self, tmp_path: Path) -> Path:
+        raise NotImplementedError(f"{type(self).__name__} needs a fixture `checkpoint` that returns the path of one")
+
+    @pytest.fixture
+    def base(self, checkpoint: Path) -> Wrapped:
+        model = load_model(checkpoint)
+        views = self.cameras or orbit(model.parameters()["means"], (24, 32), 4, torch.Generator().manual_seed(0))
+        return wrap_model(model, cameras=views, backend="reference")
+
+    def test_is_recognized(self, checkpoint):
+        assert detect(checkpoint).family == self.family
+
+    def test_offers_what_a_model_offers(self, base):
+        assert lacking(base.model) == []
+        named = base.model.parameters()
+        assert "means" in named and set(named) <= set(PARAMETERS)
+        assert {len(tensor) for tensor in named.values()} == {len(named["means"])}
+
+    def test_shows_something_finite(self, base):
+        with torch.no_grad():
+            shown = base.render(base.cameras[0])
+        assert shown.image.isfinite().all() and shown.alpha.max() > 0
+
+    def test_a_copy_learns_and_the_base_does_not(self, base):
+        before, copied, view = _tensors(base.model), base.model.copy(), base.cameras[0]
+        base.backend(gradients=True)[0].render(copied.gaussians(view), view, base.effects()).image.sum().backward()
+        gradients = {name: tensor.grad for name, tensor in copied.parameters().items() if tensor.grad is not None}
+        assert any(gradient.abs().sum() > 0 for gradient in gradients.values())
+        assert all(gradient.isfinite().all() for gradient in gradients.values())
+        with torch.no_grad():
+            for tensor in copied.parameters().values():
+                tensor.add_(1)
+        _assert_same(before, base.model)
+
+    def test_rows_can_be_taken_away(self, base):
+        copied = base.model.copy()
+        half = {name: tensor.detach()[: max(1, len(tensor) // 2)].clone().requires_grad_() for name, tensor in copied.parameters().items()}
+        copied.replace_parameters(half)
+        assert all(copied.parameters()[name] is tensor for name, tensor in half.items())
+        assert copied.row_opacities(base.cameras).shape == (len(half["means"]),)
+        assert copied.gaussians(base.cameras[0]).means.isfinite().all()
+
+    def test_adapts_and_is_saved_and_loaded_again(self, base, checkpoint, tmp_path):
+        with _untouched(base.model, checkpoint):
+            adapted = base.adapt(self.scale, **self.settings)
+            saved = adapted.save(tmp_path / self.saved_as)
+        assert saved.is_file()
+        again = load_model(tmp_path / self.saved_as)
+        view = base.cameras[0].zoomed(self.scale)
+        shown = [adapted.render(view).image, wrap_model(again, cameras=base.cameras, backend="reference").render(view).image]
+        assert (shown[0] - shown[1]).abs().max() <= SAME
+
+    def test_goes_to_another_device(self, base):
+        there = base.model.to(self.device)
+        assert {tensor.device.type for tensor in there.parameters().values()} == {torch.device(self.device).type}
+        with torch.no_grad():
+            for tensor in there.parameters().values():
+                tensor.zero_()
+        assert any(tensor.abs().sum() > 0 for tensor in base.model.parameters().values())
+
+
+@contextmanager
+def _untouched(model: SplatModel, checkpoint: Path) -> Iterator[None]:
+    tensors, files = _tensors(model), _digests(checkpoint)
+    yield
+    _assert_same(tensors, model)
+    assert _digests(checkpoint) == files, "the files of the base have changed"
+
+
+def _tensors(model: SplatModel) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in {**model.parameters(), **model.shared_parameters()}.items()}
+
+
+def _assert_same(before: dict[str, Tensor], model: SplatModel) -> None:
+    after = _tensors(model)
+    assert before.keys() == after.keys() and all(torch.equal(tensor, after[name]) for name, tensor in before.items()), "the base has changed"
+
+
+def _digests(path: Path) -> dict[Path, str]:
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    return {file: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}

@@ -1,0 +1,225 @@
+"""The built-in families: how each is recognized, and what loads it. Whoever adds one writes such a record, here or in a package of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from mipmap_plugin.errors import PluginError
+from mipmap_plugin.models.anchor_networks import missing_networks
+from mipmap_plugin.models.exchange import EXCHANGE
+from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
+from mipmap_plugin.models.places import GSPLAT, NETWORKS, SPLATFACTO, is_coarse, network_of
+from mipmap_plugin.models.tags import render_mode
+from mipmap_plugin.registry import Registry
+
+Recognize = Callable[[Files], Match | None]
+
+# What the optimizer of fudan-zvg's 4D Gaussian Splatting names, and no other's; that project saves no PLY.
+FUDAN = ("scaling_t", "rotation_r")
+
+ANCHOR_COLUMNS = {"f_offset_0", "f_anchor_feat_0"}
+FILTERED = ("mip", "gof", "analytic")
+FLAT_OR_FILTERED = (*FILTERED, "2dgs")
+
+
+def plain(files: Files) -> Match | None:
+    return Match(PLAIN, "columns of splats") if files.holds_splats else None
+
+
+def certain(test: Callable[[Files], bool], why: str, trouble: str = "") -> Recognize:
+    """A family whose files no other has. `trouble` is formatted with the path."""
+    return lambda files: Match(CERTAIN, why, trouble.format(path=files.path)) if test(files) else None
+
+
+def has(*columns: str) -> Recognize:
+    """A PLY with these columns, which no other family has."""
+    return certain(lambda files: files.columns >= set(columns), f"columns {', '.join(columns)}")
+
+
+def anchors(name: str) -> Recognize:
+    return lambda files: Match(CERTAIN, "columns of anchors", lacks=_networks(files, name)) if _kind_of_anchors(files.columns) == name else None
+
+
+def _kind_of_anchors(columns: frozenset[str]) -> str | None:
+    """HAC and what follows it have masks. Octree-AnyGS has explicit anchors too, and keeps its constants in the header, not in `info`."""
+    if not ANCHOR_COLUMNS & columns:
+        return None
+    if "f_mask_0" in columns:
+        return "hac"
+    if "f_anchor_feat_0" not in columns or not columns & {"opacity", "nx"} or ("level" in columns and "info" not in columns):
+        return "anygs"
+    return "octree" if {"level", "extra_level", "info"} <= columns else "scaffold"
+
+
+def _networks(files: Files, name: str) -> tuple[str, ...]:
+    return tuple(missing_networks(files.path.parent)) if name in ("scaffold", "octree") else ()
+
+
+def filtered(name: str) -> Recognize:
+    """A PLY with a 3D filter, by the options that each project saves; a bare file that was written here tells its family."""
+
+    def recognize(files: Files) -> Match | None:
+        if "filter_3D" not in files.columns:
+            return None
+        told, options = files.provenance.get("family"), files.options
+        if not options and told in FILTERED:
+            project = told
+        elif "use_decoupled_appearance" in options:
+            project = "gof"
+        else:
+            project = "analytic" if "load_allres" in options and "kernel_size" not in options else "mip"
+        return Match(CERTAIN, "column filter_3D, and what cfg_args says") if project == name else None
+
+    return recognize
+
+
+def _is_flat(files: Files) -> bool:
+    return ({"scale_0", "scale_1", "rot_0"} <= files.columns and "scale_2" not in files.columns) or render_mode(files.comments) == "2dgs"
+
+
+def hexplane(files: Files) -> Match | None:
+    if files.holds_splats and (is_coarse(files.path) or network_of(files.path, "4dgs").exists()):
+        return Match(BY_COMPANIONS, "a deformation.pth beside it")
+    return _lost_network(files, "4dgs")
+
+
+def deformable(files: Files) -> Match | None:
+    if (nodes := _nodes_of_network(files)) is None:
+        return _lost_network(files, "deformable")
+    return None if nodes else Match(BY_COMPANIONS, "a deform.pth of its iteration")
+
+
+def controlled(files: Files) -> Match | None:
+    if "fea_0" in files.columns:
+        return Match(CERTAIN, "column fea_0")
+    return Match(BY_COMPANIONS, "a deform.pth of its iteration, with nodes") if _nodes_of_network(files) else None
+
+
+def _nodes_of_network(files: Files) -> bool | None:
+    """Whether the deform.pth of the splats' iteration has the nodes of SC-GS; None: there is no such file."""
+    network = network_of(files.path, "deformable")
+    return bool(Files(network).words("nodes")) if files.holds_splats and files.folder and network.is_file() else None
+
+
+def _lost_network(files: Files, family: str) -> Match | None:
+    """Splats in a folder where others of its iterations are moved by a network."""
+    if not files.holds_splats or files.folder is None or not any(files.folder.glob(NETWORKS[family])):
+        return None
+    trouble = f"{files.path} lacks the network that moves its splats; copy it to {network_of(files.path, family)}, or choose another iteration"
+    return Match(BY_COMPANIONS, "networks of other iterations", trouble)
+
+
+def exchange(files: Files) -> Match | None:
+    return Match(CERTAIN, "its first bytes") if files.kind in EXCHANGE or files.compressed else None
+
+
+def torch_file(*words: str, sure: float = CERTAIN, trouble: str = "") -> Recognize:
+    """A torch file in which one of these words stands."""
+    return lambda files: Match(sure, f"holds {words[0]}", trouble.format(path=files.path)) if files.words(*words) else None
+
+
+def fudan(files: Files) -> Match | None:
+    trouble = f"{files.path} is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here"
+    return Match(BY_COMPANIONS, "its optimizer's names", trouble) if files.words(*FUDAN) == set(FUDAN) else None
+
+
+family = partial(Family, api_version=API_VERSION)
+LOADERS = "mipmap_plugin.models"
+
+BUILT_IN = (
+    family("3dgs", "3D Gaussian splatting", plain, load=f"{LOADERS}.vanilla:load_vanilla"),
+    *(
+        family(name, title, filtered(name), load=f"{LOADERS}.mip:load_mip", before=("2dgs",))
+        for name, title in {"mip": "Mip-Splatting", "gof": "Gaussian Opacity Fields", "analytic": "Analytic-Splatting"}.items()
+    ),
+    family("2dgs", "2D Gaussian splatting", certain(_is_flat, "two scales"), load=f"{LOADERS}.surfels:load_surfels"),
+    family("scaffold", "Scaffold-GS", anchors("scaffold"), load=f"{LOADERS}.scaffold:load_scaffold", before=FLAT_OR_FILTERED),
+    family("octree", "Octree-GS", anchors("octree"), load=f"{LOADERS}.octree:load_octree", before=FLAT_OR_FILTERED),
+    family("deformable", "Deformable 3D Gaussians", deformable, load=f"{LOADERS}.deformable:load_deformable"),
+    family("4dgs", "4D Gaussians", hexplane, load=f"{LOADERS}.hexplane:load_hexplane", before=("deformable", "sc-gs")),
+    family("gsplat", "gsplat", torch_file("splats"), load=f"{LOADERS}.gsplat:load_gsplat", before=("splatfacto",), place=GSPLAT),
+    family(
+        "splatfacto", "splatfacto (nerfstudio)", torch_file("pipeline", "gauss_params"),
+        load=f"{LOADERS}.splatfacto:load_splatfacto", place=SPLATFACTO,
+    ),
+    family(
+        "exchange", "exchange format (SPZ, SOG, KSPLAT, SPLAT, compressed PLY)", exchange,
+        load=f"{LOADERS}.exchanged:load_exchanged", place=("", r"(lod-)?meta\.json"),
+    ),
+    # Recognized, so that nobody takes them for what they are not; not read.
+    family(
+        "anygs", "Octree-AnyGS", anchors("anygs"), before=FLAT_OR_FILTERED,
+        not_loaded=": its anchors are drawn at offsets, in sizes and at levels of their own"
+        " (or it is of Octree-GS before April 2024, not read either)",
+    ),
+    family(
+        "hac", "HAC", anchors("hac"), before=FLAT_OR_FILTERED,
+        not_loaded=": its networks and grids lie in checkpoint.pth (HAC++, ContextGS and others store theirs so too)",
+    ),
+    family("spacetime", "SpacetimeGaussians", has("trbf_center"), before=("sc-gs", *FLAT_OR_FILTERED)),
+    family("sc-gs", "SC-GS", controlled, before=FLAT_OR_FILTERED),
+    family(
+        "many-scales", "another model", certain(
+            lambda files: "scale_3" in files.columns and not ANCHOR_COLUMNS & files.columns, "column scale_3",
+            "{path} has the column scale_3, which no splats have: it holds anchors or another model; give what it exports",
+        ),
+        before=("spacetime", "sc-gs", *FLAT_OR_FILTERED),
+    ),
+    family(
+        "3d-hgs", "3D-HGS", certain(
+            lambda files: {"opacity1", "opacity2"} <= files.columns, "columns opacity1, opacity2",
+            "{path} holds half-Gaussians (3D-HGS), whose two halves have opacities of their own, which are not read here",
+        ),
+        before=("many-scales", "spacetime", "sc-gs", *FLAT_OR_FILTERED),
+    ),
+    family(
+        "saga", "SAGA", certain(
+            lambda files: {"f_0", "opacity"} <= files.columns and "f_dc_0" not in files.columns, "features without colors",
+            "{path} holds features without colors (SAGA); give the scene_point_cloud.ply of its training",
+        ),
+        before=("spacetime", "sc-gs", *FLAT_OR_FILTERED),
+    ),
+    family(
+        "gsplat-png", "gsplat's PngCompression", certain(
+            lambda files: files.kind == "gsplat-png", "a meta.json of pictures",
+            "{path} lists the pictures of gsplat's PngCompression, which are quantized; give the ckpts/ckpt_*.pt that they were made from",
+        ),
+        place=("", r"meta\.json"),
+    ),
+    family("fudan", "4D Gaussian Splatting (fudan-zvg)", fudan),
+    family(
+        "training", "a training run", torch_file(
+            "param_groups", sure=0.3,
+            trouble="{path} is the state of a training run; give the point_cloud.ply or the model folder that was saved beside it",
+        ),
+    ),
+    family(
+        "network", "a deformation network", torch_file(
+            "linear.0.weight", "nodes", "deformation_net", sure=0.2,
+            trouble="{path} is a deformation network without its splats; give the model folder that holds both",
+        ),
+    ),
+)  # fmt: skip
+
+# By name; others come by `register_model` and by the entry-point group.
+FAMILIES = Registry("mipmap_plugin.models", {each.name: each for each in BUILT_IN})
+
+
+def find_family(name: str) -> Family:
+    """The family of that name. Raises SettingsError for an unknown one, PluginError for what is no family of this version."""
+    found = FAMILIES.get(name)
+    if not isinstance(found, Family):
+        raise PluginError(f"family {name!r} is of type {type(found).__name__}; make it a mipmap_plugin.models.Family")
+    if found.name != name:
+        raise PluginError(f"family {name!r} calls itself {found.name!r}; register it under its own name")
+    if found.api_version != API_VERSION:
+        raise PluginError(f"family {name!r} is written for API version {found.api_version}, this package has {API_VERSION}")
+    return found
+
+
+def not_loaded(name: str) -> str:
+    """The sentence for a family that is recognized, but that nothing loads."""
+    known = find_family(name)
+    told = f"this is a {known.title} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
+    return told + known.not_loaded

@@ -1,0 +1,36 @@
+"""Where the projects keep their files: below a model folder, and beside the file that holds the splats."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+# The files in the result folders of projects that save with torch: the folder they lie in, and their names.
+GSPLAT = ("ckpts", r"ckpt_(?P<step>\d+)(?:_rank(?P<rank>\d+))?\.pt")
+SPLATFACTO = ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")
+
+# Which files of a model folder are the networks of a moving scene.
+NETWORKS = {"4dgs": "point_cloud/*iteration_*/deformation.pth", "deformable": "deform/iteration_*/deform.pth"}
+
+
+def around(file: Path) -> tuple[Path | None, int | None]:
+    """The model folder and the iteration of a file: of INRIA's `<folder>/point_cloud/iteration_<N>/point_cloud.ply`, and of results below
+    a folder of a known name; else a folder with cfg_args is one."""
+    place = file.absolute().parent
+    number = re.fullmatch(r"(?:coarse_)?iteration_(\d+)", place.name)
+    if number and place.parent.name == "point_cloud":
+        return place.parent.parent, int(number[1])
+    if place.name in (GSPLAT[0], SPLATFACTO[0]) and file.suffix != ".ply":
+        return place.parent, None
+    return (place if (place / "cfg_args").is_file() else None), None
+
+
+def network_of(ply: Path, family: str) -> Path:
+    """Where the network of a moving scene lies: the one of the same iteration, for any other moves other splats."""
+    place = ply.absolute().parent
+    return place / "deformation.pth" if family == "4dgs" else place.parent.parent / "deform" / place.name / "deform.pth"
+
+
+def is_coarse(ply: Path) -> bool:
+    """Whether it is of the first stage of 4D Gaussians, in which nothing moves yet."""
+    return ply.absolute().parent.name.startswith("coarse_iteration_")

@@ -1,0 +1,158 @@
+"""Families of strangers: recognized beside the built-in ones, and a broken one breaks nothing."""
+
+import runpy
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import ply_files
+import pytest
+import tiny
+
+from mipmap_plugin import cli, load_model, register_model, registry, wrap_model
+from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
+from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, detect
+from mipmap_plugin.models.conformance import ModelSuite
+from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family
+from mipmap_plugin.models.vanilla import load_vanilla
+
+EXAMPLE = runpy.run_path(str(Path(__file__).parents[1] / "examples/register_family.py"))
+
+
+def archive(path):
+    np.savez(path, **{name: tensor.numpy() for name, tensor in tiny.model(40).parameters().items()})
+    return path
+
+
+def mine(**changes):
+    """A family whose PLY is that of 3DGS with a column of its own."""
+    family = Family("mine", "My splats", lambda files: Match(CERTAIN, "column mine") if "mine" in files.columns else None, API_VERSION, load_vanilla)
+    return replace(family, **changes)
+
+
+def ply(path, *columns):
+    return ply_files.write(path, {**ply_files.splat_columns(8, bands=0), **{name: np.zeros(8, np.float32) for name in columns}})
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays():
+    with FAMILIES.temporarily():
+        yield
+
+
+@pytest.fixture
+def install(monkeypatch):
+    """Pretend that a package is installed whose entry point of this name leads to `target`."""
+
+    def install(name, target):
+        points = [EntryPoint(name, target, "mipmap_plugin.models")]
+        monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "mipmap_plugin.models" else [])
+
+    return install
+
+
+class TestOfTheExample(ModelSuite):
+    family = "npz"
+    cameras = tuple(tiny.cameras())
+    saved_as = "saved.ply"
+
+    @pytest.fixture
+    def checkpoint(self, tmp_path):
+        register_model("npz", EXAMPLE["FAMILY"])
+        return archive(tmp_path / "scene.npz")
+
+
+def test_an_installed_family_works_in_every_command(tmp_path, install, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
+    install("npz", "register_family:FAMILY")
+    scene = archive(tmp_path / "scene.npz")
+    cameras = str(tiny.folder(tmp_path / "views", tiny.cameras()) / "cameras.json")
+    assert cli.main(["inspect", str(scene), "--no-viewers"]) == 0
+    assert "npz" in capsys.readouterr().out
+    adapt = ["adapt", str(scene), "--scale", "1/2", "--cameras", cameras, "--recipe", "instant", "--backend", "reference"]
+    assert cli.main([*adapt, "--output", str(tmp_path / "small.ply")]) == 0
+    assert cli.main(["render", str(scene), "--cameras", cameras, "--output", str(tmp_path / "images"), "--backend", "reference"]) == 0
+
+
+def test_what_is_recognized_can_be_read_by_whoever_registers_a_loader(tmp_path):
+    path = ply(tmp_path / "a.ply", "trbf_center")
+    with pytest.raises(CheckpointError, match="this is a SpacetimeGaussians checkpoint"):
+        load_model(path)
+    with pytest.raises(SettingsError, match="replace=True"):
+        register_model("spacetime", mine(name="spacetime"))
+    register_model("spacetime", replace(find_family("spacetime"), load=lambda path, iteration: tiny.model(3)), replace=True)
+    assert len(load_model(path)) == 3
+
+
+def test_a_family_may_put_itself_before_another(tmp_path):
+    path = ply(tmp_path / "a.ply", "mine", "filter_3D")
+    register_model("mine", mine())
+    with pytest.raises(CheckpointError, match=r"claimed by 'mine' \(column mine\) and 'mip' .*; one of these families has to name the other"):
+        detect(path)
+    register_model("mine", mine(before=("mip",)), replace=True)
+    assert detect(path).family == "mine"
+
+
+def test_the_surest_is_believed(tmp_path):
+    path = ply(tmp_path / "a.ply", "mine")
+    register_model("mine", mine(recognize=lambda files: Match(PLAIN - 0.1, "a guess")))
+    assert detect(path).family == "3dgs"
+    register_model("mine", mine(), replace=True)
+    assert detect(path).family == "mine"
+
+
+def test_results_of_a_training_are_found_in_a_place_of_their_own(tmp_path):
+    (tmp_path / "run/weights").mkdir(parents=True)
+    for step in (5, 20):
+        ply(tmp_path / f"run/weights/step_{step}.ply", "mine")
+    register_model("mine", mine(place=("weights", r"step_(?P<step>\d+)\.ply")))
+    found = detect(tmp_path / "run")
+    assert (found.family, found.path.name, found.iteration) == ("mine", "step_20.ply", 20)
+    assert detect(tmp_path / "run", iteration=5).path.name == "step_5.ply"
+
+
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("no_such_package:FAMILY", "cannot be loaded: ModuleNotFoundError"),
+        (lambda path: None, "is of type function; make it a mipmap_plugin.models.Family"),
+        (mine(name="other"), "calls itself 'other'"),
+        (mine(api_version=API_VERSION + 1), f"is written for API version {API_VERSION + 1}, this package has {API_VERSION}"),
+        (mine(recognize=lambda files: files.nothing), "has no attribute 'nothing'"),
+    ],
+)
+def test_a_broken_family_is_told_of_and_breaks_nothing(tmp_path, target, reason):
+    register_model("mine", target)
+    found = detect(ply(tmp_path / "a.ply"))
+    assert found.family == "3dgs" and "the family 'mine' could not be asked" in found.notes[0] and reason in found.notes[0]
+    assert wrap_model(found.path).model.family == "3dgs"
+    with pytest.raises(CheckpointError, match="could not be asked"):
+        detect(ply_files.write(tmp_path / "points.ply", {name: np.zeros(2, np.float32) for name in "xyz"}))
+
+
+def test_a_loader_that_cannot_be_imported(tmp_path):
+    register_model("mine", mine(load="no_such_module:load"))
+    with pytest.raises(PluginError, match="no_such_module"):
+        load_model(ply(tmp_path / "a.ply", "mine"))
+
+
+def test_what_a_loaded_model_lacks_is_named(tmp_path):
+    class Half:
+        traits = tiny.model(2).traits
+        family, trained, notes, source, folder, digest = "mine", None, [], None, None, ""
+
+        def gaussians(self, camera): ...
+
+        def parameters(self): ...
+
+    register_model("mine", mine(load=lambda path, iteration: Half()))
+    with pytest.raises(PluginError, match=r"loads Half, which lacks copy, replace_parameters, shared_parameters, .*, rebuild; see"):
+        load_model(ply(tmp_path / "a.ply", "mine"))
+    with pytest.raises(SettingsError, match=r"this Half has gaussians\(\) as a model has, but lacks copy"):
+        wrap_model(Half())
+
+
+def test_every_family_says_what_version_it_is_of():
+    assert {family.api_version for family in BUILT_IN} == {API_VERSION}
+    assert len({family.name for family in BUILT_IN}) == len(BUILT_IN)
