@@ -6,6 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
+from mipmap_plugin.backends import BACKENDS
+from mipmap_plugin.models.families import FAMILIES
+from mipmap_plugin.viewers import VIEWERS
+
 SHARED = Path(__file__).parents[1].parent / "shared"
 
 
@@ -33,3 +38,9 @@ def ctrl_c_is_heard():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(autouse=True)
+def nothing_that_is_registered_stays():
+    with BACKENDS.temporarily(), FAMILIES.temporarily(), UPSAMPLERS.temporarily(), VIEWERS.temporarily():
+        yield

@@ -25,7 +25,6 @@ from scenes import make  # noqa: E402
 from tables import Row, Rows  # noqa: E402
 from workloads import Size, activated, count_pairs, effects_of, from_scene  # noqa: E402
 
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS  # noqa: E402
 from mipmap_plugin.backends import get_backend  # noqa: E402
 from mipmap_plugin.backends.projection import project  # noqa: E402
 from mipmap_plugin.config import recipe as make_config  # noqa: E402
@@ -136,7 +135,6 @@ def captures(tmp_path, monkeypatch):
         png.rename(png.with_suffix(".jpg"))  # Pillow looks at the bytes
 
     def measured(scale, photographs=None):
-        monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))  # it registers one
         monkeypatch.setattr(unbounded, "CAPTURES", {"ball": unbounded.Capture("ball", (scale,), every=3, photographs=photographs)})
         monkeypatch.setattr(unbounded, "recipes", lambda capture, scale: {"instant": dict(recipe="instant")})
         unbounded.main(tmp_path, tmp_path)

@@ -8,7 +8,7 @@ from skimage.metrics import structural_similarity
 from mipmap_plugin.adaptation.detail import SURE, Detail
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.structure import similarity
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
+from mipmap_plugin.adaptation.upsamplers import register_upsampler
 from mipmap_plugin.config import AdaptConfig, recipe
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.wrap import wrap_model
@@ -18,9 +18,8 @@ SIZE = (48, 64)
 
 
 @pytest.fixture
-def upsampler(monkeypatch):
+def upsampler():
     """Register a function as the upsampler `mine`."""
-    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
     return lambda function: register_upsampler("mine", function, replace=True)
 
 

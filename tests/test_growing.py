@@ -10,7 +10,7 @@ import torch
 
 from mipmap_plugin.adaptation import growing
 from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
+from mipmap_plugin.adaptation.upsamplers import register_upsampler
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model
@@ -20,8 +20,7 @@ EAGER = dict(returns="last", recipe="thorough", steps=8, prune_every=2, check_ev
 
 
 @pytest.fixture(autouse=True)
-def upsampler(monkeypatch):
-    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
+def upsampler():
     register_upsampler("mine", lambda image, size: resize(image, size, "lanczos"), replace=True)
 
 

@@ -17,7 +17,7 @@ import torch_checkpoints
 from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation import growing, optimizer
 from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
+from mipmap_plugin.adaptation.upsamplers import register_upsampler
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.filters import USUAL_EPS2D
@@ -65,7 +65,6 @@ def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
 
 @pytest.mark.parametrize("enough", [True, False])
 def test_growing_is_judged_and_undone_there(enough, monkeypatch):
-    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
     register_upsampler("mine", lambda image, size: resize(image, size, "lanczos"), replace=True)
     agreements = iter([0.0, *[0.0 if enough else -1.0] * 9])
     monkeypatch.setattr(growing, "decibel", lambda _: next(agreements))

@@ -19,11 +19,6 @@ def image():
     return torch.rand(24, 30, 3, generator=torch.Generator().manual_seed(0))
 
 
-@pytest.fixture(autouse=True)
-def forget_new_names(monkeypatch):
-    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
-
-
 def pillow(image, size, method):
     """Pillow's own resize, plane by plane in 32-bit floats."""
     planes = [Image.fromarray(image[..., c].numpy()).resize((size[1], size[0]), method) for c in range(3)]

@@ -14,7 +14,7 @@ from mipmap_plugin import cli, load_model, register_model, registry, wrap_model
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, detect
 from mipmap_plugin.models.conformance import ModelSuite
-from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family
+from mipmap_plugin.models.families import BUILT_IN, find_family
 from mipmap_plugin.models.vanilla import load_vanilla
 
 EXAMPLE = runpy.run_path(str(Path(__file__).parents[1] / "examples/register_family.py"))
@@ -33,12 +33,6 @@ def mine(**changes):
 
 def ply(path, *columns):
     return ply_files.write(path, {**ply_files.splat_columns(8, bands=0), **{name: np.zeros(8, np.float32) for name in columns}})
-
-
-@pytest.fixture(autouse=True)
-def nothing_stays():
-    with FAMILIES.temporarily():
-        yield
 
 
 @pytest.fixture

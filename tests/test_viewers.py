@@ -490,8 +490,7 @@ def test_an_unknown_viewer_is_told_the_known_ones():
         find_viewer("sparks")
 
 
-def test_a_new_viewer_is_one_record(monkeypatch):
-    monkeypatch.setattr(VIEWERS, "_targets", dict(VIEWERS._targets))
+def test_a_new_viewer_is_one_record():
     register_viewer("blurry", Viewer("blurry", "A blurry one", "nowhere", "classic", 2.0))
     model = wrap_model(tiny.model(), cameras=tiny.cameras(1), backend="reference")
     shown = model.render(tiny.cameras(1)[0], viewer="blurry").image

@@ -12,7 +12,6 @@ from tiny import with_bands
 
 from mipmap_plugin import register_upsampler
 from mipmap_plugin.adaptation import density
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import filters, harmonics, reference, supersample
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
@@ -203,9 +202,8 @@ def test_screen_gradients_are_kept_only_where_something_is_densified(monkeypatch
 
 
 @pytest.fixture
-def broken_upsampler(monkeypatch):
+def broken_upsampler():
     """One that cannot be imported; known while the test lasts."""
-    monkeypatch.setattr(UPSAMPLERS, "_targets", dict(UPSAMPLERS._targets))
     register_upsampler("broken", "no_such_package.upsampling:enlarge")
     return "broken"
 
