@@ -39,7 +39,7 @@ from mipmap_plugin.wrap import Wrapped
 INTRO = """# Captures
 
 Made by `python benchmarks/unbounded.py DATA`, judged on views that nothing was adapted to: those held out of the cameras, one of so many as the
-name says (of bird_272 one of 8, on which the base was not trained either), or six new views of an orbit where the checkpoint came without
+name says (of bird_272 one of 8, on which the base was not trained either), or 24 new views of an orbit where the checkpoint came without
 cameras. The protocol says by what: *N x N samples*, the base's own image averaged; *base, bicubic*, the same shrunk by Pillow's bicubic (a zoom-in
 is shrunk itself and compared with the base's image as it is); P3, photographs. What is the truth itself has no row. Of flowers at x2 the base's
 cameras are half as large, and Lanczos takes a network's place. One thread of a shared machine.
@@ -47,8 +47,9 @@ cameras are half as large, and Lanczos takes a network's place. One thread of a 
 
 LANCZOS = dict(upsampler="lanczos as a network")
 
-# New views of an orbit.
-ORBIT_VIEWS = 6
+# New views of an orbit: as many as it takes for their mean to follow the scene. dB of one view lie up to 20 from those of another, and means of
+# six up to 2 from each other.
+ORBIT_VIEWS = 24
 
 # By what the base's own image is shrunk; floats, for 8 bits end at 59 dB.
 AVERAGED = Protocol("N x N samples", "area", eight_bit=False)
