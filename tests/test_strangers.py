@@ -2,7 +2,6 @@
 
 import runpy
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import ply_files
 import pytest
 import tiny
 
-from mipmap_plugin import cli, load_model, register_model, registry, wrap_model
+from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, detect
 from mipmap_plugin.models.conformance import ModelSuite
@@ -35,17 +34,6 @@ def ply(path, *columns):
     return ply_files.write(path, {**ply_files.splat_columns(8, bands=0), **{name: np.zeros(8, np.float32) for name in columns}})
 
 
-@pytest.fixture
-def install(monkeypatch):
-    """Pretend that a package is installed whose entry point of this name leads to `target`."""
-
-    def install(name, target):
-        points = [EntryPoint(name, target, "mipmap_plugin.models")]
-        monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "mipmap_plugin.models" else [])
-
-    return install
-
-
 class TestOfTheExample(ModelSuite):
     family = "npz"
     cameras = tuple(tiny.cameras())
@@ -55,18 +43,6 @@ class TestOfTheExample(ModelSuite):
     def checkpoint(self, tmp_path):
         register_model("npz", EXAMPLE["FAMILY"])
         return archive(tmp_path / "scene.npz")
-
-
-def test_an_installed_family_works_in_every_command(tmp_path, install, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
-    install("npz", "register_family:FAMILY")
-    scene = archive(tmp_path / "scene.npz")
-    cameras = str(tiny.folder(tmp_path / "views", tiny.cameras()) / "cameras.json")
-    assert cli.main(["inspect", str(scene), "--no-viewers"]) == 0
-    assert "npz" in capsys.readouterr().out
-    adapt = ["adapt", str(scene), "--scale", "1/2", "--cameras", cameras, "--recipe", "instant", "--backend", "reference"]
-    assert cli.main([*adapt, "--output", str(tmp_path / "small.ply")]) == 0
-    assert cli.main(["render", str(scene), "--cameras", cameras, "--output", str(tmp_path / "images"), "--backend", "reference"]) == 0
 
 
 def test_what_is_recognized_can_be_read_by_whoever_registers_a_loader(tmp_path):

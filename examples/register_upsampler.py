@@ -1,0 +1,32 @@
+"""Bring your own upsampler, towards which a zoom-in is adapted: unsharp masking of Lanczos, here.
+
+    python examples/register_upsampler.py output/bicycle 2
+
+A package makes it known without any call, by an entry point in its pyproject.toml:
+
+    [project.entry-points."mipmap_plugin.upsamplers"]
+    sharp = "my_package.sharp:sharp"
+
+and `mipmap-plugin adapt output/bicycle --scale 2 --upsampler sharp` takes it.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from torch import Tensor
+
+from mipmap_plugin import register_upsampler, wrap_model
+from mipmap_plugin.adaptation.resize import resize
+
+
+def sharp(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """An `image` [H, W, 3] of 0..1 at `size` (height, width): [*size, 3]."""
+    height, width, _ = image.shape
+    blurred = resize(resize(image, ((height + 1) // 2, (width + 1) // 2), "area"), (height, width), "lanczos")
+    return resize(image + 0.5 * (image - blurred), size, "lanczos").clamp(0, 1)
+
+
+if __name__ == "__main__":
+    register_upsampler("sharp", sharp)
+    print(wrap_model(sys.argv[1]).adapt(float(sys.argv[2]), upsampler="sharp").save("sharp.ply"))

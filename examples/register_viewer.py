@@ -1,0 +1,28 @@
+"""Tell of the viewer that you use, so that files are adapted for it: one record.
+
+    python examples/register_viewer.py output/bicycle 1/4
+
+A package makes it known without any call, by an entry point in its pyproject.toml:
+
+    [project.entry-points."mipmap_plugin.viewers"]
+    kiosk = "my_package.kiosk:KIOSK"
+
+and `mipmap-plugin adapt output/bicycle --scale 1/4 --viewer kiosk` makes a file for it.
+"""
+
+from __future__ import annotations
+
+import sys
+from fractions import Fraction
+
+from mipmap_plugin import register_viewer, wrap_model
+from mipmap_plugin.effects import RenderSettings
+from mipmap_plugin.viewers import Viewer
+
+KIOSK = Viewer(
+    "kiosk", "The kiosk in our hall", "kiosk.glsl of 2026-11", "classic", eps2d=0.5, settings=RenderSettings(min_alpha=1 / 255), sh_degree=1
+)  # fmt: skip
+
+if __name__ == "__main__":
+    register_viewer("kiosk", KIOSK)
+    print(wrap_model(sys.argv[1]).adapt(float(Fraction(sys.argv[2])), viewer="kiosk").save("kiosk.ply"))

@@ -1,0 +1,60 @@
+"""What the examples bring, as a package would that is installed beside this one: by entry points alone, in the commands."""
+
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+
+from mipmap_plugin import cli, registry
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+POINTS = [
+    EntryPoint("careful", "register_backend:CarefulBackend", "mipmap_plugin.backends"),
+    EntryPoint("npz", "register_family:FAMILY", "mipmap_plugin.models"),
+    EntryPoint("sharp", "register_upsampler:sharp", "mipmap_plugin.upsamplers"),
+    EntryPoint("kiosk", "register_viewer:KIOSK", "mipmap_plugin.viewers"),
+]
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    """A checkpoint of the example's family, and its cameras; the package is installed while the test lasts."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [point for point in POINTS if point.group == group])
+    np.savez(tmp_path / "scene.npz", **{name: tensor.numpy() for name, tensor in tiny.model(40).parameters().items()})
+    views = tiny.folder(tmp_path / "views", tiny.cameras())
+    return [str(tmp_path / "scene.npz"), "--cameras", str(views / "cameras.json"), "--backend", "careful"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("adapt", ["--scale", "1/2", "--steps", "2", "--viewer", "classic"]),
+        ("adapt", ["--scale", "2", "--steps", "1", "--upsampler", "sharp"]),
+        ("render", ["--scale", "1/2"]),
+    ],
+)
+def test_all_of_it_works_together(scene, tmp_path, capsys, name, words):
+    assert cli.main([name, *scene, *words, "--output", str(tmp_path / ("out.ply" if name == "adapt" else "out"))]) == 0, capsys.readouterr().err
+
+
+def test_the_commands_that_list_know_of_it(scene, capsys):
+    assert cli.main(["inspect", scene[0], "--no-viewers"]) == 0
+    assert "npz" in capsys.readouterr().out
+    assert cli.main(["backends"]) == 0
+    assert "careful" in capsys.readouterr().out
+
+
+def test_a_file_for_the_viewer_of_the_example(scene, tmp_path, capsys):
+    scene[-1] = "reference"  # the example's backend draws what is classic only
+    assert cli.main(["adapt", *scene, "--scale", "1/2", "--steps", "1", "--viewer", "kiosk", "--output", str(tmp_path / "out.ply")]) == 0
+    assert "x0.5 in kiosk" in capsys.readouterr().out
+    assert b'"viewer": "kiosk"' in (tmp_path / "out.ply").read_bytes()[:8192]
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("register_*.py")), ids=lambda file: file.stem)
+def test_what_a_stranger_writes_is_short(file):
+    text = file.read_text().split('"""', 2)[2]
+    assert len([line for line in text.splitlines() if line.strip()]) <= 40
