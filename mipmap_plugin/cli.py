@@ -6,6 +6,7 @@ import contextlib
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from importlib.metadata import version
 
 import tyro
 
@@ -26,6 +27,9 @@ for command in (inspect, adapt, render, evaluate, tradeoff, backends, demo):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit code."""
+    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
+        print(f"mipmap-plugin {version('mipmap-plugin')}")
+        return 0
     try:
         with _our_warnings_only():
             app.cli(prog="mipmap-plugin", description="Make a Gaussian-splatting checkpoint look right at another zoom.", args=arguments)

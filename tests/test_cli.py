@@ -62,6 +62,10 @@ def refused(answer, *words):
 # inspect
 
 
+def test_the_version(run):
+    assert re.fullmatch(r"mipmap-plugin \d+\.\d+\.\d+\S*\n", run("--version")[1])
+
+
 def test_inspect_says_what_a_checkpoint_is(run, model_folder):
     code, out, err = run("inspect", model_folder)
     assert (code, err) == (0, "")
