@@ -152,7 +152,9 @@ class Wrapped:
         if config.steps:
             largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
-        base = Base(model, self.effects(), target, viewer, backend, why, not backend.lacking(needs))
+        read = self._read_by(viewer)
+        given = model if read is self.model else read
+        base = Base(model, self.effects(), target, viewer, backend, why, not backend.lacking(needs), given)
         return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True) -> None:
@@ -177,9 +179,8 @@ class Wrapped:
 
     def _read_by(self, viewer: str | None) -> SplatModel:
         """The base as a viewer reads its file."""
-        if viewer is None or not isinstance(self.model, MipModel) or find_viewer(viewer).filter_3d:
-            return self.model
-        return self.model.splats
+        reads_all = viewer is None or not hasattr(self.model, "bare") or find_viewer(viewer).filter_3d
+        return self.model if reads_all else self.model.bare()  # type: ignore[attr-defined]
 
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit where it came without any."""

@@ -98,6 +98,16 @@ def test_the_base_is_neither_changed_nor_overwritten(tmp_path):
             made.save(path, overwrite=True)
 
 
+@pytest.mark.parametrize("viewer", ["spark", "mip"])
+def test_the_base_as_it_is_is_what_the_viewer_shows_of_its_file(tmp_path, viewer):
+    """Where that is better than any state of a run, it is what is given back."""
+    base = wrapped(tmp_path, "gof")
+    made = base.adapt(1, viewer=viewer, recipe="instant", validation_views=2)
+    view = made.views[-1]  # which alone has chosen
+    expected = psnr(base.render(view, viewer=viewer).image, base.render(view).image)
+    assert made.report.validation["the base as it is"] == pytest.approx(expected, abs=1e-3)
+
+
 def test_fused_splats_may_be_merged_and_others_not(tmp_path):
     twins = {name: np.repeat(column, 2) for name, column in splats().items()}
     base = wrap_model(folder(tmp_path / "model", columns=twins), cameras=tiny.cameras(), backend="reference")

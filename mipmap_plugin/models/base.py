@@ -74,7 +74,9 @@ class SplatModel(Protocol):
     # which holds what `form` makes of its splats instead of them. Without it, splats are never merged. A family that keeps its filter, and
     # whose splats 3DGS can hold without it, offers
     #     fused() -> SplatModel
-    # which is what a file for a viewer is made of. Another whose splats no viewer draws says why, in a sentence without a full stop:
+    #     bare() -> SplatModel
+    # The first is what a file for a viewer is made of, the second what a viewer shows of the family's own file. Another whose splats no
+    # viewer draws says why, in a sentence without a full stop:
     #     not_in_viewers: str
     # A family whose photographs were exposed differently has
     #     exposures: Exposures

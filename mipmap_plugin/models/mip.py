@@ -119,18 +119,20 @@ class MipModel:
         """As `VanillaModel.refuse_output`."""
         self.splats.refuse_output(path, overwrite=overwrite)
 
-    def fused(self) -> VanillaModel:
-        """The same splats as 3DGS has them, smoothed once and for all: for viewers, which know no column filter_3D.
+    def bare(self) -> VanillaModel:
+        """The splats, over the same tensors, as a viewer that knows no column filter_3D reads them."""
+        plain = self.splats.with_extras(self.splats.extras)
+        plain.trained = replace(self.trained, keeps_filter=False)
+        return plain
 
-        Drawn with the filter that the base was trained with they look as the base does; saved, they are a checkpoint of 3DGS.
-        """
-        plain = self.splats.copy()
+    def fused(self) -> VanillaModel:
+        """The splats of 3DGS that look, drawn with the filter of training, as these do: smoothed once and for all."""
+        plain = self.bare().copy()
         if self._smooths:
             shown = self.gaussians().detach()
             plain.reshape(lambda _: (shown.scales, shown.opacities))
         for tensor in plain.parameters().values():
             tensor.requires_grad_(False)
-        plain.trained = replace(self.trained, keeps_filter=False)
         plain.digest = self.digest  # a report names the file that its base was read from
         return plain
 
