@@ -44,6 +44,7 @@ class AnchorModel(ABC):
     """
 
     family: str
+    not_in_viewers = "networks decode its splats for each camera, which no viewer of the list does"
 
     def __init__(self, read: AnchorFile, inputs: Mapping[str, tuple[str, ...]]) -> None:
         """`inputs`: what each network takes, in its order (`anchor_decoding.decode`)."""

@@ -71,8 +71,14 @@ class SplatModel(Protocol):
     # which raises what `save` would raise for that path, so that nobody works in vain. A family whose rows are splats that look the same
     # to every camera offers
     #     rebuild(form: Callable[[Gaussians], Gaussians]) -> None
-    # which holds what `form` makes of its splats instead of them. Without it, splats are never merged. A family whose photographs
-    # were exposed differently has
+    # which holds what `form` makes of its splats instead of them. Without it, splats are never merged. A family that keeps its filter, and
+    # whose splats 3DGS can hold without it, offers
+    #     fused() -> SplatModel
+    #     bare() -> SplatModel
+    # The first is what a file for a viewer is made of, the second what a viewer shows of the family's own file. Another whose splats no
+    # viewer draws says why, in a sentence without a full stop:
+    #     not_in_viewers: str
+    # A family whose photographs were exposed differently has
     #     exposures: Exposures
 
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
@@ -88,6 +94,17 @@ class SplatModel(Protocol):
 def same_for_all_views(model: SplatModel) -> bool:
     """Whether the model says that every camera sees the same splats, by offering `rebuild`."""
     return hasattr(model, "rebuild")
+
+
+def why_no_viewer(model: SplatModel) -> str:
+    """Why no viewer (`viewers`) draws what a model shows, in a sentence without a full stop; empty where a file can be made for one."""
+    if hasattr(model, "fused"):
+        return ""
+    if told := getattr(model, "not_in_viewers", ""):
+        return told
+    if not same_for_all_views(model):
+        return "its splats differ from view to view or in time, and a viewer's file holds them once and for all"
+    return "it says that its files are for its own project alone" if model.trained.keeps_filter else ""
 
 
 def effects_of(model: SplatModel) -> list[Effect]:

@@ -41,6 +41,8 @@ class Field(Protocol):
 class MovingModel:
     """Canonical splats, stored and named as 3DGS does, seen through a frozen field at the time of each camera."""
 
+    not_in_viewers = "a network moves its splats, which no viewer of the list does"
+
     def __init__(self, family: str, canonical: VanillaModel, field: Field) -> None:
         self.family, self.canonical, self.field = family, canonical, field
         self.source, self.folder, self.digest, self.notes = canonical.source, canonical.folder, canonical.digest, canonical.notes
