@@ -27,6 +27,7 @@ class Viewer:
     settings: RenderSettings = USUAL
     near_plane: float | None = None  # world units; None: the page that shows the viewer decides
     sh_degree: int = 3  # bands above it are not drawn
+    filter_3d: bool = False  # whether splats are smoothed by a column filter_3D of their file; others do not read it
     unlike: str = ""  # what it does otherwise than this record says
 
     def effects(self, effects: Effects) -> Effects:
@@ -80,7 +81,10 @@ BUILT_IN = (
         "diff-gaussian-rasterization, dr_aa; gsplat 1.5, rasterize_mode antialiased",
         "antialiased", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
     ),
-    Viewer("mip", "Mip-Splatting", "diff-gaussian-rasterization of Mip-Splatting", "mip", 0.1, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE),
+    Viewer(
+        "mip", "Mip-Splatting", "diff-gaussian-rasterization of Mip-Splatting", "mip", 0.1, near_plane=NEAR_PLANE, filter_3d=True,
+        unlike=INRIA_UNLIKE,
+    ),
     Viewer(
         # Its compensation has no least share; that of "mip" lies below its least alpha, so that nobody sees it.
         "spark", "Spark (three.js)", "@sparkjsdev/spark 2.2.0, SparkRenderer, vertex and fragment shader, packSplatEncoding",

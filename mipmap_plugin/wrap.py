@@ -26,7 +26,7 @@ from mipmap_plugin.files import refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_background, check_image, check_scale
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import Placed, SplatModel, TrainedScale
+from mipmap_plugin.models.base import Filtered, Placed, SplatModel, TrainedScale, why_no_viewer
 from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
@@ -96,20 +96,20 @@ class Wrapped:
         `filter_3d`: every splat is smoothed first by what the cameras could see of it at best (Mip-Splatting's 3D filter).
         `outputs`: "depth" and "normals" are drawn beside the image (`Rendered`). `exposure`: the colors become those of the
         photograph that `camera` is named after, as the checkpoint's exposure.json has it. Raises SettingsError where it has none.
-        `viewer`: the view as that viewer draws it, instead of `screen_filter`.
+        `viewer`: the view as that viewer draws it, instead of `screen_filter`: without a filter_3D that it does not read.
         """
         check_scale(scale)
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
         effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(outputs), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if filter_3d else None
-        return shown(self.model, backend, camera, effects, form)
+        return shown(self._read_by(viewer), backend, camera, effects, form)
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
         """Raises SettingsError where no splat can be smoothed, or nothing says by how much."""
         if not self.cameras:
             raise SettingsError("the 3D filter follows from the cameras, and this checkpoint has none; give --cameras")
-        if gaussians.covariances is not None or self.model.traits.smoothed:
+        if gaussians.covariances is not None or self.model.traits.filtered:
             raise SettingsError(f"{self.model.family}: its splats have no scales of their own, or a 3D filter already; leave filter_3d out")
         scales, opacities = smooth_3d(gaussians.scales, gaussians.opacities, filter_3d_of(gaussians.means, self.cameras))
         return replace(gaussians, scales=scales, opacities=opacities)
@@ -137,8 +137,9 @@ class Wrapped:
         Raises SettingsError and BackendUnavailable.
         """
         check_scale(scale)
-        if not self.model.traits.same_for_all_views and settings.setdefault("merge_to", 1.0) < 1:
-            raise SettingsError(f"{self.model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
+        model = cast(Filtered, self.model).fused() if viewer is not None and self.model.traits.filtered else self.model
+        if not model.traits.same_for_all_views and settings.setdefault("merge_to", 1.0) < 1:
+            raise SettingsError(f"{model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adapting to them does not know (exposure.json); leave them out")
         config = make_config(recipe, scale, **settings)
@@ -147,11 +148,13 @@ class Wrapped:
             cameras = real.cameras if real else self.cameras
         target = self.target(viewer)
         needs = replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings)
-        backend, why = choose_backend(self._backend, replace(needs, gradients=config.steps > 0 or config.merge_to < 1))
+        backend, why = choose_backend(self._backend, replace(needs, gradients=config.steps > 0 or config.merge_to < 1), self._needs)
         if config.steps:
             largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
-        base = Base(self.model, self.effects(), target, viewer, backend, why, not backend.lacking(needs))
+        read = self._read_by(viewer)
+        given = model if read is self.model else read
+        base = Base(model, self.effects(), target, viewer, backend, why, not backend.lacking(needs), given)
         return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True) -> None:
@@ -164,12 +167,17 @@ class Wrapped:
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 
     def target(self, viewer: str | None) -> Effects:
-        """How the adapted file is rendered. Raises SettingsError for a viewer that does not open the files of this family."""
+        """How the adapted file is rendered. Raises SettingsError for a viewer of splats that no viewer draws."""
         if viewer is not None:
-            if self.trained.keeps_filter or not self.model.traits.same_for_all_views:
-                raise SettingsError(f"{self.model.family}: its files are opened by its own project alone; leave the viewer {viewer} out")
+            if why := why_no_viewer(self.model):
+                raise SettingsError(f"{self.model.family}: {why}; leave the viewer {viewer} out")
             return self.effects(viewer=viewer)
         return self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)
+
+    def _read_by(self, viewer: str | None) -> SplatModel:
+        """The base as a viewer reads its file."""
+        reads_all = viewer is None or not self.model.traits.filtered or find_viewer(viewer).filter_3d
+        return self.model if reads_all else cast(Filtered, self.model).bare()
 
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit where it came without any."""

@@ -91,7 +91,7 @@ def test_zoomed_out_views_that_nobody_adapted_to_are_closer_to_the_supersampled_
         truth = model.render(small, 1 / 4, "scaled", supersampling=4).image
         images = model.render(small, 1 / 4, "classic").image, started.render(small).image, adapted.render(small).image
         naive, first, final = (psnr(image, truth) for image in images)
-        assert naive + 5 < first + 0.5 < final
+        assert naive + 18 < first < final - 1.3
 
 
 def test_the_paper_leaves_the_centers_bit_for_bit():

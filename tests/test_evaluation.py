@@ -18,6 +18,7 @@ from mipmap_plugin.evaluation.metrics import SAME_DB, psnr, ssim
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.published import PUBLISHED, published
 from mipmap_plugin.evaluation.report import markdown, published_table, records, table
+from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.scenes.images import write_image
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -262,3 +263,10 @@ def test_published_rows_name_their_protocol_and_source():
 
 def test_a_markdown_table_pads_its_columns():
     assert markdown(["a", "long"], [["123", "4"]]) == "| a   | long |\n| --- | ---- |\n| 123 | 4    |"
+
+
+def test_a_viewer_that_cannot_be_adapted_for_is_refused_before_anything_is_drawn(scene, monkeypatch):
+    own = wrap_model(tiny.model(trained=TrainedScale(keeps_filter=True)), cameras=tiny.cameras(), backend="reference")
+    monkeypatch.setattr(Wrapped, "render", None)
+    with pytest.raises(SettingsError, match="leave the viewer spark out"):
+        evaluate(own, scene, [1 / 4], ["instant"], "P3", viewer="spark")

@@ -159,7 +159,7 @@ def test_a_failed_writing_leaves_the_old_file(tmp_path, tool):
 
 def test_what_no_viewer_of_it_shows_is_not_written(tmp_path, tool, monkeypatch):
     flat = SurfelModel(tiny.model().parameters(), flat_trained(tiny.model().trained))
-    with pytest.raises(SettingsError, match="surfel filter"):
+    with pytest.raises(SettingsError, match=r"the filter of their own project \(surfel, 0.5 px²\); give a .ply or a folder"):
         flat.save(tmp_path / "out.spz", provenance={})
     monkeypatch.setenv("PATH", "")
     with pytest.raises(SettingsError, match="npm install"):

@@ -5,6 +5,7 @@ from statistics import fmean
 
 import pytest
 import tiny
+import torch_checkpoints
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.evaluation import looks
@@ -59,5 +60,6 @@ def test_where_training_drew_what_only_a_slow_backend_draws_nothing_is_drawn(tmp
     assert looks.looks(model).startswith("not drawn")
 
 
-def test_what_no_viewer_opens_is_said(tmp_path):
-    assert looks.looks(wrap_model(tiny.model(), cameras=tiny.cameras(1))) == "no viewer opens it as it is"
+def test_a_file_of_another_project_is_not_drawn_and_the_remedy_is_said(tmp_path):
+    model = wrap_model(torch_checkpoints.gsplat_folder(tmp_path / "run", torch_checkpoints.splats()), cameras=tiny.cameras(1))
+    assert looks.looks(model).startswith("not drawn: its own project alone opens such a file; `mipmap-plugin adapt --scale 1 --viewer NAME")

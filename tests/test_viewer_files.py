@@ -2,6 +2,8 @@
 
 import signal
 
+import anchor_checkpoints
+import moving
 import pytest
 import tiny
 
@@ -10,10 +12,18 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.surfels import SurfelModel, flat_trained, flattened
 from mipmap_plugin.models.tags import provenance_of
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 BRIEF = dict(steps=2, extra_views=2, merge_to=1.0, warm_up=0)
+
+
+def write_flat(path):
+    """A model folder of 2DGS."""
+    splats = VanillaModel.from_gaussians(flattened(tiny.gaussians(40))).parameters()
+    return SurfelModel(splats, flat_trained(TrainedScale())).save(path, provenance={}).parents[2]
 
 
 def wrapped(**trained):
@@ -41,8 +51,29 @@ def test_an_unknown_viewer_is_told_the_known_ones():
 
 
 def test_files_of_a_family_that_keeps_its_filter_are_for_no_viewer():
-    with pytest.raises(SettingsError, match="3dgs: its files are opened by its own project alone; leave the viewer spark out"):
+    with pytest.raises(SettingsError, match="3dgs: it says that its files are for its own project alone; leave the viewer spark out"):
         wrapped(keeps_filter=True).adapt(1 / 4, viewer="spark")
+
+
+WRITERS = {"2dgs": write_flat, "scaffold": anchor_checkpoints.write, "deformable": moving.write_deformable, "4dgs": moving.write_hexplane}
+
+
+@pytest.mark.parametrize(
+    ("family", "why"),
+    [
+        ("2dgs", "its splats are flat and met by rays (2DGS), which no viewer of the list does"),
+        ("scaffold", "networks decode its splats for each camera, which no viewer of the list does"),
+        ("deformable", "a network moves its splats, which no viewer of the list does"),
+        ("4dgs", "a network moves its splats, which no viewer of the list does"),
+    ],
+)
+def test_what_no_viewer_draws_is_refused_before_any_work_and_inspect_says_why(tmp_path, capsys, family, why):
+    base = WRITERS[family](tmp_path / "base")
+    assert main(["adapt", str(base), "--scale", "1", "--viewer", "spark"]) == 2
+    assert f"{family}: {why}; leave the viewer spark out" in capsys.readouterr().err
+    assert main(["inspect", str(base)]) == 0
+    assert f"not drawn: {why}" in capsys.readouterr().out
+    assert not (tmp_path / "base_x1_spark").exists()
 
 
 @pytest.mark.parametrize("viewer", ["spark", "playcanvas"])

@@ -23,7 +23,7 @@ class Report(BaseModel):
     settings: AdaptConfig
     backend: str  # which, and why
     views: str  # which, in a sentence
-    viewer: str | None = None  # what the file is for; None: any that draws splats as 3DGS does
+    viewer: str | None = None  # what the file is for; None: what draws as the base's project does
     filters: str  # of the pseudo truth, the base and the adapted file
     effects: list[Effect]  # what adapting and rendering simulate, what they do not, and why
     gaussians_before: int

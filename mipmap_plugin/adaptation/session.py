@@ -82,6 +82,7 @@ class Base:
     backend: Backend
     why: str  # this backend was taken
     differentiates: bool  # whether it has gradients for what is asked
+    given: SplatModel  # what the viewer shows of the base's own file: the base, where it reads all of it
 
 
 class Session:
@@ -91,7 +92,7 @@ class Session:
         self.base, self.backend, self.why, self.trained, self.effects = base.model, base.backend, base.why, base.effects, base.target
         self.differentiates = base.differentiates
         self._smooth = replace(self.effects, settings=replace(self.effects.settings, packing=None, picture_step=None))
-        self.scale, self.config, self.viewer = scale, config, base.viewer
+        self.scale, self.config, self.viewer, self._given = scale, config, base.viewer, base.given
         self.seconds, self.peak = {"optimization": 0.0}, Peak(self.base.parameters()["means"].device)
         views, self.which = choose_views(cameras, self.base.parameters()["means"], config)
         self.views, validation = hold_back(cameras, views, self.base.parameters()["means"], scale, config)
@@ -117,7 +118,7 @@ class Session:
         began = time.perf_counter()
         with self.phase("compilation"):
             warm(self.backend, self.base.gaussians(self.views[0]), (self.trained, self.effects), gradients=self.config.steps > 0)
-        as_it_is = self.fresh()
+        as_it_is = self._to_be_shown(self._given)
         student, start = Start(self).best()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": student.copy()}
         curve: list[CurvePoint] = []
@@ -183,7 +184,11 @@ class Session:
 
     def fresh(self) -> SplatModel:
         """The base as it is, to be rendered as the target is."""
-        model = self.base.copy()
+        return self._to_be_shown(self.base)
+
+    def _to_be_shown(self, model: SplatModel) -> SplatModel:
+        """A copy, to be rendered as the target is."""
+        model = model.copy()
         model.trained = replace(model.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
         return model
 

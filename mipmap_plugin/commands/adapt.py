@@ -7,12 +7,12 @@ from typing import Any
 
 import tyro
 
-from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import Recipe, ResizeFilter, ViewPolicy
 from mipmap_plugin.config import recipe as make_config
+from mipmap_plugin.models.base import SplatModel, why_no_viewer
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import Adapted, state_path
 
@@ -45,7 +45,7 @@ def adapt(
         scale: Target focal length over base focal length, such as 1/4 or 4. May be given several times.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. Several scales or viewers: a folder for all of them.
         recipe: default; thorough (more steps and views); instant (closed form only); paper (the published code, quirk by quirk).
-        viewer: What the file is for: classic (INRIA, gsplat, nerfstudio; the default), spark, supersplat, ...; several: a file each.
+        viewer: What the file is for: spark, supersplat, ...; several: a file each. By default classic (INRIA, gsplat, nerfstudio) or its own project.
         views: Which views to adapt to; by default what the recipe says.
         cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         steps: Optimizer steps at most.
@@ -83,7 +83,7 @@ def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> d
     """The report of an adapted model that is saved, and told of unless `quiet`."""
     saved = adapted.save(target, overwrite=overwrite)
     if not quiet:
-        _print(saved, adapted.report)
+        _print(saved, adapted)
     return {"file": str(saved), **adapted.report.model_dump()}
 
 
@@ -97,12 +97,21 @@ def _wanted(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, 
     return [(scale, name) for scale in each_once(scales) for name in names]
 
 
-def _print(saved: Path, report: Report) -> None:
+def _made_for(model: SplatModel) -> str:
+    """Whom a file is for that no viewer was asked for."""
+    made, others = "made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio)", "; for others give --viewer spark, supersplat, ..."
+    if why_no_viewer(model):
+        return "made for its own project"
+    return f"made for its own project, whose filter it keeps{others}" if model.trained.keeps_filter else f"{made}{others}"
+
+
+def _print(saved: Path, adapted: Adapted) -> None:
+    report = adapted.report
     print(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {saved}")
     db = ", ".join(f"{name} {found:.2f}" for name, found in report.validation.items())
     print(f"  holds {report.returned}{f' (dB on views that nothing was adapted to: {db})' if db else ''}")
     if report.viewer is None:
-        print("  made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio); for others give --viewer spark, supersplat, ...")
+        print(f"  {_made_for(adapted.model)}")
     print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
     if report.peak_memory_mib is not None:
         print(f"  at most {report.peak_memory_mib:,.0f} MiB on the GPU")

@@ -7,6 +7,7 @@ from statistics import fmean
 import torch
 
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr
+from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.wrap import Wrapped
 
 VIEWERS = ("spark", "playcanvas", "gaussian-splats-3d", "classic", "antialiased")
@@ -24,8 +25,10 @@ def looks(wrapped: Wrapped) -> str:
     """
     model, views = wrapped.model, wrapped.views()
     count, pixels = len(model.gaussians(views[0])), views[0].width * views[0].height
-    if not model.traits.same_for_all_views or model.source is None or model.source.suffix != ".ply":
-        return "no viewer opens it as it is"
+    if why := why_no_viewer(model):
+        return f"not drawn: {why}"
+    if model.traits.placed:
+        return "not drawn: its own project alone opens such a file; `mipmap-plugin adapt --scale 1 --viewer NAME --output NEW.ply` makes another"
     if "reference" in (wrapped.backend()[0].name, wrapped.backend(viewer=VIEWERS[0])[0].name):
         return "not drawn: only the reference backend can, which takes too long; `mipmap-plugin backends` says what others lack"
     most = min(VIEWS, len(views), SPLATS // max(1, count), PIXELS // pixels)

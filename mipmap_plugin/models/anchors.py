@@ -58,7 +58,7 @@ class AnchorModel(ABC):
 
     @property
     def traits(self) -> Traits:
-        return Traits(effects=self._effects())
+        return Traits(no_viewer="networks decode its splats for each camera, which no viewer of the list does", effects=self._effects())
 
     def _effects(self) -> tuple[Effect, ...]:
         products = sum(held.numel() for name, held in self.shared_parameters().items() if held.dim() == 2 and not name.startswith("appearance"))

@@ -39,8 +39,9 @@ class Traits:
 
     same_for_all_views: bool = False  # its rows are splats, which every camera sees alike: it offers `rebuild`, and they may be merged
     moves: bool = False  # its Gaussians follow the camera's time
-    smoothed: bool = False  # its splats carry a 3D filter already, or have none that one could be added to
+    filtered: bool = False  # each of its splats has a 3D filter, which no viewer but its own project's knows: it offers `fused` and `bare`
     placed: bool = False  # it was trained in a frame or at a size of its own: it offers `as_trained`
+    no_viewer: str = ""  # why no viewer (`viewers`) draws its splats, in a sentence without a full stop; empty where one does
     exposures: Exposures = NO_EXPOSURES  # what training made of the colors for each photograph
     effects: tuple[Effect, ...] = ()  # what it does for a camera before any splat is drawn, of `effects.OF_OTHER_MODELS`
 
@@ -115,17 +116,37 @@ class Placed(SplatModel, Protocol):
         """Views of the photographs' scene in the frame and at the size that the model was trained in. Raises SceneError."""
 
 
+class Filtered(SplatModel, Protocol):
+    """A model with the trait `filtered`."""
+
+    def fused(self) -> SplatModel:
+        """Splats that look the same without the 3D filter; what a file for a viewer is made of."""
+
+    def bare(self) -> SplatModel:
+        """What a viewer shows of the family's own file: the splats without their filter."""
+
+
 def lacking(model: Any) -> list[str]:
     """What an object lacks to be a SplatModel, by name; [] for one that is."""
     asked = [*_members(SplatModel)]
     if isinstance(traits := getattr(model, "traits", None), Traits):
-        asked += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed
+        asked += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed + ["fused", "bare"] * traits.filtered
     return [name for name in asked if not hasattr(model, name)]
 
 
 def _members(protocol: type) -> list[str]:
     """The attributes and methods that a protocol asks for."""
     return [*protocol.__annotations__, *(name for name in vars(protocol) if not name.startswith("_"))]
+
+
+def why_no_viewer(model: SplatModel) -> str:
+    """Why no viewer (`viewers`) draws what a model shows, in a sentence without a full stop; empty where a file can be made for one."""
+    traits = model.traits
+    if traits.no_viewer or traits.filtered:
+        return traits.no_viewer
+    if not traits.same_for_all_views:
+        return "its splats differ from view to view or in time, and a viewer's file holds them once and for all"
+    return "it says that its files are for its own project alone" if model.trained.keeps_filter else ""
 
 
 def effects_of(model: SplatModel) -> list[Effect]:

@@ -66,7 +66,8 @@ def write_exchange(path: Path, write: Callable[[Path], Any], trained: TrainedSca
     Raises SettingsError where splat-transform is not installed, or splats need the filter of their training; OutputExists, OutputError.
     """
     if trained.keeps_filter:
-        raise SettingsError(f"{path}: viewers of this format have no {trained.screen_filter} filter, which these splats need; give a .ply or folder")
+        own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
+        raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
     tool = _tool()
     if tool is None:
         raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}; or give a .ply")

@@ -22,6 +22,9 @@ ANTIALIASING = (
     " if it was on, say so (--screen-filter antialiased)"
 )
 
+# Options that tell a screen filter (`_screen_filter`).
+FILTER_OPTIONS = ("kernel_size", "load_allres")
+
 # 3DGS takes iteration 0 for "nothing loaded" (scene/__init__.py), so a model that came without one gets the usual last one.
 DEFAULT_ITERATION = 30_000
 
@@ -94,9 +97,14 @@ def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: in
 
 
 def cfg_args_for(source: Path | None, target: Path, trained: TrainedScale, sh_degree: int) -> str:
-    """The source's own text where its SH degree fits; else its options, or the defaults of 3DGS, with the degree set."""
+    """The source's own text where its SH degree and screen filter fit; else its options, or the defaults of 3DGS, with the degree set.
+
+    Options that tell another screen filter are left out, for whoever reads the folder would draw with it.
+    """
     options, _ = read_options(source)
-    if source is not None and options.get("sh_degree") == sh_degree:
+    fits = not any(name in options for name in FILTER_OPTIONS) or _screen_filter(options, None) == (trained.screen_filter, trained.eps2d)
+    options = {name: value for name, value in options.items() if fits or name not in FILTER_OPTIONS}
+    if fits and source is not None and options.get("sh_degree") == sh_degree:
         return (source / "cfg_args").read_bytes().decode("utf-8")
     usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": False}
     white = trained.background == (1.0, 1.0, 1.0)

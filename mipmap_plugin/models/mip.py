@@ -72,7 +72,7 @@ class MipModel:
     def traits(self) -> Traits:
         told = f"the file gives one for each of {len(self):,} splats" if self._smooths else "the file gives one, but its project does not apply it"
         effect = Effect("3D filter", self._smooths, told, "three roots a splat")
-        return Traits(smoothed=True, exposures=self.splats.traits.exposures, effects=(effect,))
+        return Traits(filtered=True, exposures=self.splats.traits.exposures, effects=(effect,))
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated and smoothed. `camera` is not looked at."""
@@ -119,6 +119,23 @@ class MipModel:
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """As `VanillaModel.refuse_output`."""
         self.splats.refuse_output(path, overwrite=overwrite)
+
+    def bare(self) -> VanillaModel:
+        """The splats, over the same tensors, as a viewer that knows no column filter_3D reads them."""
+        plain = self.splats.with_extras(self.splats.extras)
+        plain.trained = replace(self.trained, keeps_filter=False)
+        return plain
+
+    def fused(self) -> VanillaModel:
+        """The splats of 3DGS that look, drawn with the filter of training, as these do: smoothed once and for all."""
+        plain = self.bare().copy()
+        if self._smooths:
+            shown = self.gaussians().detach()
+            plain.reshape(lambda _: (shown.scales, shown.opacities))
+        for tensor in plain.parameters().values():
+            tensor.requires_grad_(False)
+        plain.digest = self.digest  # a report names the file that its base was read from
+        return plain
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
         """Write a PLY or a model folder as `VanillaModel.save` does, with filter_3D as the last column. Raises OutputExists."""
@@ -189,7 +206,7 @@ def filter_3d_of(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 
 def _trained(family: str, told: TrainedScale) -> TrainedScale:
-    """The family's filter. Only its own project renders it right, so an adapted file keeps it."""
+    """The family's filter, which a file with the column keeps: only its own project renders it right."""
     screen_filter, eps2d = SCREEN_FILTERS[family]
     eps2d = told.eps2d if told.screen_filter == screen_filter else eps2d
     return replace(told, screen_filter=screen_filter, eps2d=eps2d, keeps_filter=True)

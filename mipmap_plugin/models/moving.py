@@ -66,7 +66,8 @@ class MovingModel:
     @property
     def traits(self) -> Traits:
         effect = Effect("time", self.moves, "a field moves the splats" if self.moves else "the field changes no splat", self.field.cost)
-        return Traits(moves=self.moves, exposures=self.canonical.traits.exposures, effects=(effect,))
+        why = "a network moves its splats, which no viewer of the list does"
+        return Traits(moves=self.moves, no_viewer=why, exposures=self.canonical.traits.exposures, effects=(effect,))
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """All splats at the time of `camera`, 0 if it has none."""

@@ -36,6 +36,7 @@ class SurfelModel(VanillaModel):
     """N flat splats. Parameters are `VanillaModel`'s; the third log scale is carried and means nothing."""
 
     family = "2dgs"
+    _no_viewer = "its splats are flat and met by rays (2DGS), which no viewer of the list does"
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated, with third scales of 0. `camera` is not looked at."""

@@ -62,6 +62,7 @@ class VanillaModel:
     """
 
     family = "3dgs"
+    _no_viewer = ""  # `Traits.no_viewer`
 
     def __init__(
         self, parameters: dict[str, Tensor], trained: TrainedScale = TrainedScale(), origin: Origin = Origin(), notes: Iterable[str] = ()  # noqa: B008
@@ -73,7 +74,7 @@ class VanillaModel:
         if origin.host:
             self.family = origin.host.family
         self.source, self.folder, self.digest = origin.source, origin.folder, origin.digest
-        self.traits = Traits(same_for_all_views=True, placed=origin.host is not None, exposures=origin.exposures)
+        self.traits = Traits(same_for_all_views=True, placed=origin.host is not None, no_viewer=self._no_viewer, exposures=origin.exposures)
         self.trained = trained
         self.notes: list[str] = list(notes)
 

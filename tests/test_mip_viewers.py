@@ -1,0 +1,158 @@
+"""Families with a `filter_3D` column in viewers, which do not read it: what they show of the file, and files that are made for them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from mip_checkpoints import folder, splats
+
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
+from mipmap_plugin.evaluation import looks
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.files import sha256
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.cfg_args import read_cfg_args
+from mipmap_plugin.models.mip import MipModel
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.tags import provenance_of
+from mipmap_plugin.scenes import write_cameras
+from mipmap_plugin.viewers import find_viewer
+from mipmap_plugin.wrap import Wrapped, wrap_model
+
+FAMILIES = ("mip", "gof", "analytic")
+BRIEF = dict(steps=2, extra_views=2, merge_to=1.0, warm_up=0)
+
+
+def wrapped(path, family: str = "mip") -> Wrapped:
+    return wrap_model(folder(path / "model", family), cameras=tiny.cameras(), backend="reference")
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_fused_splats_look_as_the_base_does(tmp_path, family):
+    base = wrapped(tmp_path, family)
+    fused = base.model.fused()
+    assert fused.family == "3dgs" and not fused.trained.keeps_filter
+    assert not any(tensor.requires_grad for tensor in fused.parameters().values())
+    shown = wrap_model(fused, cameras=tiny.cameras(), backend="reference")
+    for view in tiny.cameras(2):
+        image = base.render(view).image
+        assert image.max() > 0.2
+        torch.testing.assert_close(shown.render(view).image, image, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("viewer", ["spark", "playcanvas"])
+def test_a_viewer_shows_the_file_without_its_filter(tmp_path, family, viewer):
+    base, view = wrapped(tmp_path, family), tiny.cameras(1)[0]
+    bare = base.model.splats.gaussians()
+    expected = ReferenceBackend().render(bare, view, find_viewer(viewer).effects(base.effects())).image
+    assert torch.equal(base.render(view, viewer=viewer).image, expected)
+
+
+def test_mip_splatting_itself_smooths(tmp_path):
+    base, view = wrapped(tmp_path), tiny.cameras(1)[0]
+    assert torch.equal(base.render(view, viewer="mip").image, base.render(view).image)
+
+
+@pytest.mark.parametrize(
+    ("family", "viewer"), [("mip", "spark"), ("mip", "playcanvas"), ("gof", "spark"), ("gof", "playcanvas"), ("analytic", "playcanvas")]
+)
+def test_at_scale_one_a_viewer_comes_closer_to_the_bases_own_picture(tmp_path, family, viewer):
+    base = wrapped(tmp_path, family)
+    made = base.adapt(1, viewer=viewer, recipe="instant")
+    assert made.effects == base.effects(viewer=viewer)
+    for view in tiny.cameras(3, seed=9):  # that nothing was adapted to
+        own = base.render(view).image
+        assert psnr(made.render(view).image, own) > psnr(base.render(view, viewer=viewer).image, own) + 3
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(("viewer", "tag"), [("spark", "antialiased"), ("playcanvas", "classic")])
+def test_what_is_made_for_a_viewer_is_a_checkpoint_of_3dgs(tmp_path, family, viewer, tag):
+    base = wrapped(tmp_path, family)
+    write_cameras(base.model.folder / "cameras.json", tiny.cameras())
+    made = base.adapt(1 / 4, viewer=viewer, **BRIEF)
+    saved = made.save(tmp_path / "made")
+    header = read_ply(saved)
+    assert "filter_3D" not in header.columns and provenance_of(header.comments)["base"] == sha256(base.model.source)
+    assert not {"kernel_size", "load_allres"} & read_cfg_args(tmp_path / "made" / "cfg_args").keys()  # of a filter that it has no more
+    again = load_model(tmp_path / "made")
+    assert (again.family, again.trained.screen_filter, again.trained.eps2d) == ("3dgs", tag, 0.3)
+    assert len(wrap_model(again).cameras) == 4
+    view = tiny.cameras(1)[0].zoomed(1 / 4)
+    loaded = wrap_model(again, backend="reference", background=(0.0, 0.0, 0.0))
+    torch.testing.assert_close(loaded.render(view, viewer=viewer).image, made.render(view).image, atol=1e-5, rtol=0)
+
+
+def test_the_base_is_neither_changed_nor_overwritten(tmp_path):
+    base = wrapped(tmp_path)
+    before = {name: tensor.clone() for name, tensor in base.model.parameters().items()}
+    made = base.adapt(1, viewer="spark", **BRIEF)
+    assert all(torch.equal(base.model.parameters()[name], tensor) for name, tensor in before.items())
+    for path in (tmp_path / "model", base.model.source):
+        with pytest.raises(OutputExists):
+            made.save(path, overwrite=True)
+
+
+@pytest.mark.parametrize("viewer", ["spark", "mip"])
+def test_the_base_as_it_is_is_what_the_viewer_shows_of_its_file(tmp_path, viewer):
+    """Where that is better than any state of a run, it is what is given back."""
+    base = wrapped(tmp_path, "gof")
+    made = base.adapt(1, viewer=viewer, recipe="instant", validation_views=2)
+    view = made.views[-1]  # which alone has chosen
+    expected = psnr(base.render(view, viewer=viewer).image, base.render(view).image)
+    assert made.report.validation["the base as it is"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_fused_splats_may_be_merged_and_others_not(tmp_path):
+    twins = {name: np.repeat(column, 2) for name, column in splats().items()}
+    base = wrap_model(folder(tmp_path / "model", columns=twins), cameras=tiny.cameras(), backend="reference")
+    assert len(base.adapt(1 / 4, viewer="playcanvas", steps=0, merge_to=0.5).model) == len(base.model) / 2
+    with pytest.raises(SettingsError, match="none are merged"):
+        base.adapt(1 / 4, steps=0, merge_to=0.5)
+
+
+def test_without_a_viewer_the_filter_stays(tmp_path):
+    made = wrapped(tmp_path).adapt(1 / 4, **BRIEF)
+    assert isinstance(made.model, MipModel) and (made.effects.screen_filter, made.effects.eps2d) == ("mip", 0.1)
+
+
+def test_splats_that_were_fused_elsewhere_leave_the_kernel_size_behind_too(tmp_path):
+    plain = {name: column for name, column in splats().items() if name != "filter_3D"}
+    base = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras(), backend="reference")
+    base.adapt(1, viewer="spark", **BRIEF).save(tmp_path / "made")
+    assert (load_model(tmp_path / "made").trained.screen_filter, load_model(tmp_path / "made").trained.eps2d) == ("antialiased", 0.3)
+
+
+def test_who_draws_the_base_has_its_filter_too(tmp_path, monkeypatch):
+    """A renderer that has the viewer's filter but not that of training would draw another truth."""
+    lacking = ReferenceBackend.lacking
+    no_analytic = ["it does not integrate"]
+    monkeypatch.setattr(ReferenceBackend, "lacking", lambda self, needs: no_analytic if needs.screen_filter == "analytic" else lacking(self, needs))
+    with pytest.raises(BackendUnavailable, match="it does not integrate"):
+        wrapped(tmp_path, "analytic").adapt(1, viewer="classic", **BRIEF)
+
+
+def test_inspect_says_how_viewers_show_it(tmp_path):
+    pytest.importorskip("numba")
+    told = looks.looks(wrap_model(folder(tmp_path / "model"), cameras=tiny.cameras()))
+    assert told.startswith("spark ") and "playcanvas" in told
+
+
+def test_the_command_converts_it(tmp_path, capsys):
+    base = folder(tmp_path / "model")
+    write_cameras(base / "cameras.json", tiny.cameras())
+    words = ["adapt", base, "--scale", "1", "--viewer", "spark", "--recipe", "instant", "--backend", "reference"]
+    assert main([str(word) for word in words]) == 0
+    assert f"x1 in spark: {tmp_path / 'model_x1_spark'}" in capsys.readouterr().out
+    assert load_model(tmp_path / "model_x1_spark").family == "3dgs"
+
+
+def test_the_command_says_that_a_file_without_a_viewer_is_for_its_own_project(tmp_path, capsys):
+    words = ["adapt", folder(tmp_path / "model"), "--scale", "1/4", "--recipe", "instant", "--backend", "reference"]
+    assert main([str(word) for word in words]) == 0
+    assert "made for its own project, whose filter it keeps; for others give --viewer spark, supersplat, ..." in capsys.readouterr().out
