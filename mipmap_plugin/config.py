@@ -60,6 +60,7 @@ class AdaptConfig(BaseModel):
     extra_views: int = Field(100, ge=0, description="How many views `jittered` adds, or an orbit has.")
 
     closed_form: bool = Field(True, description="Start from the closed form instead of from the base.")
+    crispness: float = Field(0.0, ge=0, le=1, description="Zoom-in: from 0, most dB, to 1, splats as small as the base's own and more opaque.")
     merge_to: float = Field(1.0, gt=0, le=1, description="Share of the splats that is left when like ones that share pixels are merged.")
     merging_costs: float = Field(0.3, ge=0, description="dB on validation views that merging may cost before the first step; else fewer are merged.")
     rates: LearningRates = LearningRates()
