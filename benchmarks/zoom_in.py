@@ -16,8 +16,8 @@ from typing import Literal
 
 import torch
 import tyro
-from front import draw
 from pages import write_page
+from zoom_in_plot import draw
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
