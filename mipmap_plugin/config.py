@@ -60,6 +60,7 @@ class AdaptConfig(BaseModel):
     extra_views: int = Field(100, ge=0, description="How many views `jittered` adds, or an orbit has.")
 
     closed_form: bool = Field(True, description="Start from the closed form instead of from the base.")
+    crispness: float = Field(0.0, ge=0, le=1, description="Zoom-in: from 0, most dB, to 1, splats as small as the base's own and more opaque.")
     merge_to: float = Field(1.0, gt=0, le=1, description="Share of the splats that is left when like ones that share pixels are merged.")
     merging_costs: float = Field(0.3, ge=0, description="dB on validation views that merging may cost before the first step; else fewer are merged.")
     rates: LearningRates = LearningRates()
@@ -120,15 +121,17 @@ WHOLE_RATES = 0.25
 
 # Towards a bicubic or Lanczos target every step loses real dB against the closed form: the target knows nothing that the
 # base does not, and adds the kernel's ringing. So the image is shrunk and compared with the base itself, at gentle rates. Centers
-# stay: moving them gains 0.02 dB on lego, and steps of a third of a pixel cost 5 dB on flowers.
+# stay: moving them gains 0.02 dB on lego, and steps of a third of a pixel cost 5 dB on flowers. What no image of the base's size tells stays as
+# it was at the start, and so a crisp start, which has less dB, ends with as many and better LPIPS (benchmarks/results/zoom_in.md).
 _DEFAULT_IN = dict(
-    steps=200, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
+    steps=200, crispness=0.5, compare_at="base", resize="area", patience=2, check_every=25, prune_every=1000, decay=0.3,
     rates=LearningRates(opacities=0.02, networks=5e-4),
 )  # fmt: skip
 
-# With a super-resolution network there is something to learn at the new scale too: more steps and bolder rates pay, LPIPS above all.
+# With a super-resolution network there is something to learn at the new scale too: more steps and bolder rates pay, LPIPS above all. How crisp
+# it is follows from the network.
 _DEFAULT_UPSAMPLED = dict(
-    _DEFAULT_IN, steps=800, compare_at="both", resize="pil-bicubic", patience=None, views="train",
+    _DEFAULT_IN, steps=800, crispness=0.0, compare_at="both", resize="pil-bicubic", patience=None, views="train",
     rates=LearningRates(scales=0.015, quats=0.003, opacities=0.05, sh0=0.01, shN=0.001, networks=5e-4),
 )  # fmt: skip
 

@@ -24,6 +24,8 @@ from real_bases import kept  # noqa: E402
 from scenes import make  # noqa: E402
 from tables import Row, Rows  # noqa: E402
 from workloads import Size, activated, count_pairs, effects_of, from_scene  # noqa: E402
+from zoom_in import kept as kept_with_networks  # noqa: E402
+from zoom_in_plot import draw  # noqa: E402
 
 from mipmap_plugin.backends import get_backend  # noqa: E402
 from mipmap_plugin.backends.projection import project  # noqa: E402
@@ -171,3 +173,22 @@ def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_d
     judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,)))
     adapted = base.adapt(0.25, recipe="instant", cameras=others)
     assert len(judged) == 6 and others == [] and seen_before(judged, adapted.views) == []
+
+
+def zoomed_in(name, psnr_db=27.0, lpips=0.08, scale=2.0):
+    return Judged(name, scale, "P3", psnr_db, 0.9, 1.0, 10.0, 100, lpips=lpips, lpips_label="LPIPS", scene="lego")
+
+
+def test_only_rows_with_networks_of_a_scale_are_kept(tmp_path):
+    file = tmp_path / "lego_100.json"
+    assert kept_with_networks(file, 2) == []
+    rows = [zoomed_in("base"), zoomed_in("default, crispness 0"), zoomed_in("default + X2.pt"), zoomed_in("default + X4.pt", scale=4.0)]
+    write_json(file, records(rows), overwrite=True)
+    assert [row.name for row in kept_with_networks(file, 2)] == ["default + X2.pt"]
+
+
+def test_crispness_is_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    crisp = [zoomed_in(f"{kind}, crispness {each}", 26 - each, 0.09 - 0.02 * each) for kind in ("closed form", "default") for each in (0, 0.5, 1)]
+    draw(tmp_path / "front.png", {"lego_100": [zoomed_in("base", 22.0), *crisp, zoomed_in("enlarged by bicubic", lpips=0.16)]})
+    assert (tmp_path / "front.png").read_bytes().startswith(b"\x89PNG")

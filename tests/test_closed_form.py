@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mipmap_plugin.adaptation.closed_form import CLEAR_OF_CULLS, THINNEST, closed_form, needs_nothing, pixel_size
+from mipmap_plugin.adaptation.closed_form import CLEAR_OF_CULLS, THINNEST, Form, closed_form, needs_nothing, pixel_size
 from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.surfel_form import shown_area
 from mipmap_plugin.backends.filters import footprint, keeps_light
 from mipmap_plugin.backends.projection import project
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -35,14 +36,14 @@ def show(gaussians: Gaussians, scale: float, eps2d: float = DILATION, screen_fil
     return BACKEND.render(gaussians, VIEW.zoomed(scale), Effects(0, screen_filter, eps2d)).image
 
 
-def adapted(gaussians: Gaussians, scale: float, base: Effects = Effects(0), target: Effects = Effects(0)) -> Gaussians:  # noqa: B008
-    scales, opacities = closed_form(gaussians, [VIEW], scale, base, target)
+def adapted(gaussians: Gaussians, scale: float, base: Effects = Effects(0), target: Effects = Effects(0), crispness: float = 0.0) -> Gaussians:  # noqa: B008
+    scales, opacities = closed_form(gaussians, [VIEW], scale, base, target, Form(crispness=crispness))
     return replace(gaussians, scales=scales, opacities=opacities)
 
 
-def finer(width: float, height: float, scale: float, base: Effects, opacity: float = 0.7):
-    """The picture at zoom-in of the disc that `base` shows: what the pixel's average widened is narrower again, and no light is lost."""
-    shown = BASE_WIDTH[base.screen_filter] - 1 / 12 + 1 / 12 / scale**2
+def finer(width: float, height: float, scale: float, base: Effects, opacity: float = 0.7, averaged: float = 1 / 12):
+    """The picture at zoom-in of the disc that `base` shows: what an average of `averaged` px² widened is narrower again, and no light is lost."""
+    shown = BASE_WIDTH[base.screen_filter] - averaged + averaged / scale**2
     light = 0.0 if keeps_light(base.screen_filter) else BASE_WIDTH[base.screen_filter]
     areas = [math.sqrt((width**2 + more) * (height**2 + more)) for more in (light, shown)]
     return show(disc(width, height, opacity * areas[0] / areas[1]), scale, shown * scale**2)
@@ -53,6 +54,35 @@ def finer(width: float, height: float, scale: float, base: Effects, opacity: flo
 @pytest.mark.parametrize("base", [Effects(0), Effects(0, "antialiased")], ids=lambda base: base.screen_filter)
 def test_zoom_in_shows_what_the_base_is_the_average_of(scale, size, base):
     torch.testing.assert_close(show(adapted(disc(*size), scale, base), scale), finer(*size, scale, base), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+@pytest.mark.parametrize("size", [(2.0, 0.8), (0.3, 0.05)])
+@pytest.mark.parametrize(("crispness", "averaged"), [(0.5, (1 / 12 + 0.3) / 2), (1.0, 0.3)])
+def test_a_crisp_zoom_in_is_narrower_and_no_light_is_lost(scale, size, crispness, averaged):
+    new = adapted(disc(*size, opacity=0.1), scale, crispness=crispness)
+    torch.testing.assert_close(show(new, scale), finer(*size, scale, Effects(0), 0.1, averaged), atol=1e-6, rtol=0)
+
+
+def test_the_crispest_splats_keep_their_size():
+    splat = disc(0.3, 0.05)
+    new = adapted(splat, 4, crispness=1.0)
+    torch.testing.assert_close(new.scales[:, :2], splat.scales[:, :2])
+    assert splat.opacities < new.opacities <= 1
+
+
+def test_crispness_is_of_zoom_in_only():
+    splat = disc(0.8, 0.3)
+    plain, crisp = (adapted(splat, 1 / 4, crispness=each) for each in (0.0, 1.0))
+    assert torch.equal(plain.scales, crisp.scales) and torch.equal(plain.opacities, crisp.opacities)
+
+
+def test_the_crispest_surfels_keep_their_size_and_add_as_much_light():
+    splat, surfel = disc(0.3, 0.05, opacity=0.02), Effects(0, SURFEL)
+    plain, crisp = (adapted(splat, 4, surfel, surfel, crispness) for crispness in (0.0, 1.0))
+    torch.testing.assert_close(crisp.scales, splat.scales)
+    areas = [shown_area(project(each, VIEW.zoomed(4), 0.2), surfel.eps2d) for each in (plain, crisp)]
+    torch.testing.assert_close(crisp.opacities * areas[1], plain.opacities * areas[0])
 
 
 def test_a_view_from_afar_raises_no_opacity_further():

@@ -31,6 +31,12 @@ def test_the_base_is_chosen_where_the_closed_form_is_worse(monkeypatch):
     assert torch.equal(result.model.parameters()["scales"], tiny.model(COUNT).parameters()["scales"])
 
 
+def test_crispness_reaches_the_start():
+    plain, crisp = (adapted(scale=4, crispness=each, returns="last").model.parameters() for each in (0.0, 1.0))
+    torch.testing.assert_close(crisp["scales"], tiny.model(COUNT).parameters()["scales"], atol=1e-5, rtol=0)
+    assert (crisp["opacities"] >= plain["opacities"]).all() and (crisp["scales"] < plain["scales"]).any()
+
+
 def test_the_base_is_where_a_run_starts_without_a_closed_form():
     assert start_of(adapted(closed_form=False).report) == "the base"
 

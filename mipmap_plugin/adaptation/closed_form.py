@@ -12,7 +12,9 @@ the opacity can rise for, so that the splat adds as much to an image as before. 
 
 Zoom-in (s > 1) widens, but less than that: the pictures that a base was trained on are averages over pixels, which is p = 1/12 px² of
 variance, and so should be those that it is to show. The world is what Σ + e·ρ² is the average of, so that e and e' are each less by p, and
-opacity rises by the area that is lost (+0.3 dB after the default steps on photographs of lego and chair at x2 and x4).
+opacity rises by the area that is lost (+0.3 dB after the default steps on photographs of lego and chair at x2 and x4). How much of e is
+such an average, and how much is a splat's own extent, no image of the base's size tells: anything from p = 1/12 to p = e shows it the same picture,
+nearly. More is crisper: with p = e splats keep their size, and opacity alone makes up for what a zoom takes off them (`Form.crispness`).
 
 A file that is drawn by the base's own filter needs nothing where that filter compensates: it does what a pixel does, view by view. Wider
 splats would cost a base of Mip-Splatting 10 dB against the truth at x4.
@@ -24,7 +26,7 @@ argues); the mean distance costs 0.3 to 0.7 dB at zoom-in on lego and the demo s
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -50,22 +52,29 @@ CLEAR_OF_CULLS = 2.0
 ENOUGH_VIEWS = 12
 
 
+@dataclass(frozen=True)
+class Form:
+    """What the base's images leave open."""
+
+    area_power: float = AREA_POWER  # how much faster than its area an opacity falls at zoom-out
+    crispness: float = 0.0  # 0..1, zoom-in: 0, pictures are averages over a pixel; 1, over all that the base's filter adds
+
+
 def closed_form(
-    gaussians: Gaussians, views: Sequence[Camera], scale: float, base: Effects, target: Effects, area_power: float = AREA_POWER
+    gaussians: Gaussians, views: Sequence[Camera], scale: float, base: Effects, target: Effects, form: Form = Form()
 ) -> tuple[Tensor, Tensor]:
     """Scales [N, 3] and opacities [N] that look right at `scale`.
 
-    `views` are cameras of the base scale, `base` is how the base was trained, `target` how the result is rendered. `area_power`: how
-    much faster than its area an opacity falls at zoom-out.
+    `views` are cameras of the base scale, `base` is how the base was trained, `target` how the result is rendered.
     """
     if needs_nothing(scale, base, target):
         return gaussians.scales, gaussians.opacities
     views = views[:: -(-len(views) // ENOUGH_VIEWS)]
     base_pixel = pixel_size(gaussians.means, views)
     if target.screen_filter == SURFEL:
-        return _of_surfels(gaussians, views, scale, base, target, base_pixel)
+        return _of_surfels(gaussians, views, scale, (base, target), base_pixel, form)
     target_pixel = base_pixel / scale
-    averaged = min(SQUARE_VARIANCE, _width(base)) if scale > 1 else 0.0  # px²
+    averaged = _averaged(base, form.crispness) if scale > 1 else 0.0
     wide = gaussians.scales.square() + ((_width(base) - averaged) * base_pixel**2)[:, None]
     narrow = (wide - ((_width(target) - averaged) * target_pixel**2)[:, None]).clamp_min(0)
     if keeps_light(target.screen_filter):  # an area may become smaller by as much as the opacity can rise
@@ -77,7 +86,7 @@ def closed_form(
     # A splat of no size of its own rises most; a view from afar, in which every splat has none, must not raise it further.
     most = _width(base) / (_width(base) - averaged + averaged / scale**2) if averaged else torch.inf if keeps_light(target.screen_filter) else 1.0
     areas = _area_ratio(gaussians, new, views, scale, (base, target), most)
-    opacities = opacities * areas ** (area_power if scale <= 1 and not keeps_light(target.screen_filter) else 1.0)
+    opacities = opacities * areas ** (form.area_power if scale <= 1 and not keeps_light(target.screen_filter) else 1.0)
     # What the target's renderer takes off by itself is added before.
     return scales, (opacities / _light(new, [view.zoomed(scale) for view in views], target)).clamp_max(1)
 
@@ -91,9 +100,10 @@ def needs_nothing(scale: float, base: Effects, target: Effects) -> bool:
 
 
 def _of_surfels(
-    gaussians: Gaussians, views: Sequence[Camera], scale: float, base: Effects, target: Effects, base_pixel: Tensor
+    gaussians: Gaussians, views: Sequence[Camera], scale: float, effects: tuple[Effects, Effects], base_pixel: Tensor, form: Form
 ) -> tuple[Tensor, Tensor]:
-    """Scales [N, 3] and opacities [N] of surfels (`surfel_form`); `base_pixel` [N] world units."""
+    """Scales [N, 3] and opacities [N] of surfels (`surfel_form`); `effects` of base and target, `base_pixel` [N] world units."""
+    base, target = effects
     zoomed = [view.zoomed(scale) for view in views]
 
     def drawn(scales: Tensor) -> Tensor:
@@ -108,7 +118,11 @@ def _of_surfels(
     if scale <= 1:
         return gaussians.scales, gaussians.opacities / drawn(gaussians.scales) ** AREA_POWER
     wide = least_sizes(gaussians.scales, base_pixel, base.eps2d)
-    return lay_out(gaussians.scales, wide, 1 / drawn(wide)), gaussians.opacities
+    wide = lay_out(gaussians.scales, wide, 1 / drawn(wide))
+    if form.crispness == 0:
+        return wide, gaussians.opacities
+    crisp = wide.square().lerp(gaussians.scales.square(), form.crispness).sqrt()
+    return crisp, (gaussians.opacities * drawn(wide) / drawn(crisp)).clamp_max(1)
 
 
 def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
@@ -136,6 +150,12 @@ def _least_variance(effects: Effects) -> float:
 def _width(effects: Effects) -> float:
     """px²: the variance that the screen filter adds."""
     return widening(effects.screen_filter, effects.eps2d)
+
+
+def _averaged(base: Effects, crispness: float) -> float:
+    """px²: the variance of what the base's pictures are averages over, from a pixel's own to all that the base's filter adds."""
+    pixel = min(SQUARE_VARIANCE, _width(base))
+    return pixel + crispness * (_width(base) - pixel)
 
 
 def _light(gaussians: Gaussians, views: Sequence[Camera], effects: Effects) -> Tensor | float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.closed_form import AREA_POWER, closed_form, needs_nothing, pixel_size
+from mipmap_plugin.adaptation.closed_form import AREA_POWER, Form, closed_form, needs_nothing, pixel_size
 from mipmap_plugin.adaptation.light import light
 from mipmap_plugin.adaptation.matching import matched
 from mipmap_plugin.adaptation.merging import merge
@@ -78,7 +78,8 @@ class Start:
 
     def _form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         of = self._of
-        scales, opacities = closed_form(gaussians, of.views, of.scale, of.trained, of.effects, 1.0 if self._weighs else AREA_POWER)
+        form = Form(1.0 if self._weighs else AREA_POWER, of.config.crispness)
+        scales, opacities = closed_form(gaussians, of.views, of.scale, of.trained, of.effects, form)
         if not self._weighs or weights is None:
             return scales, opacities
         views = [view.zoomed(of.scale) for view in self._views]
