@@ -22,7 +22,7 @@ from mipmap_plugin.config import AdaptConfig, Recipe
 from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
-from mipmap_plugin.files import refuse_output, refuse_unwritable
+from mipmap_plugin.files import named, refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_background, check_image, check_scale
 from mipmap_plugin.models import load_model
@@ -156,7 +156,7 @@ class Wrapped:
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True) -> None:
         """Raise what saving an adapted model to `path` would raise at the end, as far as it can be known, before any work."""
-        report, source = path.with_name(path.name + REPORT), self.model.source
+        report, source = named(path).with_name(named(path).name + REPORT), self.model.source
         parts = parts_of(source, self.model.folder)
         if hasattr(self.model, "refuse_output"):
             self.model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
@@ -241,6 +241,7 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
 
 def state_path(output: Path) -> Path:
     """Where the state of a run is kept whose model is to be saved to `output`."""
+    output = named(output)
     return output.with_name(output.name + ".resume")
 
 

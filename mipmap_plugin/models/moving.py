@@ -16,6 +16,7 @@ from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import FAMILIES, detect, network_of, not_loaded
+from mipmap_plugin.models.exchange import is_written
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 
 # Views whose moments tell how opaque a splat ever gets; each costs one pass through the field.
@@ -103,8 +104,9 @@ class MovingModel:
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """What `save` would refuse about `path`, before anything is done for it. Raises SettingsError, OutputExists, OutputError."""
-        if path.suffix.lower() == ".ply":
-            raise SettingsError(f"{path}: a PLY has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}")
+        if path.suffix.lower() == ".ply" or is_written(path):
+            told = f"has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}"
+            raise SettingsError(f"{path}: {'a PLY' if path.suffix.lower() == '.ply' else 'this format'} {told}")
         self.canonical.refuse_output(path, overwrite=overwrite)
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
