@@ -100,7 +100,19 @@ def precious(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+def compile_kernels(folder: Path) -> None:
+    """Run a sound command, which compiles what a machine keeps from then on: that takes longer than any file or command may."""
+    here, work = Path.cwd(), folder / "compiled"
+    work.mkdir()
+    words.prepare(work)
+    os.chdir(work)
+    commanded(words.SOUND[0].split())
+    os.chdir(here)
+    shutil.rmtree(work)
+
+
 def run_commands(folder: Path, first: int, last: int) -> None:
+    compile_kernels(folder)
     here = Path.cwd()
     for seed in range(first - 1, last):
         chosen = words.words(random.Random(f"{COMMANDS} {seed}")) if seed >= first else words.SOUND[0].split()
