@@ -96,6 +96,11 @@ def absolute(path: Path) -> Path:
     return real
 
 
+def named(path: Path) -> Path:
+    """`path` with a last part of its own, which others can be put beside: of "." the folder's name. Raises OutputError for a root."""
+    return path if path.name not in ("", "..") else absolute(path)
+
+
 def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_file: bool = False) -> None:
     """Raise OutputExists for what may not be written to, or not without `overwrite`; OutputError for what no system takes.
 

@@ -22,7 +22,7 @@ from mipmap_plugin.config import AdaptConfig, Recipe
 from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
-from mipmap_plugin.files import refuse_output, refuse_unwritable
+from mipmap_plugin.files import named, refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_background, check_image, check_scale
 from mipmap_plugin.models import load_model
@@ -157,11 +157,12 @@ class Wrapped:
         base = Base(model, self.effects(), target, viewer, backend, why, not backend.lacking(needs), given)
         return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
 
-    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True) -> None:
-        """Raise what saving an adapted model to `path` would raise at the end, as far as it can be known, before any work."""
-        report, source = path.with_name(path.name + REPORT), self.model.source
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
+        """Raise what saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be known, before any work."""
+        report, source = named(path).with_name(named(path).name + REPORT), self.model.source
         parts = parts_of(source, self.model.folder)
-        self.model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
+        model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
+        model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
         for beside in (report, state_path(path)):
             refuse_output(beside, True, parts, is_file=True)
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
@@ -246,6 +247,7 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
 
 def state_path(output: Path) -> Path:
     """Where the state of a run is kept whose model is to be saved to `output`."""
+    output = named(output)
     return output.with_name(output.name + ".resume")
 
 

@@ -142,6 +142,18 @@ def test_adapt_of_a_phones_file_simply_works(tmp_path, tool, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
+def test_what_is_only_read_goes_out_as_a_ply(tmp_path, tool):
+    (tmp_path / "phone.splat").write_bytes(RECORD * 3)
+    assert main(["adapt", str(tmp_path / "phone.splat"), "--scale", "1/4", "--recipe", "instant"]) == 0
+    assert len(load_model(tmp_path / "phone_x0.25.ply")) == 60
+
+
+@pytest.mark.parametrize("name", ["out.splat", "out.KSPLAT"])
+def test_no_folder_is_named_as_a_file_of_these_formats_is(tmp_path, name):
+    with pytest.raises(SettingsError, match=r"is not written as K?SPLAT; give a \.ply"):
+        tiny.model().save(tmp_path / name, provenance={})
+
+
 @pytest.mark.parametrize("name", ["out.sog", "out.spz", "out.compressed.ply"])
 def test_any_splats_are_written_so_where_the_name_asks_for_it(tmp_path, tool, name):
     tiny.model().save(tmp_path / name, provenance={})

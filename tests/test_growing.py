@@ -4,6 +4,7 @@ import math
 import signal
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -11,8 +12,10 @@ import torch
 from mipmap_plugin.adaptation import growing
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.validation import Validation
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import recipe
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 # Every splat that is seen grows at steps 2, 4 and 6, if nothing forbids it.
@@ -146,3 +149,16 @@ def test_a_resumed_run_equals_an_uninterrupted_one(judged, monkeypatch, tmp_path
     resumed = adapted(resume=tmp_path / "state")
     assert resumed.save(tmp_path / "resumed.ply").read_bytes() == whole.save(tmp_path / "whole.ply").read_bytes()
     assert resumed.report.ended_by == whole.report.ended_by
+
+
+def test_rows_that_are_as_many_but_others_have_no_columns_of_the_base(monkeypatch):
+    """Pruned after the first step, and grown to as many as the base has, which is where growing ends, after the second."""
+    found = iter([30.0, 40.0, 39.0])  # in the beginning, after step 2, after step 4
+    monkeypatch.setattr(Validation, "steer", lambda self, model: next(found))
+    monkeypatch.setattr(Validation, "choose", lambda self, states: (list(states)[2], dict.fromkeys(states, 0.0)))
+    base = VanillaModel(tiny.model(40).parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)}))
+    settings = dict(most_growth=1, densify_gradient=1e-12, min_opacity=0.5, prune_every=1, steps=4, check_every=2, merge_to=1.0, warm_up=0)
+    run = wrap_model(base, cameras=tiny.cameras(6), backend="reference").adapt(1 / 2, extra_views=0, closed_form=False, **settings)
+    assert run.report.returned.startswith("the state after step 2") and len(run.model) == len(base)
+    assert not torch.equal(run.model.parameters()["means"], base.parameters()["means"])
+    assert "confidence" not in run.model.extras

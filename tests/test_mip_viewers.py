@@ -14,7 +14,7 @@ from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
 from mipmap_plugin.evaluation import looks
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.files import sha256
-from mipmap_plugin.models import load_model
+from mipmap_plugin.models import exchange, load_model
 from mipmap_plugin.models.cfg_args import read_cfg_args
 from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.models.ply import read_ply
@@ -96,6 +96,14 @@ def test_the_base_is_neither_changed_nor_overwritten(tmp_path):
     for path in (tmp_path / "model", base.model.source):
         with pytest.raises(OutputExists):
             made.save(path, overwrite=True)
+
+
+def test_an_exchange_format_is_refused_for_its_own_project_only(tmp_path, monkeypatch):
+    monkeypatch.setattr(exchange, "_tool", lambda: ["splat-transform"])
+    base = wrapped(tmp_path)
+    base.refuse_output(tmp_path / "small.spz", overwrite=False, viewer="spark")
+    with pytest.raises(SettingsError, match="these splats need the filter of their own project"):
+        base.refuse_output(tmp_path / "small.spz", overwrite=False)
 
 
 @pytest.mark.parametrize("viewer", ["spark", "mip"])

@@ -1,9 +1,12 @@
 """Snapshots: what a model held, put back into it or into a copy."""
 
+import numpy as np
+import pytest
 import tiny
 import torch
 
 from mipmap_plugin.adaptation.snapshot import Snapshot
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 
 class Shared:
@@ -63,3 +66,13 @@ def test_shared_parameters_keep_their_leaves_whatever_the_rows():
         taken.put_into(model)
         assert model.network["weight"] is weight and weight.tolist() == [2.0, 2.0]
         assert torch.equal(model.rows["means"], taken.rows["means"])
+
+
+@pytest.mark.parametrize("rows_changed", [True, False])
+def test_columns_of_a_file_stay_with_the_rows_that_they_belong_to(rows_changed):
+    began = VanillaModel(tiny.model(5).parameters(), origin=Origin(extras={"confidence": np.arange(5, dtype=np.float32)}))
+    taken = Snapshot.of(tiny.model(5, seed=1), rows_changed)
+    held = taken.over(began)
+    assert all(torch.equal(tensor, taken.rows[name]) for name, tensor in held.parameters().items())
+    assert ("confidence" in held.extras) != rows_changed
+    assert "confidence" in began.extras and not torch.equal(began.parameters()["means"], taken.rows["means"])

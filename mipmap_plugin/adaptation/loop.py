@@ -159,7 +159,7 @@ def _check(run: Run, task: Task, config: AdaptConfig) -> None:
         take_back(run.student, run.optimizer, steering.best)
         run.gradients = None if run.gradients is None else density.ScreenGradients.of(run.student.parameters()["means"], config)
     else:
-        steering.keep(found, run.step, run.student)
+        steering.keep(found, run.step, run.student, run.rows_changed)
     mean = float(run.square_error) / max(1, steps)  # here a GPU is waited for, so that the clock counts its work
     facts = dict(psnr_db=decibel(mean) if steps else None, validation_db=steering.best_db if harmed else found, taken_back=harmed)
     run.curve.append(CurvePoint(step=run.step, seconds=run.watch.read(), gaussians=len(run.student.parameters()["means"]), **facts))

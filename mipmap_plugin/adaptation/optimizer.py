@@ -45,13 +45,17 @@ def take_back(model: SplatModel, optimizer: torch.optim.Adam, snapshot: Snapshot
     if len(model.parameters()["means"]) != len(snapshot.rows["means"]):
         put_back(model, optimizer, snapshot.rows)
     snapshot.put_into(model)
-    optimizer.state.clear()  # moments at 0 whose steps went on being counted would make the first step three times too long
+    optimizer.state.clear()
 
 
 def put_back(model: SplatModel, optimizer: torch.optim.Adam, before: Mapping[str, Tensor]) -> None:
-    """Let the model hold the parameters that it had `before`; their moments begin at 0."""
-    rows = len(before["means"])
-    change_rows(model, optimizer, lambda name, _: before[name], lambda old: old.new_zeros(rows, *old.shape[1:]))
+    """Let the model hold the parameters that it had `before`; for them Adam begins anew.
+
+    Moments at 0 whose steps went on being counted would make the first step three times too long.
+    """
+    change_rows(model, optimizer, lambda name, _: before[name], torch.zeros_like)
+    for tensor in model.parameters().values():
+        optimizer.state.pop(tensor, None)
 
 
 def change_rows(

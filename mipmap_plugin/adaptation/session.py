@@ -120,21 +120,21 @@ class Session:
             warm(self.backend, self.base.gaussians(self.views[0]), (self.trained, self.effects), gradients=self.config.steps > 0)
         as_it_is = self._to_be_shown(self._given)
         student, start = Start(self).best()
-        states = {AS_IT_IS: as_it_is, f"the start, {start}": student.copy()}
+        initial = student.copy()
+        states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps"
         self.seconds["total"] = time.perf_counter() - began
         if self.config.steps:
             run, ended_by = self._optimize(student, resume, observe)
-            curve, states = run.curve, states | self._reached(run)
+            curve, states = run.curve, states | self._reached(run, initial)
         return self._returned(states, curve, ended_by)
 
-    def _reached(self, run: Run) -> dict[str, SplatModel]:
-        """The best state of a run and its last, where these are others than the start and than each other."""
+    def _reached(self, run: Run, initial: SplatModel) -> dict[str, SplatModel]:
+        """The best state of a run and its last, where these are others than the start, the `initial` model, and than each other."""
         step, states = run.steering.best_step, {}
         if 0 < step < run.step:
-            states[f"the state after step {step}"] = best = self.fresh()
-            run.steering.best.put_into(best)
+            states[f"the state after step {step}"] = run.steering.best.over(initial)
         if not run.curve[-1].taken_back:  # else it is the best
             states["the last state"] = run.student
         return states

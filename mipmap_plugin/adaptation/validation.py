@@ -131,6 +131,6 @@ class Steering:
     def take_back(self, boldness: float) -> None:
         self.ceiling = GENTLER * boldness
 
-    def keep(self, found: float, step: int, student: SplatModel) -> None:
+    def keep(self, found: float, step: int, student: SplatModel, rows_changed: bool = False) -> None:
         if found >= self.best_db - HARDLY:
-            self.best_db, self.best_step, self.best = max(found, self.best_db), step, Snapshot.of(student)
+            self.best_db, self.best_step, self.best = max(found, self.best_db), step, Snapshot.of(student, rows_changed)

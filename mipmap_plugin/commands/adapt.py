@@ -68,7 +68,7 @@ def adapt(
     for (each, name), target in zip(wanted, targets, strict=True):
         config = make_config(recipe, each, seed=seed, **settings)
         wrapped.target(name)
-        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0)
+        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
     real = None if images is None else load_scene(images)
     settings |= dict(recipe=recipe, seed=seed, images=real)
     reports = []

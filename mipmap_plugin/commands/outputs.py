@@ -6,15 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.models.exchange import WRITTEN
+from mipmap_plugin.models.exchange import READ_ONLY, WRITTEN
 
 
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:
-    """Beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark, or `output`, which is a folder for all where there are several."""
+    """Beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark, or `output`, which is a folder for all where there are several.
+
+    What came in an exchange format that is read only goes out as a PLY.
+    """
     checkpoint_name = checkpoint.resolve().name
-    known = (*WRITTEN, ".ply") if checkpoint.is_file() or checkpoint.suffix == ".ply" else ()
+    known = (*WRITTEN, ".ply", *READ_ONLY) if checkpoint.is_file() or checkpoint.suffix == ".ply" else ()
     suffix = next((ending for ending in known if checkpoint_name.lower().endswith(ending)), "")
-    name = f"{checkpoint_name[: len(checkpoint_name) - len(suffix)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{suffix}"
+    written = ".ply" if suffix in READ_ONLY else suffix
+    name = f"{checkpoint_name[: len(checkpoint_name) - len(suffix)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
     if output is None:
         return checkpoint.resolve().parent / name
     return output / name if several else output

@@ -29,6 +29,7 @@ EXCHANGE = {
 
 # What it writes of these.
 WRITTEN = (".spz", ".sog", ".compressed.ply")
+READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
 TOOL = "splat-transform"
 INSTALL = "npm install -g @playcanvas/splat-transform"
@@ -40,6 +41,27 @@ LONGEST = 1200
 def is_written(path: Path) -> bool:
     """Whether a path's ending asks for an exchange format."""
     return path.name.lower().endswith(WRITTEN)
+
+
+def refuse_exchange(path: Path, trained: TrainedScale) -> list[str]:
+    """The command of splat-transform, if it can write `path`, whose ending asks for an exchange format, from splats `trained` so.
+
+    Raises SettingsError where it is not installed, or splats need the filter of their training.
+    """
+    if trained.keeps_filter:
+        own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
+        raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
+    tool = _tool()
+    if tool is None:
+        raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}; or give a .ply")
+    return tool
+
+
+def refuse_as_folder(path: Path) -> None:
+    """Raise SettingsError for the name of a folder that ends as files of an exchange format do."""
+    for name, ending in EXCHANGE.values():
+        if path.name.lower().endswith(ending):
+            raise SettingsError(f"{path}: this model is not written as {name}; give a .ply, or the path of a folder")
 
 
 @contextmanager
@@ -63,14 +85,9 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
 def write_exchange(path: Path, write: Callable[[Path], Any], trained: TrainedScale, *, overwrite: bool) -> Path:
     """Turn the PLY that `write` writes into the exchange format that the ending of `path` asks for, atomically; return `path`.
 
-    Raises SettingsError where splat-transform is not installed, or splats need the filter of their training; OutputExists, OutputError.
+    Raises SettingsError (`refuse_exchange`), OutputExists, OutputError.
     """
-    if trained.keeps_filter:
-        own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
-        raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
-    tool = _tool()
-    if tool is None:
-        raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}; or give a .ply")
+    tool = refuse_exchange(path, trained)
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder, new_file(path, overwrite) as temporary:
         ending = next(each for each in WRITTEN if path.name.lower().endswith(each))
         plain, made = Path(folder, "plain.ply"), Path(folder, f"made{ending}")

@@ -16,6 +16,7 @@ from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.detect import detect_as
+from mipmap_plugin.models.exchange import is_written
 from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.places import network_of
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
@@ -107,8 +108,9 @@ class MovingModel:
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """What `save` would refuse about `path`, before anything is done for it. Raises SettingsError, OutputExists, OutputError."""
-        if path.suffix.lower() == ".ply":
-            raise SettingsError(f"{path}: a PLY has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}")
+        if path.suffix.lower() == ".ply" or is_written(path):
+            told = f"has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}"
+            raise SettingsError(f"{path}: {'a PLY' if path.suffix.lower() == '.ply' else 'this format'} {told}")
         self.canonical.refuse_output(path, overwrite=overwrite)
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:

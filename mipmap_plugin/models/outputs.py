@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import refuse_output, refuse_to_lose
+from mipmap_plugin.models.exchange import refuse_as_folder
 
 # Where the projects that are read keep the parts of a checkpoint, in their folders.
 PARTS = ("point_cloud", "deform", "ckpts", "nerfstudio_models")
@@ -33,9 +34,13 @@ def parts_of(source: Path | None, folder: Path | None) -> list[Path]:
 
 
 def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path | None, holds: str | None) -> None:
-    """Raise OutputExists for a path that a model of that checkpoint may not be saved to; `holds` names what is in a folder, None: a file."""
+    """Raise OutputExists for a path that a model of that checkpoint may not be saved to; `holds` names what is in a folder, None: a file.
+
+    Raises SettingsError for a folder with the ending of a file.
+    """
     refuse_output(path, overwrite, parts_of(source, folder), is_file=holds is None)
     if holds is not None:
+        refuse_as_folder(path)
         refuse_to_lose(path, source if folder is None else folder, holds)
 
 

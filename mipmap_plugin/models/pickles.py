@@ -8,8 +8,9 @@ import zipfile
 from pathlib import Path
 from typing import IO
 
-# Bytes of instructions. The pickles of all checkpoints that are read have a few kB, the state dict of a large network some hundred.
-MAX_PICKLE = 16 * 1024 * 1024
+# Bytes of instructions. The pickles of all checkpoints that are read have a few kB, the state dict of a large network some hundred. So many
+# take 15 seconds at most.
+MAX_PICKLE = 8 * 1024 * 1024
 
 # How many times the bytes on disk the numbers of a file may take that somebody has packed: trained weights lose a tenth by it.
 MOST_PACKED = 2

@@ -59,8 +59,13 @@ def load_torch(path: Path) -> Any:
             raise ValueError("its tensors claim more numbers than the file holds")
         return content
     except Exception as error:  # a damaged or hostile pickle may fail in any way
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:160]
-        raise CheckpointError(f"{path} is damaged, or holds more than plain tensors and is not executed; save it again ({reason})") from error
+        raise CheckpointError(f"{path} is damaged, or holds more than plain tensors and is not executed; save it again ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    """The first line of what went wrong, without torch's advice to its users, which comes before and behind."""
+    text = str(error).rpartition("WeightsUnpickler error:")[2].strip()
+    return (text.splitlines() or [type(error).__name__])[0].partition(". Please use")[0][:160]
 
 
 def _allowing_scalars() -> AbstractContextManager[None]:

@@ -19,7 +19,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters, unit_quaternions
 from mipmap_plugin.models.detect import Checkpoint, detect_as
-from mipmap_plugin.models.exchange import is_written, write_exchange
+from mipmap_plugin.models.exchange import is_written, refuse_exchange, write_exchange
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Host, Taken
@@ -188,7 +188,9 @@ class VanillaModel:
         return write_folder(path, self.folder, cfg_args, self._origin.iteration, overwrite, write)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
-        """What `save` would refuse about `path`, before anything is done for it. Raises OutputExists, OutputError."""
+        """What `save` would refuse about `path`, before anything is done for it. Raises OutputExists, OutputError, SettingsError."""
+        if is_written(path):
+            refuse_exchange(path, self.trained)
         a_file = path.suffix.lower() == ".ply" or is_written(path)
         host = None if a_file else self._origin.host
         holds = host.holds(path) if host else None if a_file else "point_cloud"

@@ -269,3 +269,10 @@ def test_a_pipe_in_the_place_of_a_part_of_a_checkpoint_ends_in_one_sentence(tmp_
                 load_model(path)
             except (CheckpointError, SettingsError) as error:
                 assert "\n" not in str(error)
+
+
+def test_the_reason_is_not_cut_off_in_the_advice_of_another_library(tmp_path):
+    """Torch says for a page how to execute the file all the same."""
+    path = torch_file(tmp_path / "a.pth", b"(S'splats'\nI1\ntd.", {})
+    with pytest.raises(CheckpointError, match=r"save it again \(Unsupported operand \d+\)$"):
+        load_torch(path)

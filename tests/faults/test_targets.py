@@ -112,6 +112,10 @@ def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, monk
     (full / "precious").write_text("")
     words = ["--scale", "1/2", *INSTANT, "--overwrite", "--output"]
     assert "a PLY has no room for the network" in refused("adapt", moving, *words, tmp_path / "new.ply")
+    assert "this format has no room for the network" in refused("adapt", moving, *words, tmp_path / "new.spz")
+    assert "is not written as SPZ" in refused("adapt", anchors, *words, tmp_path / "new.spz")
+    assert "is not written as SPLAT" in refused("adapt", base, *words, tmp_path / "new.splat")
+    assert "is the root of a disk" in refused("adapt", base, *words, "/")
     assert "is a folder with other things in it" in refused("adapt", moving, *words, full)
     assert "is a folder, which no file replaces" in refused("adapt", base, *words[:-2], "--overwrite", "--output", _named(full, "full.ply"))
     splats = anchors / "point_cloud/iteration_30000/point_cloud.ply"
@@ -119,6 +123,23 @@ def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, monk
     assert "holds other networks" in refused("adapt", splats, "--scale", "1/2", "--backend", "reference", "--output", beside)
     monkeypatch.setattr(files.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(100, 90, 10))
     assert "its disk has 10 bytes free, and the base takes" in refused("adapt", base, *words, tmp_path / "new.ply")
+
+
+def test_a_format_that_nothing_here_writes_is_refused_before_any_work(tmp_path, refused, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+    monkeypatch.setenv("PATH", "")
+    base = tiny.ply(tmp_path / "base.ply")
+    assert "run: npm install" in refused("adapt", base, "--scale", "1/2", "--output", tmp_path / "new.spz", *INSTANT)
+
+
+@pytest.mark.parametrize("output", [".", ""])
+def test_the_working_folder_is_a_folder_like_others(tmp_path, refused, monkeypatch, output):
+    base = tiny.ply(tmp_path / "base.ply")
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert "holds the base checkpoint itself" in refused("adapt", base, "--scale", "1/2", "--output", output, "--overwrite", *INSTANT)
+    monkeypatch.chdir(tmp_path / "here")
+    assert "pass --overwrite" in refused("adapt", base, "--scale", "1/2", "--output", output, *INSTANT)
 
 
 def _named(path: Path, name: str) -> Path:

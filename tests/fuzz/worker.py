@@ -34,7 +34,8 @@ from mipmap_plugin.errors import MipmapPluginError
 
 COMMANDS = "command line"  # beside the names of the samples
 SPARE = 1 << 30  # bytes of address space beyond what the imports took
-SECONDS = 20  # for one file of a few kB, or one command on such files
+SECONDS = 20  # of work, for one file of a few kB, or one command on such files
+PATIENCE = 10  # times as long may it take on a machine that is busy with other things, or wait for what never comes
 
 
 class TooSlow(BaseException):
@@ -57,8 +58,9 @@ def damage(sample: Sample, file: Path, rng: random.Random, canary: Path) -> None
 
 def outcome(job: Callable[[], str]) -> str:
     """How it ended: what `job` returns, "refused: ...", or "fault: ..."."""
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
-    faulthandler.dump_traceback_later(10 * SECONDS, exit=True)  # compiled code does not hear the alarm
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE * SECONDS)
+    faulthandler.dump_traceback_later(2 * PATIENCE * SECONDS, exit=True)  # compiled code does not hear the alarms
     try:
         return job()
     except MipmapPluginError as error:
@@ -67,6 +69,7 @@ def outcome(job: Callable[[], str]) -> str:
         where = [f"{Path(frame.filename).name}:{frame.lineno}" for frame in traceback.extract_tb(error.__traceback__)[-6:]]
         return f"fault: {type(error).__name__}: {str(error)[:200]} at {' < '.join(reversed(where))}"
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
         faulthandler.cancel_dump_traceback_later()
 
@@ -97,7 +100,19 @@ def precious(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
+def compile_kernels(folder: Path) -> None:
+    """Run a sound command, which compiles what a machine keeps from then on: that takes longer than any file or command may."""
+    here, work = Path.cwd(), folder / "compiled"
+    work.mkdir()
+    words.prepare(work)
+    os.chdir(work)
+    commanded(words.SOUND[0].split())
+    os.chdir(here)
+    shutil.rmtree(work)
+
+
 def run_commands(folder: Path, first: int, last: int) -> None:
+    compile_kernels(folder)
     here = Path.cwd()
     for seed in range(first - 1, last):
         chosen = words.words(random.Random(f"{COMMANDS} {seed}")) if seed >= first else words.SOUND[0].split()
@@ -125,6 +140,7 @@ def address_space() -> int:
 
 def main(folder: Path, first: int, last: int, names: list[str]) -> None:
     torch.set_num_threads(1)
+    signal.signal(signal.SIGPROF, ring)
     signal.signal(signal.SIGALRM, ring)
     canary = folder / "executed"
     sound = {name: SAMPLES[name].make(folder / "sound" / name) for name in names if name != COMMANDS}
