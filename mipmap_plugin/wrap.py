@@ -33,7 +33,7 @@ from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import REPORT, parts_of
 from mipmap_plugin.scenes import Scene, model_cameras
-from mipmap_plugin.viewers import find_viewer
+from mipmap_plugin.viewers import find_viewer, viewers_for
 
 
 class Wrapped:
@@ -128,7 +128,8 @@ class Wrapped:
     ) -> Adapted:
         """A new model for `scale` (target focal length in px over base focal length in px); the base stays as it is.
 
-        `viewer`: what the file is to be opened in (`viewers`); by default what draws it as its training did, but without compensation.
+        `viewer`: what the file is to be opened in (`viewers`), or "portable" for all that are built in at once; by default what draws it as its
+        training did, but without compensation.
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override the recipe's, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` sees the model before
@@ -145,13 +146,14 @@ class Wrapped:
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = real.cameras if real else self.cameras
-        target = self.target(viewer)
-        needs = replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings)
-        backend, why = choose_backend(self._backend, replace(needs, gradients=config.steps > 0 or config.merge_to < 1))
+        targets = self.targets(viewer)
+        needs = [replace(self._needs, gradients=True, screen_filter=each.screen_filter, settings=each.settings) for each in targets.values()]
+        differentiates = config.steps > 0 or config.merge_to < 1
+        backend, why = choose_backend(self._backend, *(replace(each, gradients=differentiates) for each in needs))
         if config.steps:
             largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
-        base = Base(self.model, self.effects(), target, viewer, backend, why, not backend.lacking(needs))
+        base = Base(self.model, self.effects(), targets, viewer, backend, why, not any(backend.lacking(each) for each in needs))
         return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True) -> None:
@@ -173,6 +175,10 @@ class Wrapped:
                 raise SettingsError(f"{self.model.family}: its files are opened by its own project alone; leave the viewer {viewer} out")
             return self.effects(viewer=viewer)
         return self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)
+
+    def targets(self, viewer: str | None) -> dict[str, Effects]:
+        """How each viewer that a file for `viewer` is for renders it; several where that is `portable`. Raises what `target` raises."""
+        return {"": self.target(None)} if viewer is None else {each: self.target(each) for each in viewers_for(viewer)}
 
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit where it came without any."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -40,12 +41,12 @@ def get_backend(name: str) -> Backend:
     return backend
 
 
-def survey(needs: Needs) -> dict[str, list[str]]:
-    """Every known backend and why it cannot serve `needs`; an empty list where it can."""
+def survey(*needs: Needs) -> dict[str, list[str]]:
+    """Every known backend and why it cannot serve all of `needs`; an empty list where it can."""
     reasons = {}
     for name in BACKENDS.names():
         try:
-            reasons[name] = get_backend(name).lacking(needs)
+            reasons[name] = _lacking(get_backend(name), needs)
         except PluginError as error:
             reasons[name] = [str(error)]
     return reasons
@@ -63,24 +64,28 @@ def device_for(name: str) -> str:
     return "cuda" if backend.lacking(replace(usual, device="cpu")) and not backend.lacking(usual) else "cpu"
 
 
-def choose_backend(name: str, needs: Needs) -> tuple[Backend, str]:
-    """The backend for `needs` and why it was taken. `"auto"`: the fastest that lacks nothing.
+def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
+    """The backend for all of `needs` and why it was taken. `"auto"`: the fastest that lacks nothing.
 
     Raises BackendUnavailable with every reason when there is none.
     """
     if name != "auto":
         backend = get_backend(name)
-        reasons = backend.lacking(needs)
+        reasons = _lacking(backend, needs)
         if reasons:
             raise BackendUnavailable(f"backend {name!r} cannot do this: {'; '.join(reasons)}")
         return backend, f"{name}: asked for{_noted(backend)}"
-    reasons_of = survey(needs)
+    reasons_of = survey(*needs)
     able = [get_backend(name) for name, reasons in reasons_of.items() if not reasons]
     if not able:
         raise BackendUnavailable("no backend can do this: " + " | ".join(f"{n}: {'; '.join(r)}" for n, r in reasons_of.items()))
     best = max(able, key=lambda backend: backend.speed)
     faster_not = [f"{n} not, because {r[0]}" for n, r in reasons_of.items() if r]
     return best, f"{best.name}: the fastest that lacks nothing{_noted(best)}" + "".join(f"; {reason}" for reason in faster_not)
+
+
+def _lacking(backend: Backend, needs: Sequence[Needs]) -> list[str]:
+    return list(dict.fromkeys(reason for each in needs for reason in backend.lacking(each)))
 
 
 def note_of(name: str) -> str:
