@@ -13,6 +13,7 @@ import torch
 from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import Adapted, Base, Observer, Session, shown
+from mipmap_plugin.adaptation.several import FEWER
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend, device_for
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
@@ -142,11 +143,12 @@ class Wrapped:
             raise SettingsError(f"{self.model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
         if images is not None and exposures_of(self.model).changed:
             raise SettingsError("the images were exposed differently, which adapting to them does not know (exposure.json); leave them out")
-        config = make_config(recipe, scale, **settings)
+        config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
+        if len(targets) > 1 and "merge_to" not in settings:
+            config = config.model_copy(update={"merge_to": config.merge_to * FEWER if config.merge_to < 1 else 1.0})
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = real.cameras if real else self.cameras
-        targets = self.targets(viewer)
         needs = [replace(self._needs, gradients=True, screen_filter=each.screen_filter, settings=each.settings) for each in targets.values()]
         differentiates = config.steps > 0 or config.merge_to < 1
         backend, why = choose_backend(self._backend, *(replace(each, gradients=differentiates) for each in needs))

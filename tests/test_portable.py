@@ -11,6 +11,7 @@ import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
 from mipmap_plugin.adaptation.loop import Task
+from mipmap_plugin.adaptation.several import FEWER, extremes, middle
 from mipmap_plugin.adaptation.validation import Validation
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
@@ -69,6 +70,24 @@ def test_the_command_does_not_draw_as_several(tmp_path, capsys):
 def test_files_of_a_family_that_keeps_its_filter_are_not_portable():
     with pytest.raises(SettingsError, match="its files are opened by its own project alone"):
         wrapped(keeps_filter=True).adapt(1 / 4, viewer="portable")
+
+
+def test_the_extremes_speak_for_all():
+    every = {name: find_viewer(name).effects(Effects(3)) for name in viewers_for("portable")}
+    assert list(extremes(every)) == ["classic", "antialiased", "playcanvas-webgpu", "gaussian-splats-3d", "antimatter15"]
+    assert middle(every) is every["playcanvas"]
+
+
+@pytest.mark.parametrize("name", ["classic", "spark", "mip"])
+def test_one_viewer_speaks_for_itself(name):
+    alone = {name: find_viewer(name).effects(Effects(3))}
+    assert extremes(alone) == alone and middle(alone) is alone[name]
+
+
+def test_a_file_for_several_has_fewer_splats():
+    for viewer, share in (("spark", 0.8 / 4), ("portable", 0.8 / 4 * FEWER)):
+        assert wrapped().adapt(1 / 4, viewer=viewer, steps=1, extra_views=1).report.settings.merge_to == pytest.approx(share)
+    assert wrapped().adapt(1 / 4, viewer="portable", steps=1, extra_views=1, merge_to=0.5).report.settings.merge_to == 0.5
 
 
 # Turns, and the judgement
@@ -131,7 +150,7 @@ def test_the_report_has_each_viewer_and_the_file_says_what_it_is(tmp_path):
     adapted = wrapped().adapt(1 / 4, viewer="portable", **BRIEF)
     assert tuple(adapted.report.viewers) == tuple(adapted.viewers) == viewers_for("portable")
     returned = next(name for name in adapted.report.validation if adapted.report.returned.startswith(name))
-    assert min(adapted.report.viewers.values()) == pytest.approx(adapted.report.validation[returned], abs=1e-6)
+    assert min(adapted.report.viewers[name] for name in extremes(adapted.viewers)) == pytest.approx(adapted.report.validation[returned], abs=1e-6)
     assert {effect.name: effect.on for effect in adapted.report.effects}["contribution cull"]  # of one of them
     assert adapted.effects == Effects(1)  # classic
     comments = read_ply(adapted.save(tmp_path / "new.ply")).comments

@@ -33,7 +33,7 @@ class Report(BaseModel):
     ended_by: str
     returned: str  # which of the run's states the file holds, and why where it is not the last
     validation: dict[str, float]  # dB of each state on views that nothing was adapted to and that did not steer the run
-    viewers: dict[str, float] = {}  # where the file is for several: dB in each, on the same views; `validation` has the least of them
+    viewers: dict[str, float] = {}  # where the file is for several: dB in each, on the same views; `validation` is of the worst
     peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without one
     curve: list[CurvePoint]
     versions: dict[str, str]

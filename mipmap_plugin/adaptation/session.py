@@ -22,6 +22,7 @@ from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
 from mipmap_plugin.adaptation.resume import Keeper
+from mipmap_plugin.adaptation.several import extremes, middle
 from mipmap_plugin.adaptation.start import Start, warm
 from mipmap_plugin.adaptation.state_file import StateFile
 from mipmap_plugin.adaptation.validation import HARM, WINDOW, Validation, hold_back
@@ -92,6 +93,7 @@ class Session:
     def __init__(self, base: Base, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
         self.base, self.backend, self.why, self.trained, self.targets = base.model, base.backend, base.why, base.effects, base.targets
         self.differentiates, self.effects = base.differentiates, next(iter(self.targets.values()))
+        self.extremes, self.aim = extremes(self.targets), middle(self.targets)
         self.scale, self.config, self.viewer = scale, config, base.viewer
         self.seconds, self.peak = {"optimization": 0.0}, Peak(self.base.parameters()["means"].device)
         views, self.which = choose_views(cameras, self.base.parameters()["means"], config)
@@ -109,8 +111,8 @@ class Session:
             self.which += f", {len(self.views)} of them upsampled"
         self.state: StateFile | None = None
         asked = PseudoTruth(self.base, self.backend, self.trained, scale, config.model_copy(update=AS_THE_BASE if scale > 1 else {}))
-        renders = [_shows(self.backend, target) for target in self.targets.values()]
-        self.validation = Validation(validation[::2], validation[1::2], scale, asked, renders[0], config.resize, renders[1:])
+        first, *others = [_shows(self.backend, target) for target in self.extremes.values()]
+        self.validation = Validation(validation[::2], validation[1::2], scale, asked, first, config.resize, others)
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         if self.scale == 1 and all(target == self.trained for target in self.targets.values()):
@@ -161,10 +163,10 @@ class Session:
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists, and what ended it."""
         most = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
-        first, *others = [_shows(self.backend, _smooth(target)) for target in self.targets.values()]
+        first, *others = [_shows(self.backend, _smooth(target)) for target in self.extremes.values()]
         task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, most, others)
         keeper = Keeper(resume, self._fingerprint())
-        if not any(target.sh_degree for target in self.targets.values()) and (unused := student.parameters().get("shN")) is not None:
+        if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no color follows the direction: its coefficients stay out of the gradient
         if self.detail is not None:
             with self.phase("upsampling"):
@@ -215,8 +217,11 @@ class Session:
 
     def _in_each(self, model: SplatModel) -> dict[str, float]:
         """dB in each viewer, where the file is for several."""
-        several, of = len(self.targets) > 1, self.validation
-        return dict(zip(self.targets, of.in_each(model, of.choosing), strict=True)) if several else {}
+        if len(self.targets) == 1:
+            return {}
+        first, *others = [_shows(self.backend, target) for target in self.targets.values()]
+        found = replace(self.validation, render=first, others=others).in_each(model, self.validation.choosing)
+        return dict(zip(self.targets, found, strict=True))
 
     def _explained(self) -> list[Effect]:
         """Every effect, on where it is so in any viewer that the file is for."""
