@@ -45,8 +45,7 @@ def adapt(
         scale: Target focal length over base focal length, such as 1/4 or 4. May be given several times.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. Several scales or viewers: a folder for all of them.
         recipe: default; thorough (more steps and views); instant (closed form only); paper (the published code, quirk by quirk).
-        viewer: What the file is for: classic (INRIA, gsplat, nerfstudio; the default), spark, supersplat, ..., or portable, which is all of them
-            at once; several: a file each.
+        viewer: What the file is for: classic (INRIA, gsplat, nerfstudio; the default), spark, ...; portable: all at once; several: a file each.
         views: Which views to adapt to; by default what the recipe says.
         cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         steps: Optimizer steps at most.
