@@ -50,7 +50,8 @@ INTRO = """# What real viewers show
 
 Made by `python benchmarks/viewers.py DATA`: pictures of the viewers themselves, in Chromium with software WebGL and WebGPU and with exact cameras,
 against photographs (protocol P3); dB, mean of 8 test views. *base*: as it is. *classic*: adapted for classic dilation of 0.3 px². *viewer*: adapted
-for the viewer that shows it. *splat-transform*: the base decimated by version 3.7.0 to the count of the classic file, uniformly or adaptively.
+for the viewer that shows it. *portable*: one file for all of them. *splat-transform*: the base decimated by version 3.7.0 to the count of the
+classic file, uniformly or adaptively.
 """
 
 
@@ -94,6 +95,10 @@ def for_viewer(work: Work, viewer: str) -> Path | None:
     return work.adapted(viewer, viewer=viewer)
 
 
+def for_all(work: Work, viewer: str) -> Path | None:
+    return work.adapted("portable", viewer="portable")
+
+
 def decimated(how: str) -> Callable[[Work, str], Path | None]:
     """A rival's file with as many splats as the classic one; none at x1."""
 
@@ -112,6 +117,7 @@ FILES: dict[str, Callable[[Work, str], Path | None]] = {
     "base": as_it_is,
     "classic": for_classic,
     "viewer": for_viewer,
+    "portable": for_all,
     "splat-transform": decimated("decimate"),
     "splat-transform-adaptive": decimated("decimate-adaptive"),
 }

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, replace
 
 from mipmap_plugin.effects import DILATION, FRUSTUM_MARGIN, NEAR_PLANE, USUAL, Effects, Packing, RenderSettings
-from mipmap_plugin.errors import PluginError
+from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.registry import Registry
 
 
@@ -143,8 +143,8 @@ ALIASES = {"supersplat": "playcanvas"}
 VIEWERS = Registry("mipmap_plugin.viewers", {})
 
 
-def register_viewer(name: str, viewer: Viewer | str, *, replace: bool = False) -> None:
-    """Add a viewer under `name`: a record, or `"package.module:RECORD"` that is imported at first use."""
+def register_viewer(name: str, viewer: Viewer | tuple[Viewer, ...] | str, *, replace: bool = False) -> None:
+    """Add a viewer under `name`: a record, or `"package.module:RECORD"` that is imported at first use; or several, that files can be for at once."""
     VIEWERS.add(name, viewer, replace=replace)
 
 
@@ -152,11 +152,20 @@ for _viewer in BUILT_IN:
     register_viewer(_viewer.name, _viewer)
 for _alias, _name in ALIASES.items():
     register_viewer(_alias, VIEWERS.get(_name))
+register_viewer("portable", BUILT_IN)
+
+
+def viewers_for(name: str) -> tuple[str, ...]:
+    """The viewers that a file made for `name` has to be right in: that one, or those that it stands for. Raises SettingsError when unknown."""
+    viewer = VIEWERS.get(name)
+    return tuple(each.name for each in viewer) if isinstance(viewer, tuple) else (name,)
 
 
 def find_viewer(name: str) -> Viewer:
-    """The viewer `name`. Raises SettingsError when unknown, PluginError when it is no record of a viewer."""
+    """The viewer `name`. Raises SettingsError when unknown or several, PluginError when it is no record of a viewer."""
     viewer = VIEWERS.get(name)
+    if isinstance(viewer, tuple):
+        raise SettingsError(f"{name} is not one viewer but several, which draw a file differently; name one: {', '.join(viewers_for(name))}")
     if not isinstance(viewer, Viewer):
         raise PluginError(f"viewer {name!r} is a {type(viewer).__name__}; it has to be a mipmap_plugin.viewers.Viewer")
     return viewer

@@ -13,6 +13,7 @@ import torch
 from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import Adapted, Base, Observer, Session, shown
+from mipmap_plugin.adaptation.several import FEWER
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend, device_for
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
@@ -33,7 +34,7 @@ from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import REPORT, parts_of
 from mipmap_plugin.scenes import Scene, model_cameras
-from mipmap_plugin.viewers import find_viewer
+from mipmap_plugin.viewers import find_viewer, viewers_for
 
 
 class Wrapped:
@@ -128,7 +129,8 @@ class Wrapped:
     ) -> Adapted:
         """A new model for `scale` (target focal length in px over base focal length in px); the base stays as it is.
 
-        `viewer`: what the file is to be opened in (`viewers`); by default what draws it as its training did, but without compensation.
+        `viewer`: what the file is to be opened in (`viewers`), or "portable" for all that are built in at once; by default what draws it as its
+        training did, but without compensation.
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override the recipe's, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` sees the model before
@@ -142,19 +144,21 @@ class Wrapped:
             raise SettingsError(f"{model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adapting to them does not know (exposure.json); leave them out")
-        config = make_config(recipe, scale, **settings)
+        config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
+        if len(targets) > 1 and "merge_to" not in settings:
+            config = config.model_copy(update={"merge_to": config.merge_to * FEWER if config.merge_to < 1 else 1.0})
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = real.cameras if real else self.cameras
-        target = self.target(viewer)
-        needs = replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings)
-        backend, why = choose_backend(self._backend, replace(needs, gradients=config.steps > 0 or config.merge_to < 1), self._needs)
+        needs = [replace(self._needs, gradients=True, screen_filter=each.screen_filter, settings=each.settings) for each in targets.values()]
+        differentiates = config.steps > 0 or config.merge_to < 1
+        backend, why = choose_backend(self._backend, *(replace(each, gradients=differentiates) for each in needs), self._needs)
         if config.steps:
             largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
         read = self._read_by(viewer)
         given = model if read is self.model else read
-        base = Base(model, self.effects(), target, viewer, backend, why, not backend.lacking(needs), given)
+        base = Base(model, self.effects(), targets, viewer, backend, why, not any(backend.lacking(each) for each in needs), given)
         return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
@@ -175,9 +179,13 @@ class Wrapped:
             return self.effects(viewer=viewer)
         return self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)
 
+    def targets(self, viewer: str | None) -> dict[str, Effects]:
+        """How each viewer that a file for `viewer` is for renders it; several where that is `portable`. Raises what `target` raises."""
+        return {"": self.target(None)} if viewer is None else {each: self.target(each) for each in viewers_for(viewer)}
+
     def _read_by(self, viewer: str | None) -> SplatModel:
         """The base as a viewer reads its file."""
-        reads_all = viewer is None or not self.model.traits.filtered or find_viewer(viewer).filter_3d
+        reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(each).filter_3d for each in viewers_for(viewer))
         return self.model if reads_all else cast(Filtered, self.model).bare()
 
     def views(self) -> list[Camera]:

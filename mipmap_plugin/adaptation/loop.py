@@ -44,6 +44,11 @@ class Task:
     validation: Validation
     detail: Callable[[Camera, Tensor], Tensor] | None = None  # what a view's image adds to the loss besides
     most_splats: int = sys.maxsize  # where growing ends
+    others: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats have to be right in
+
+    def drawn(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
+        """What renders the `draw`-th view since the beginning: each viewer takes its turn."""
+        return (self.render, *self.others)[draw % (1 + len(self.others))]
 
     def pixel(self, means: Tensor) -> float:
         """World units: the size of a target pixel at the median of `means` [N, 3]."""
@@ -120,10 +125,10 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     set_rates(run.optimizer, config, now, run.steering.boldness(now, config), still=still(run))
     splats = Activation(run.student, share=len(views) > 1)
     before: Tensor | float = 0.0  # the gradient of the means from the views before this one
-    for view in views:
+    for nth, view in enumerate(views, run.step * config.views_per_step):
         camera = cameras[view]
         target = task.truth(view)  # r(x̂): the frozen base, resized
-        image = task.render(splats(camera), camera)  # x: the student at the new scale
+        image = task.drawn(nth)(splats(camera), camera)  # x: the student at the new scale
         difference = difference_from(target, image, config.resize)
         loss = _loss(difference, config.loss)
         (loss if task.detail is None else loss + task.detail(view, image)).backward()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -32,6 +33,7 @@ class Report(BaseModel):
     ended_by: str
     returned: str  # which of the run's states the file holds, and why where it is not the last
     validation: dict[str, float]  # dB of each state on views that nothing was adapted to and that did not steer the run
+    viewers: dict[str, float] = {}  # where the file is for several: dB in each, on the same views; `validation` is of the worst
     peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without one
     curve: list[CurvePoint]
     versions: dict[str, str]
@@ -56,7 +58,7 @@ class Peak:
         return torch.cuda.max_memory_allocated(self._device) / 2**20 if self._device.type == "cuda" else None
 
 
-def filters(scale: float, config: AdaptConfig, base: Effects, file: Effects) -> str:
+def filters(scale: float, config: AdaptConfig, base: Effects, files: Sequence[Effects]) -> str:
     """Which filters lie between the base's image and what is compared with it, and which ones base and file are drawn with."""
     if not config.steps:
         truth = "none, for no step is taken"
@@ -65,8 +67,8 @@ def filters(scale: float, config: AdaptConfig, base: Effects, file: Effects) -> 
     else:
         truth = config.upsampler if enlarges(config, scale) else f"the base itself, images shrunk by {config.resize}"
         truth += f", and {config.upsampler} fused with it" if config.compare_at == "both" else ""
-    of_base, of_file = (f"{effects.screen_filter} {effects.eps2d:g} px²" for effects in (base, file))
-    return f"pseudo truth {truth}; base {of_base}; file {of_file}"
+    of_base, *of_files = (f"{effects.screen_filter} {effects.eps2d:g} px²" for effects in (base, *files))
+    return f"pseudo truth {truth}; base {of_base}; file {', '.join(dict.fromkeys(of_files))}"
 
 
 def versions() -> dict[str, str]:

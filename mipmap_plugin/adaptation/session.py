@@ -6,9 +6,9 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -22,6 +22,7 @@ from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
 from mipmap_plugin.adaptation.resume import Keeper
+from mipmap_plugin.adaptation.several import extremes, middle
 from mipmap_plugin.adaptation.start import Start, warm
 from mipmap_plugin.adaptation.state_file import StateFile
 from mipmap_plugin.adaptation.validation import HARM, WINDOW, Validation, hold_back
@@ -30,7 +31,7 @@ from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effects, explain
+from mipmap_plugin.effects import Effect, Effects, explain
 from mipmap_plugin.files import together, write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
@@ -54,12 +55,14 @@ class Adapted:
     report: Report
     backend: Backend
     effects: Effects
+    viewers: Mapping[str, Effects] = field(default_factory=dict)  # how each viewer that the file is for renders it
     state: StateFile | None = None  # of the run, which is of use until the model is saved
     views: Sequence[Camera] = ()  # of the base scale, that were adapted to or selected on
 
-    def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False) -> Rendered:
-        """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`."""
-        return shown(self.model, self.backend, camera, replace(self.effects, outputs=tuple(outputs), exposure=exposure))
+    def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
+        """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`. `viewer`: one of `viewers`."""
+        effects = self.effects if viewer is None else self.viewers[viewer]
+        return shown(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
@@ -77,8 +80,8 @@ class Base:
 
     model: SplatModel
     effects: Effects
-    target: Effects  # how the adapted file is rendered
-    viewer: str | None  # that renders it so; None: none in particular
+    targets: Mapping[str, Effects]  # how the adapted file is rendered, by the viewers that it is for; the first of them is the one that it says
+    viewer: str | None  # what it is made for; None: no viewer in particular
     backend: Backend
     why: str  # this backend was taken
     differentiates: bool  # whether it has gradients for what is asked
@@ -89,9 +92,9 @@ class Session:
     """One call of adapt: the pieces, made once, and the order they run in."""
 
     def __init__(self, base: Base, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
-        self.base, self.backend, self.why, self.trained, self.effects = base.model, base.backend, base.why, base.effects, base.target
-        self.differentiates = base.differentiates
-        self._smooth = replace(self.effects, settings=replace(self.effects.settings, packing=None, picture_step=None))
+        self.base, self.backend, self.why, self.trained, self.targets = base.model, base.backend, base.why, base.effects, base.targets
+        self.differentiates, self.effects = base.differentiates, next(iter(self.targets.values()))
+        self.extremes, self.aim = extremes(self.targets), middle(self.targets)
         self.scale, self.config, self.viewer, self._given = scale, config, base.viewer, base.given
         self.seconds, self.peak = {"optimization": 0.0}, Peak(self.base.parameters()["means"].device)
         views, self.which = choose_views(cameras, self.base.parameters()["means"], config)
@@ -109,15 +112,16 @@ class Session:
             self.which += f", {len(self.views)} of them upsampled"
         self.state: StateFile | None = None
         asked = PseudoTruth(self.base, self.backend, self.trained, scale, config.model_copy(update=AS_THE_BASE if scale > 1 else {}))
-        self.validation = Validation(validation[::2], validation[1::2], scale, asked, _shows(self.backend, self.effects), config.resize)
+        first, *others = [_shows(self.backend, target) for target in self.extremes.values()]
+        self.validation = Validation(validation[::2], validation[1::2], scale, asked, first, config.resize, others)
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
-        if self.scale == 1 and self.effects == self.trained:
+        if self.scale == 1 and all(target == self.trained for target in self.targets.values()):
             why = "scale 1, at which the base is right as it is"
-            return Adapted(self.fresh(), self._report(self.fresh(), [], why, AS_IT_IS, {}), self.backend, self.effects)
+            return Adapted(self.fresh(), self._report(self.fresh(), [], why, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         began = time.perf_counter()
         with self.phase("compilation"):
-            warm(self.backend, self.base.gaussians(self.views[0]), (self.trained, self.effects), gradients=self.config.steps > 0)
+            warm(self.backend, self.base.gaussians(self.views[0]), (self.trained, *self.targets.values()), gradients=self.config.steps > 0)
         as_it_is = self._to_be_shown(self._given)
         student, start = Start(self).best()
         initial = student.copy()
@@ -155,14 +159,15 @@ class Session:
             why, found = f", not judged: at this scale one pixel of the base is more than {WINDOW} px", {}
         report = self._report(states[best], curve, ended_by, f"{best}{why}", found)
         seen = [*self.views, *self.validation.steering, *self.validation.choosing]
-        return Adapted(states[best], report, self.backend, self.effects, self.state, seen)
+        return Adapted(states[best], report, self.backend, self.effects, self.targets, self.state, seen)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Algorithm 1 on `student`, or the rest of it where `resume` exists, and what ended it."""
         most = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
-        task = Task(self.views, self.scale, self.truth, self._render, self._white, self.validation, self.detail, most)
+        first, *others = [_shows(self.backend, _smooth(target)) for target in self.extremes.values()]
+        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, most, others)
         keeper = Keeper(resume, self._fingerprint())
-        if self.effects.sh_degree == 0 and (unused := student.parameters().get("shN")) is not None:
+        if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no color follows the direction: its coefficients stay out of the gradient
         if self.detail is not None:
             with self.phase("upsampling"):
@@ -174,7 +179,7 @@ class Session:
         def look(run: Run) -> None:
             keeper.now_and_then(run)
             if observe is not None:
-                observe(run.step, run.watch.seconds, lambda camera: self._render(run.student.gaussians(camera), camera))
+                observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
 
         ended_by = adapt(run, task, self.config, keeper.stop, look)
         self.state = keeper.left()
@@ -203,10 +208,6 @@ class Session:
         with self.phase("validation"):
             return self.validation.steer(model)
 
-    def _render(self, gaussians: Gaussians, camera: Camera) -> Tensor:
-        """What a step sees: without the rounding of a viewer's file and picture, which is noise to it and a third of its time."""
-        return self.backend.render(gaussians, camera, self._smooth).image
-
     @property
     def _white(self) -> bool:
         return self.effects.background == (1.0, 1.0, 1.0)
@@ -215,11 +216,25 @@ class Session:
         """Names what a run depends on, so that a state is never resumed as another run."""
         poses = [[view.width, view.height, view.fx, view.fy, view.time, *view.viewmat.flatten().tolist()] for view in self.views]
         base = self.base.digest or _digest(self.base)
-        facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.trained), asdict(self.effects), poses]
+        targets = [asdict(target) for target in self.targets.values()]
+        facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.trained), targets, poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
+    def _in_each(self, model: SplatModel) -> dict[str, float]:
+        """dB in each viewer, where the file is for several."""
+        if len(self.targets) == 1:
+            return {}
+        first, *others = [_shows(self.backend, target) for target in self.targets.values()]
+        found = replace(self.validation, render=first, others=others).in_each(model, self.validation.choosing)
+        return dict(zip(self.targets, found, strict=True))
+
+    def _explained(self) -> list[Effect]:
+        """Every effect, on where it is so in any viewer that the file is for."""
+        before, of_model = self.base.gaussians(self.views[0]), effects_of(self.base)
+        found = [explain(target, before, of_model, self.config, self.scale) for target in self.targets.values()]
+        return [next((effect for effect in same if effect.on), same[0]) for same in zip(*found, strict=True)]
+
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
-        before = self.base.gaussians(self.views[0])
         return Report(
             scale=self.scale,
             base=self.base.digest or _digest(self.base),
@@ -227,14 +242,15 @@ class Session:
             backend=self.why,
             views=self.which,
             viewer=self.viewer,
-            filters=filters(self.scale, self.config, self.trained, self.effects),
-            effects=list(explain(self.effects, before, effects_of(self.base), self.config, self.scale)),
-            gaussians_before=len(before),
+            filters=filters(self.scale, self.config, self.trained, list(self.targets.values())),
+            effects=self._explained(),
+            gaussians_before=len(self.base.gaussians(self.views[0])),
             gaussians_after=len(student.gaussians(self.views[0])),
             seconds=self.seconds,
             ended_by=ended_by,
             returned=returned,
             validation=validation,
+            viewers=self._in_each(student) if validation else {},
             peak_memory_mib=self.peak.mib(),
             curve=curve,
             versions=versions(),
@@ -259,6 +275,11 @@ def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects,
 def _shows(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
     """What a camera sees. It knows of no session, which would else outlive its run, and hold on to the state's file."""
     return lambda gaussians, camera: backend.render(gaussians, camera, effects).image
+
+
+def _smooth(effects: Effects) -> Effects:
+    """What a step sees: without the rounding of a viewer's file and picture, which is noise to it and a third of its time."""
+    return replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
 
 
 def _rows(model: SplatModel) -> int:

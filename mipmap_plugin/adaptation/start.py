@@ -32,7 +32,7 @@ class Start:
 
     def __init__(self, session: Session) -> None:
         self._of, self._views = session, evenly(session.views, WEIGHED_VIEWS)
-        filters_do_it = needs_nothing(session.scale, session.trained, session.effects)
+        filters_do_it = needs_nothing(session.scale, session.trained, session.aim)
         self._weighs = session.differentiates and session.base.traits.same_for_all_views and session.scale <= 1 and not filters_do_it
 
     @torch.no_grad()
@@ -79,13 +79,13 @@ class Start:
     def _form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         of = self._of
         form = Form(1.0 if self._weighs else AREA_POWER, of.config.crispness)
-        scales, opacities = closed_form(gaussians, of.views, of.scale, of.trained, of.effects, form)
+        scales, opacities = closed_form(gaussians, of.views, of.scale, of.trained, of.aim, form)
         if not self._weighs or weights is None:
             return scales, opacities
         views = [view.zoomed(of.scale) for view in self._views]
 
         def weigh(tried: Tensor) -> Tensor:
-            return light(replace(gaussians, scales=scales, opacities=tried), views, of.backend, of.effects)
+            return light(replace(gaussians, scales=scales, opacities=tried), views, of.backend, of.aim)
 
         return scales, matched(opacities, weights, weigh)
 

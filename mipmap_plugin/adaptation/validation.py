@@ -58,14 +58,22 @@ class Validation:
     truth: Callable[[Camera], Tensor]  # a view of the base scale -> what it should show
     render: Callable[[Gaussians, Camera], Tensor]  # what a camera of the new scale sees
     resize: str  # the filter that brings an image to the truth's size
+    others: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats have to be right in
+
+    def decibels(self, model: SplatModel, views: Sequence[Camera]) -> float:
+        """Of the viewer that shows the model worst."""
+        return min(self.in_each(model, views))
+
+    def in_each(self, model: SplatModel, views: Sequence[Camera]) -> list[float]:
+        """In each viewer the mean PSNR over views, of images as they are displayed; 0 without views."""
+        return [self._decibels(render, model, views) for render in (self.render, *self.others)]
 
     @torch.no_grad()
-    def decibels(self, model: SplatModel, views: Sequence[Camera]) -> float:
-        """PSNR of each view, of an image as it is displayed, and then the mean; 0 without views."""
+    def _decibels(self, render: Callable[[Gaussians, Camera], Tensor], model: SplatModel, views: Sequence[Camera]) -> float:
         total = 0.0
         for view in views:
             camera = view.zoomed(self.scale)
-            image = self.render(model.gaussians(camera), camera).clamp(0, 1)
+            image = render(model.gaussians(camera), camera).clamp(0, 1)
             total += decibel(float(difference_from(self.truth(view), image, self.resize).square().mean()))
         return total / max(1, len(views))
 

@@ -45,7 +45,7 @@ def adapt(
         scale: Target focal length over base focal length, such as 1/4 or 4. May be given several times.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. Several scales or viewers: a folder for all of them.
         recipe: default; thorough (more steps and views); instant (closed form only); paper (the published code, quirk by quirk).
-        viewer: What the file is for: spark, supersplat, ...; several: a file each. By default classic (INRIA, gsplat, nerfstudio) or its own project.
+        viewer: What the file is for: classic (INRIA, gsplat, nerfstudio; the default), spark, ...; portable: all at once; several: a file each.
         views: Which views to adapt to; by default what the recipe says.
         cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
         steps: Optimizer steps at most.
@@ -67,7 +67,7 @@ def adapt(
     targets = [adapted_path(checkpoint, output, *each, several=len(wanted) > 1) for each in wanted]
     for (each, name), target in zip(wanted, targets, strict=True):
         config = make_config(recipe, each, seed=seed, **settings)
-        wrapped.target(name)
+        wrapped.targets(name)
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
     real = None if images is None else load_scene(images)
     settings |= dict(recipe=recipe, seed=seed, images=real)
@@ -110,6 +110,8 @@ def _print(saved: Path, adapted: Adapted) -> None:
     print(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {saved}")
     db = ", ".join(f"{name} {found:.2f}" for name, found in report.validation.items())
     print(f"  holds {report.returned}{f' (dB on views that nothing was adapted to: {db})' if db else ''}")
+    if report.viewers:
+        print(f"  in each viewer: {', '.join(f'{name} {found:.1f}' for name, found in report.viewers.items())} dB")
     if report.viewer is None:
         print(f"  {_made_for(adapted.model)}")
     print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")

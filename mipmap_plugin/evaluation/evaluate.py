@@ -19,6 +19,7 @@ from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, not_exposed, test_views
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.scenes import Scene
+from mipmap_plugin.viewers import viewers_for
 from mipmap_plugin.wrap import Adapted, Wrapped
 
 
@@ -83,8 +84,15 @@ def training_free_rows(
     count = len(model.model.gaussians(model.any_camera()))
     filters = [name for name in FILTERS if name not in without]
     found = rivals(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
-    found += [base_in(viewer, model, scale)] if viewer else []
-    return [judge.row(rival.name, scale, rival.show, gaussians=count) for rival in found]
+    rows = [judge.row(rival.name, scale, rival.show, gaussians=count) for rival in found]
+    shown = [base_in(name, model, scale) for name in viewers_for(viewer)] if viewer else []
+    return rows + worst([judge.row(rival.name, scale, rival.show, gaussians=count) for rival in shown])
+
+
+def worst(rows: Sequence[Row]) -> list[Row]:
+    """Of rows of several viewers the one of least PSNR, which says so; no row without rows."""
+    least = sorted(rows, key=lambda row: row.psnr_db)[:1]
+    return [replace(row, name=f"{row.name}, worst of {len(rows)}") for row in least] if len(rows) > 1 else least
 
 
 def notes(model: Wrapped, scales: Sequence[float], appearance: str = "mean") -> list[str]:
@@ -104,10 +112,12 @@ def _of_appearance(model: SplatModel, appearance: str) -> list[str]:
 
 
 def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:
-    """An adapted model, rendered as the viewer that it was made for renders its file."""
+    """An adapted model, rendered as the viewer that it was made for renders its file; of several as the one that shows it worst."""
     report = adapted.report
     facts = dict(adapt_seconds=report.seconds["total"], gaussians=report.gaussians_after, adapted_on=report.views, ended_by=report.ended_by)
-    return judge.row(name, report.scale, lambda camera: adapted.render(camera.zoomed(report.scale)).image, **facts)
+    names = {each: f"{name} in {each}" if len(adapted.viewers) > 1 else name for each in adapted.viewers}
+    shows = {each: lambda camera, each=each: adapted.render(camera.zoomed(report.scale), viewer=each).image for each in names}
+    return worst([judge.row(names[each], report.scale, show, **facts) for each, show in shows.items()])[0]
 
 
 def evaluate(

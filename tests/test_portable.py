@@ -1,0 +1,190 @@
+"""One file for several viewers at once: each takes its turn, the worst of them judges, and none of them hides behind another."""
+
+import json
+from dataclasses import replace
+from statistics import fmean
+from types import SimpleNamespace
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import cli, register_viewer, wrap_model
+from mipmap_plugin.adaptation.loop import Task
+from mipmap_plugin.adaptation.several import FEWER, extremes, middle
+from mipmap_plugin.adaptation.validation import Validation
+from mipmap_plugin.backends import choose_backend
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import BackendUnavailable, SettingsError
+from mipmap_plugin.evaluation.evaluate import Judge, adapted_row, training_free_rows
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.models.tags import provenance_of
+from mipmap_plugin.viewers import BUILT_IN, VIEWERS, find_viewer, viewers_for
+
+BRIEF = dict(steps=2, extra_views=1, merge_to=1.0, warm_up=0, views_per_step=3, validation_views=2)
+PAIR = ("classic", "spark")
+
+
+@pytest.fixture
+def pair(monkeypatch):
+    """The name of two viewers that disagree."""
+    monkeypatch.setattr(VIEWERS, "_targets", dict(VIEWERS._targets))
+    register_viewer("pair", tuple(find_viewer(name) for name in PAIR))
+    return "pair"
+
+
+def wrapped(**trained):
+    return wrap_model(tiny.model(40, TrainedScale(**trained)), cameras=tiny.cameras(), backend="reference")
+
+
+def colored(*shades):
+    """Renderers of one color each."""
+    return [lambda _, camera, shade=shade: torch.full((*camera.size, 3), shade) for shade in shades]
+
+
+# What a file is for
+
+
+def test_portable_is_every_built_in_viewer_with_the_usual_one_first():
+    assert viewers_for("portable") == tuple(viewer.name for viewer in BUILT_IN)
+    assert viewers_for("portable")[0] == "classic" and viewers_for("spark") == ("spark",)
+
+
+def test_several_viewers_draw_no_picture():
+    with pytest.raises(SettingsError, match=r"portable is not one viewer but several, .*; name one: classic, antialiased, mip"):
+        find_viewer("portable")
+
+
+def test_the_command_does_not_draw_as_several(tmp_path, capsys):
+    words = ["render", tiny.folder(tmp_path / "base"), "--output", tmp_path / "out", "--viewer", "portable"]
+    assert cli.main([str(word) for word in words]) == 2
+    assert "portable is not one viewer but several" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_of_a_family_that_keeps_its_filter_are_not_portable():
+    with pytest.raises(SettingsError, match="its files are opened by its own project alone"):
+        wrapped(keeps_filter=True).adapt(1 / 4, viewer="portable")
+
+
+def test_the_extremes_speak_for_all():
+    every = {name: find_viewer(name).effects(Effects(3)) for name in viewers_for("portable")}
+    assert list(extremes(every)) == ["classic", "antialiased", "playcanvas-webgpu", "gaussian-splats-3d", "antimatter15"]
+    assert middle(every) is every["playcanvas"]
+
+
+@pytest.mark.parametrize("name", ["classic", "spark", "mip"])
+def test_one_viewer_speaks_for_itself(name):
+    alone = {name: find_viewer(name).effects(Effects(3))}
+    assert extremes(alone) == alone and middle(alone) is alone[name]
+
+
+def test_a_file_for_several_has_fewer_splats():
+    for viewer, share in (("spark", 0.8 / 4), ("portable", 0.8 / 4 * FEWER)):
+        assert wrapped().adapt(1 / 4, viewer=viewer, steps=1, extra_views=1).report.settings.merge_to == pytest.approx(share)
+    assert wrapped().adapt(1 / 4, viewer="portable", steps=1, extra_views=1, merge_to=0.5).report.settings.merge_to == 0.5
+
+
+# Turns, and the judgement
+
+
+def test_viewers_take_turns():
+    first, *others = colored(0.0, 0.5, 1.0)
+    task = Task([], 1.0, first, first, False, Validation([], [], 1.0, first, first, "area"), others=others)
+    assert [task.drawn(draw) for draw in range(5)] == [first, *others, first, others[0]]
+
+
+def test_each_viewer_draws_for_the_gradient(monkeypatch, pair):
+    drawn, render = [], ReferenceBackend.render
+
+    def watched(self, gaussians, camera, effects):
+        if torch.is_grad_enabled() and gaussians.means.requires_grad and camera.width > 1:
+            drawn.append((effects.screen_filter, effects.eps2d))
+        return render(self, gaussians, camera, effects)
+
+    model = wrapped()
+    monkeypatch.setattr(ReferenceBackend, "render", watched)
+    model.adapt(1 / 4, viewer=pair, **BRIEF)
+    first, second = ((find_viewer(name).screen_filter, find_viewer(name).eps2d) for name in PAIR)
+    assert drawn == [first, second, first, second, first, second]
+
+
+def test_a_model_is_as_good_as_in_the_viewer_that_shows_it_worst():
+    cameras, shows = tiny.cameras(2), colored(0.4, 0.1, 0.49)
+    judge = Validation(cameras, cameras, 1.0, lambda view: torch.full((*view.size, 3), 0.5), shows[0], "area", shows[1:])
+    model = SimpleNamespace(gaussians=lambda camera: None)
+    assert judge.in_each(model, cameras) == pytest.approx([20.0, 7.9588, 40.0], abs=1e-3)
+    assert judge.steer(model) == pytest.approx(7.9588, abs=1e-3)
+
+
+def test_a_backend_has_to_have_what_each_viewer_asks_for():
+    usual = Needs("cpu", torch.float32, gradients=True, sh_degree=0, screen_filter="classic")
+    soft = replace(usual, screen_filter="soft")
+    assert choose_backend("reference", usual, usual)[0].name == "reference"
+    for several in ((usual, soft), (soft, usual)):
+        with pytest.raises(BackendUnavailable, match="not soft"):
+            choose_backend("reference", *several)
+
+
+# A model and its file
+
+
+def test_a_file_for_two_viewers_is_better_in_its_worst_than_one_for_either(pair):
+    def worst(viewer):
+        adapted = wrapped().adapt(1 / 2, viewer=viewer, steps=40, extra_views=8, merge_to=1.0, views_per_step=2, warm_up=0, validation_views=4)
+        files, found = wrap_model(adapted.model, backend="reference"), []
+        for view in tiny.cameras(2, seed=9):  # that nothing was adapted to
+            truth = wrapped().render(view.zoomed(1 / 2), 1 / 2, "scaled", supersampling=2).image
+            found.append([psnr(files.render(view.zoomed(1 / 2), viewer=name).image, truth) for name in PAIR])
+        return min(map(fmean, zip(*found, strict=True)))
+
+    assert worst(pair) > max(worst(name) for name in PAIR) + 2
+
+
+def test_the_report_has_each_viewer_and_the_file_says_what_it_is(tmp_path):
+    adapted = wrapped().adapt(1 / 4, viewer="portable", **BRIEF)
+    assert tuple(adapted.report.viewers) == tuple(adapted.viewers) == viewers_for("portable")
+    returned = next(name for name in adapted.report.validation if adapted.report.returned.startswith(name))
+    assert min(adapted.report.viewers[name] for name in extremes(adapted.viewers)) == pytest.approx(adapted.report.validation[returned], abs=1e-6)
+    assert {effect.name: effect.on for effect in adapted.report.effects}["contribution cull"]  # of one of them
+    assert adapted.effects == Effects(1)  # classic
+    comments = read_ply(adapted.save(tmp_path / "new.ply")).comments
+    assert provenance_of(comments)["viewer"] == "portable" and "SplatRenderMode: default" in comments
+
+
+def test_a_file_for_one_viewer_has_no_table_of_viewers():
+    adapted = wrapped().adapt(1 / 4, viewer="spark", recipe="instant")
+    assert adapted.report.viewers == {} and tuple(adapted.viewers) == ("spark",)
+
+
+def test_an_adapted_model_is_drawn_by_each_of_its_viewers(pair):
+    adapted, camera = wrapped().adapt(1 / 4, viewer=pair, recipe="instant"), tiny.cameras(1)[0].zoomed(1 / 4)
+    first, second = (adapted.render(camera, viewer=name).image for name in PAIR)
+    assert torch.equal(first, adapted.render(camera).image) and not torch.allclose(first, second)
+
+
+def test_the_command_writes_a_portable_file_beside_another(tmp_path, capsys):
+    base = tiny.folder(tmp_path / "base", tiny.cameras(3))
+    words = ["adapt", base, "--scale", "1/4", "--viewer", "spark", "--viewer", "portable", "--recipe", "instant", "--backend", "reference"]
+    assert cli.main([str(word) for word in words]) == 0
+    out = capsys.readouterr().out
+    assert f"x0.25 in portable: {tmp_path / 'base_x0.25_portable'}" in out
+    [line] = [line for line in out.splitlines() if line.startswith("  in each viewer: classic ")]
+    assert all(f"{viewer.name} " in line for viewer in BUILT_IN)
+    assert json.loads(next((tmp_path / "base_x0.25_portable").rglob("*.adaptation.json")).read_text())["viewer"] == "portable"
+
+
+def test_what_is_evaluated_is_the_viewer_that_shows_it_worst(pair):
+    model, camera = wrapped(), tiny.cameras(1, seed=9)[0]
+    view = SimpleNamespace(camera=camera, truth=lambda scale, protocol: model.render(camera.zoomed(scale), viewer="classic").image)
+    judge = Judge([view], PROTOCOLS["P3"])
+    *_, row = training_free_rows(model, judge, 1 / 4, viewer=pair)
+    assert row.name == "base in spark, worst of 2"
+    adapted = model.adapt(1 / 4, viewer=pair, recipe="instant")
+    assert adapted_row("instant", adapted, judge).name in {f"instant in {name}, worst of 2" for name in PAIR}
+    assert adapted_row("instant", model.adapt(1 / 4, viewer="spark", recipe="instant"), judge).name == "instant"
