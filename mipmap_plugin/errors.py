@@ -1,8 +1,16 @@
 """One exception tree: every error a user can cause is a `MipmapPluginError` whose text says what, where and what to do."""
 
 
+# Letters of a sentence at most. A damaged file that is quoted may have megabytes in place of a name or a number.
+LONGEST = 1500
+
+
 class MipmapPluginError(Exception):
-    """Base of all errors that the command line turns into one sentence and exit code 2."""
+    """Base of all errors that the command line turns into one sentence and exit code 2. Of a long one, its beginning and its end are told."""
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        return text if len(text) <= LONGEST else f"{text[: 2 * LONGEST // 3]} ... {text[-LONGEST // 4 :]}"
 
 
 class CheckpointError(MipmapPluginError, ValueError):

@@ -276,3 +276,10 @@ def test_the_reason_is_not_cut_off_in_the_advice_of_another_library(tmp_path):
     path = torch_file(tmp_path / "a.pth", b"(S'splats'\nI1\ntd.", {})
     with pytest.raises(CheckpointError, match=r"save it again \(Unsupported operand \d+\)$"):
         load_torch(path)
+
+
+def test_what_a_damaged_file_says_at_length_is_not_repeated_at_length(tmp_path):
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement {'a' * 5000} 1\nproperty float x\nend_header\n1\n")
+    with pytest.raises(CheckpointError, match=r"has no vertex element.* \.\.\. .*a'\]$") as caught:
+        load_model(tmp_path / "a.ply")
+    assert len(str(caught.value)) < 2000
