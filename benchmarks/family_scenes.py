@@ -27,9 +27,11 @@ import torch_checkpoints
 from mipmap_plugin import Camera, Effects, load_model
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
 from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.validation import unjudged
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.config import AdaptConfig, LearningRates
+from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import CARRIED, SplatModel
 from mipmap_plugin.models.vanilla import VanillaModel
 
@@ -155,7 +157,11 @@ def trained(world: SplatModel, train: Sequence[Camera], pictures: Pictures) -> S
         seen = student.gaussians(train[0])
     effects = Effects(seen.sh_degree, filtered.screen_filter, filtered.eps2d, filtered.background or (0.0, 0.0, 0.0))
     backend = choose_backend("auto", Needs.of(seen, effects, gradients=True))[0]
-    task = Task(train, 1.0, pictures, lambda gaussians, camera: backend.render(gaussians, camera, effects).image, False)
+
+    def render(gaussians: Gaussians, camera: Camera) -> Tensor:
+        return backend.render(gaussians, camera, effects).image
+
+    task = Task(train, 1.0, pictures, render, False, unjudged(pictures, render))
     run = Run.start(student, task, TRAINING)
     adapt(run, task, TRAINING, lambda run: sys.exit(130))
     return run.student

@@ -15,6 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mipmap_plugin.adaptation.loop import Run, Task, adapt
+from mipmap_plugin.adaptation.validation import unjudged
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.harmonics import C0
@@ -50,8 +51,12 @@ def train(model: VanillaModel, views: list[Camera], truth: dict[Camera, Tensor],
     student = model.copy()
     effects = Effects(DEGREE, background=WHITE)
     backend, _ = choose_backend("auto", Needs.of(student.gaussians(), effects, gradients=True))
+
+    def render(gaussians: Gaussians, camera: Camera) -> Tensor:
+        return backend.render(gaussians, camera, effects).image
+
     # The loop zooms each view by the scale; at scale 1 that is a copy, so truth is looked up by the view itself.
-    task = Task(views, 1.0, truth.__getitem__, lambda m, camera: backend.render(m.gaussians(camera), camera, effects).image, True)
+    task = Task(views, 1.0, truth.__getitem__, render, True, unjudged(truth.__getitem__, render))
     adapt(Run.start(student, task, config), task, config, on_interrupt=lambda run: None)
     return student
 

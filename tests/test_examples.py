@@ -1,5 +1,6 @@
 """What the examples bring, as a package would that is installed beside this one: by entry points alone, in the commands."""
 
+import runpy
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import tiny
 
-from mipmap_plugin import cli, registry
+from mipmap_plugin import cli, load_model, registry
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 POINTS = [
@@ -52,6 +53,12 @@ def test_a_file_for_the_viewer_of_the_example(scene, tmp_path, capsys):
     assert cli.main(["adapt", *scene, "--scale", "1/2", "--steps", "1", "--viewer", "kiosk", "--output", str(tmp_path / "out.ply")]) == 0
     assert "x0.5 in kiosk" in capsys.readouterr().out
     assert b'"viewer": "kiosk"' in (tmp_path / "out.ply").read_bytes()[:8192]
+
+
+def test_the_demo_scene_can_be_trained(tmp_path):
+    train = runpy.run_path(str(EXAMPLES / "train_demo_scene.py"))["main"]
+    train(tmp_path / "demo", size=16, views=7, points=40, splats=30, steps=4)
+    assert len(load_model(tmp_path / "demo")) <= 30
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("register_*.py")), ids=lambda file: file.stem)

@@ -87,6 +87,11 @@ class Validation:
         return [name for name, each in found.items() if each >= best - HARDLY][-1], found
 
 
+def unjudged(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians, Camera], Tensor]) -> Validation:
+    """Validation without a view, for a training, of which every step counts."""
+    return Validation([], [], 1.0, truth, render, "area")
+
+
 def hold_back(
     cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, scale: float, config: AdaptConfig
 ) -> tuple[list[Camera], list[Camera]]:
