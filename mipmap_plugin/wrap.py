@@ -13,7 +13,7 @@ import torch
 from mipmap_plugin.adaptation.photographs import Photographs
 from mipmap_plugin.adaptation.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import Adapted, Base, Observer, Session, shown
-from mipmap_plugin.adaptation.several import FEWER
+from mipmap_plugin.adaptation.several import for_several
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend, device_for
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
@@ -145,8 +145,8 @@ class Wrapped:
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adapting to them does not know (exposure.json); leave them out")
         config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
-        if len(targets) > 1 and "merge_to" not in settings:
-            config = config.model_copy(update={"merge_to": config.merge_to * FEWER if config.merge_to < 1 else 1.0})
+        if len(targets) > 1:
+            config = make_config(recipe, scale, **(for_several(config) | settings))
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = real.cameras if real else self.cameras

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -60,10 +61,6 @@ class Validation:
     resize: str  # the filter that brings an image to the truth's size
     others: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats have to be right in
 
-    def decibels(self, model: SplatModel, views: Sequence[Camera]) -> float:
-        """Of the viewer that shows the model worst."""
-        return min(self.in_each(model, views))
-
     def in_each(self, model: SplatModel, views: Sequence[Camera]) -> list[float]:
         """In each viewer the mean PSNR over views, of images as they are displayed; 0 without views."""
         return [self._decibels(render, model, views) for render in (self.render, *self.others)]
@@ -78,11 +75,13 @@ class Validation:
         return total / max(1, len(views))
 
     def steer(self, model: SplatModel) -> float:
-        return self.decibels(model, self.steering)
+        """Of the mean square over viewers, in which the worst weighs most. The worst alone falls now and then while all come closer, and
+        the mean of their dB rises while it falls."""
+        return decibel(fmean(10 ** (-found / 10) for found in self.in_each(model, self.steering)))
 
     def choose(self, states: dict[str, SplatModel]) -> tuple[str, dict[str, float]]:
-        """The name of the best state, of equals the last, and the dB of each."""
-        found = {name: self.decibels(model, self.choosing) for name, model in states.items()}
+        """The name of the best state, of equals the last, and the dB of each in the viewer that shows it worst."""
+        found = {name: min(self.in_each(model, self.choosing)) for name, model in states.items()}
         best = max(found.values())
         return [name for name, each in found.items() if each >= best - HARDLY][-1], found
 
