@@ -171,17 +171,22 @@ class Wrapped:
             refuse_output(beside, True, parts, is_file=True)
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 
-    def target(self, viewer: str | None) -> Effects:
-        """How the adapted file is rendered. Raises SettingsError for a viewer of splats that no viewer draws."""
-        if viewer is not None:
-            if why := why_no_viewer(self.model):
-                raise SettingsError(f"{self.model.family}: {why}; leave the viewer {viewer} out")
-            return self.effects(viewer=viewer)
-        return self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)
-
     def targets(self, viewer: str | None) -> dict[str, Effects]:
-        """How each viewer that a file for `viewer` is for renders it; several where that is `portable`. Raises what `target` raises."""
-        return {"": self.target(None)} if viewer is None else {each: self.target(each) for each in viewers_for(viewer)}
+        """How each viewer that an adapted file for `viewer` is for renders it; several where that is `portable`, one named "" where it is None.
+
+        Raises SettingsError for a viewer of splats that no viewer draws.
+        """
+        if viewer is None:
+            return {"": self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)}
+        if why := why_no_viewer(self.model):
+            raise SettingsError(f"{self.model.family}: {why}; leave the viewer {viewer} out")
+        return {each: self.effects(viewer=each) for each in viewers_for(viewer)}
+
+    def target(self, viewer: str | None) -> Effects:
+        """How the adapted file is rendered. Raises SettingsError as `targets` does, and for a name that stands for several viewers."""
+        if viewer is not None:
+            find_viewer(viewer)
+        return self.targets(viewer)[viewer or ""]
 
     def _read_by(self, viewer: str | None) -> SplatModel:
         """The base as a viewer reads its file."""

@@ -98,6 +98,11 @@ def test_the_base_is_neither_changed_nor_overwritten(tmp_path):
             made.save(path, overwrite=True)
 
 
+def test_one_file_for_every_viewer(tmp_path):
+    adapted = wrapped(tmp_path).adapt(1 / 2, viewer="portable", **BRIEF)
+    assert load_model(adapted.save(tmp_path / "made.ply")).family == "3dgs"
+
+
 def test_an_exchange_format_is_refused_for_its_own_project_only(tmp_path, monkeypatch):
     monkeypatch.setattr(exchange, "_tool", lambda: ["splat-transform"])
     base = wrapped(tmp_path)

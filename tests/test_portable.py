@@ -69,7 +69,7 @@ def test_the_command_does_not_draw_as_several(tmp_path, capsys):
 
 
 def test_files_of_a_family_that_keeps_its_filter_are_not_portable():
-    with pytest.raises(SettingsError, match="its files are opened by its own project alone"):
+    with pytest.raises(SettingsError, match="its files are for its own project alone; leave the viewer portable out"):
         wrapped(keeps_filter=True).adapt(1 / 4, viewer="portable")
 
 
