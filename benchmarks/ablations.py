@@ -15,12 +15,12 @@ import tyro
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.commands.types import Scale
-from mipmap_plugin.config import recipe as make_config
 from mipmap_plugin.evaluation.evaluate import Judge, adapted_row
 from mipmap_plugin.evaluation.measure import warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.files import new_file
+from mipmap_plugin.recipes import recipe as make_config
 
 OURS = make_config("default", 1 / 4).rates
 

@@ -7,6 +7,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model, register_model
+from mipmap_plugin.recipes import register_recipe
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.viewers import Viewer, register_viewer
 from mipmap_plugin.wrap import Adapted, Wrapped, wrap_model
@@ -23,6 +24,7 @@ __all__ = [
     "load_scene",
     "register_backend",
     "register_model",
+    "register_recipe",
     "register_upsampler",
     "register_viewer",
     "wrap_model",

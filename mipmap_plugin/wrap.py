@@ -19,8 +19,7 @@ from mipmap_plugin.backends import choose_backend, device_for
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.backends.filters import INTEGRALS, USUAL_EPS2D
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.config import AdaptConfig, Recipe
-from mipmap_plugin.config import recipe as make_config
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.files import named, refuse_output, refuse_unwritable
@@ -33,6 +32,7 @@ from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import REPORT, parts_of
+from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene, model_cameras
 from mipmap_plugin.viewers import find_viewer, viewers_for
 
@@ -119,7 +119,7 @@ class Wrapped:
         self,
         scale: float,
         *,
-        recipe: Recipe = "default",
+        recipe: str = "default",
         viewer: str | None = None,
         cameras: Sequence[Camera] | None = None,
         resume: str | Path | None = None,

@@ -9,6 +9,7 @@ import torch
 from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.models.families import FAMILIES
+from mipmap_plugin.recipes import RECIPES
 from mipmap_plugin.viewers import VIEWERS
 
 SHARED = Path(__file__).parents[1].parent / "shared"
@@ -42,5 +43,5 @@ def ctrl_c_is_heard():
 
 @pytest.fixture(autouse=True)
 def nothing_that_is_registered_stays():
-    with BACKENDS.temporarily(), FAMILIES.temporarily(), UPSAMPLERS.temporarily(), VIEWERS.temporarily():
+    with BACKENDS.temporarily(), FAMILIES.temporarily(), UPSAMPLERS.temporarily(), VIEWERS.temporarily(), RECIPES.temporarily():
         yield

@@ -9,8 +9,9 @@ from mipmap_plugin.adaptation.detail import SURE, Detail
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.structure import similarity
 from mipmap_plugin.adaptation.upsamplers import register_upsampler
-from mipmap_plugin.config import AdaptConfig, recipe
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import wrap_model
 
 VIEW = tiny.cameras(1)[0]

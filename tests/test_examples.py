@@ -14,6 +14,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 POINTS = [
     EntryPoint("careful", "register_backend:CarefulBackend", "mipmap_plugin.backends"),
     EntryPoint("npz", "register_family:FAMILY", "mipmap_plugin.models"),
+    EntryPoint("brief", "register_recipe:brief", "mipmap_plugin.recipes"),
     EntryPoint("sharp", "register_upsampler:sharp", "mipmap_plugin.upsamplers"),
     EntryPoint("kiosk", "register_viewer:KIOSK", "mipmap_plugin.viewers"),
 ]
@@ -34,6 +35,7 @@ def scene(tmp_path, monkeypatch):
     [
         ("adapt", ["--scale", "1/2", "--steps", "2", "--viewer", "classic"]),
         ("adapt", ["--scale", "2", "--steps", "1", "--upsampler", "sharp"]),
+        ("adapt", ["--scale", "1/2", "--steps", "1", "--recipe", "brief"]),
         ("render", ["--scale", "1/2"]),
     ],
 )

@@ -14,8 +14,8 @@ from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import register_upsampler
 from mipmap_plugin.adaptation.validation import Validation
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.config import recipe
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 # Every splat that is seen grows at steps 2, 4 and 6, if nothing forbids it.

@@ -9,9 +9,9 @@ from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
-from mipmap_plugin.config import recipe
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import wrap_model
 

@@ -12,10 +12,11 @@ from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.upsamplers import register_upsampler
 from mipmap_plugin.adaptation.views import Order, Rounds, choose_views, evenly, extent
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.config import AdaptConfig, recipe
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.recipes import recipe
 
 TRAINED = Effects(sh_degree=1)
 

@@ -15,10 +15,10 @@ from mipmap_plugin.adaptation.resize import resize
 from mipmap_plugin.adaptation.snapshot import Snapshot
 from mipmap_plugin.adaptation.validation import FIRST, GENTLER, HARDLY, HARM, KEPT_BACK, WINDOW, Steering, Validation, hold_back
 from mipmap_plugin.adaptation.views import choose_views
-from mipmap_plugin.config import recipe
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 MEANS = tiny.gaussians().means

@@ -10,9 +10,9 @@ import tyro
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
-from mipmap_plugin.config import Recipe, ResizeFilter, ViewPolicy
-from mipmap_plugin.config import recipe as make_config
+from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.models.base import SplatModel, why_no_viewer
+from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import Adapted, state_path
 
@@ -21,7 +21,7 @@ def adapt(
     checkpoint: Checkpoint,
     scale: Scales,
     output: Path | None = None,
-    recipe: Recipe = "default",
+    recipe: str = "default",
     viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     views: ViewPolicy | None = None,
     cameras: Path | None = None,

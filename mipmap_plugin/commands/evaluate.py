@@ -10,7 +10,6 @@ import tyro
 
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, each_once
-from mipmap_plugin.config import Recipe
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import refuse_output, refuse_unwritable, write_json
 from mipmap_plugin.models.outputs import parts_of
@@ -21,7 +20,7 @@ def evaluate(
     checkpoint: tyro.conf.Positional[tuple[Path, ...]],
     images: tuple[Path, ...],
     scale: Scales,
-    recipe: tyro.conf.UseAppendAction[tuple[Recipe, ...]] = (),
+    recipe: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     viewer: str | None = None,
     protocol: Literal["P1", "P3", "P4"] = "P3",
     lpips: Literal["alex", "vgg", "vgg-01"] | None = None,

@@ -8,7 +8,6 @@ import tyro
 
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
-from mipmap_plugin.config import Recipe
 from mipmap_plugin.scenes import load_scene
 
 
@@ -17,7 +16,7 @@ def tradeoff(
     scale: Scales,
     output: Path,
     images: Path | None = None,
-    recipe: tyro.conf.UseAppendAction[tuple[Recipe, ...]] = (),
+    recipe: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     viewer: str | None = None,
     steps: tyro.conf.UseAppendAction[tuple[int, ...]] = (),
     backend: tyro.conf.UseAppendAction[tuple[str, ...]] = (),

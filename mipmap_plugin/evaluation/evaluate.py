@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from mipmap_plugin.config import Recipe
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.measure import FILTERS, Show, base_in, rivals, seen_before, warm_up, warm_watch
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, not_exposed, test_views
 from mipmap_plugin.models.base import SplatModel, effects_of
+from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.viewers import viewers_for
 from mipmap_plugin.wrap import Adapted, Wrapped
@@ -124,7 +125,7 @@ def evaluate(
     model: Wrapped,
     scene: Scene,
     scales: Sequence[float],
-    recipes: Sequence[Recipe],
+    recipes: Sequence[str],
     protocol: str,
     perceptual: Perceptual | None = None,
     **settings: Any,
@@ -147,15 +148,15 @@ def evaluate(
         if recipes and (scale != 1 or viewer):
             warm_up(model, scale, model.cameras)
         for name, on in product(recipes if scale != 1 or viewer else [], ("train", "scored")):
-            adapted = model.adapt(scale, recipe=name, **(settings | _views(name, on, judged)))
+            adapted = model.adapt(scale, recipe=name, **(settings | _views(make_config(name, scale), on, judged)))
             rows.append(adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judged, adapted)}", adapted, judge))
     return rows
 
 
-def _views(name: Recipe, on: str, judged: Sequence[TestView]) -> dict[str, Any]:
+def _views(config: AdaptConfig, on: str, judged: Sequence[TestView]) -> dict[str, Any]:
     if on == "scored":
         return {"views": "given", "cameras": [view.camera for view in judged]}
-    return {} if name in ("default", "thorough") else {"views": "train"}
+    return {} if config.steps and config.views != "given" else {"views": "train"}  # without steps, further views say nothing
 
 
 def _unseen(judged: Sequence[TestView], adapted: Adapted) -> str:

@@ -16,7 +16,6 @@ from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.backends.filters import SCREEN_FILTERS
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.config import Recipe
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.measure import BASE, FILTERS, RESIZED, Kind, Rival, Show, base_in, rivals, warm_up, warm_watch
@@ -74,7 +73,7 @@ class Point:
 class Plan:
     """What is tried."""
 
-    recipes: Sequence[Recipe] = ("default",)
+    recipes: Sequence[str] = ("default",)
     steps: Sequence[int | None] = ()  # none: as many as each recipe says
     backends: Sequence[str] = ("auto",)
     supersampling: Sequence[int] = (2, 4, 8)
@@ -150,7 +149,7 @@ def _judged(point: Point, show: Show, yardstick: Yardstick, repeats: int) -> Poi
 
 
 def _run(
-    model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan, recipe: Recipe, steps: int | None, bar: tqdm
+    model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan, recipe: str, steps: int | None, bar: tqdm
 ) -> tuple[list[Point], Adapted]:
     """The points of a recipe on its way and at its end, over all repeats, and the first repeat's model."""
     way: dict[int, list[tuple[float, float]]] = {}  # after so many steps: seconds and dB of each repeat that went so far
@@ -177,7 +176,7 @@ def _run(
     return [*points, _over_repeats(ends)], runs[0]
 
 
-def _name(recipe: Recipe, steps: int | None) -> str:
+def _name(recipe: str, steps: int | None) -> str:
     return recipe if steps is None else f"{recipe}, {steps} steps at most"
 
 

@@ -15,12 +15,12 @@ from tiny import with_bands
 
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation.report import Report
-from mipmap_plugin.config import recipe
 from mipmap_plugin.effects import OF_OTHER_MODELS, Effect, Effects, Packing, RenderSettings, explain
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel, load_mip
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import wrap_model
 
 
