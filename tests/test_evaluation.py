@@ -188,6 +188,14 @@ def test_rows_for_every_scale_and_recipe(model, scene):
     assert table(rows).splitlines()[0].endswith("| ended by |") and "ended by" not in table([zoomed["base"]])
 
 
+def test_what_is_scored_is_the_last_state_and_what_is_held_out_the_best(model, scene, monkeypatch):
+    returned, adapt = [], model.adapt
+    monkeypatch.setattr(model, "adapt", lambda scale, **settings: returned.append(made := adapt(scale, **settings)) or made)
+    evaluate(model, scene, [1 / 4], ["default"], "P3", **BRIEF)
+    held_out, scored = (adapted.report for adapted in returned[-2:])
+    assert (held_out.settings.returns, scored.settings.returns, scored.returned) == ("best", "last", "the last state")
+
+
 def test_an_upsampler_has_a_row_of_its_own(model, scene, monkeypatch):
     gray = {"bicubic": 0.0, "mine": 0.999}
     monkeypatch.setattr(measure, "find_upsampler", lambda name: lambda image, size: image.new_full((*size, 3), gray[name]))

@@ -154,8 +154,8 @@ def evaluate(
 
 
 def _views(config: AdaptConfig, on: str, judged: Sequence[TestView]) -> dict[str, Any]:
-    if on == "scored":
-        return {"views": "given", "cameras": [view.camera for view in judged]}
+    if on == "scored":  # as the paper does, to the last step: what other views show of it does not count
+        return {"views": "given", "cameras": [view.camera for view in judged], "returns": "last"}
     return {} if config.steps and config.views != "given" else {"views": "train"}  # without steps, further views say nothing
 
 
