@@ -392,7 +392,7 @@ def test_a_scale_that_is_no_zoom_is_refused(scale):
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        (dict(recipe="best"), "there is no recipe 'best'; known are default, thorough, paper, instant"),
+        (dict(recipe="best"), "there is no recipe 'best'; known are default, instant, paper, thorough"),
         (dict(stepz=3), "setting stepz: Extra inputs are not permitted"),
         (dict(steps=-1), "setting steps: Input should be greater than or equal to 0"),
         (dict(resize="nearest"), "setting resize: Input should be 'box'"),
