@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from mipmap_plugin import register_model, wrap_model
+from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models import CERTAIN, Family, Files, Match
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
@@ -31,7 +32,9 @@ def recognize(files: Files) -> Match | None:
 
 
 def load(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
-    with np.load(path) as arrays:  # an adapted model is saved as a PLY, which any viewer opens
+    with np.load(path) as arrays:  # an adapted model is saved as a PLY
+        if missing := set(NAMES) - set(arrays.files):
+            raise CheckpointError(f"{path} lacks the arrays {', '.join(sorted(missing))}; export it again")
         return VanillaModel({name: torch.from_numpy(arrays[name]) for name in NAMES}, origin=Origin(source=Path(path)))
 
 

@@ -1,4 +1,4 @@
-"""Name a set of settings of your own: half of the steps of `default`, and colors that depend on the view less, here.
+"""Name a set of settings of your own: half of the steps of `default`, and slower changes of colors that depend on the view, here.
 
     python examples/register_recipe.py output/bicycle 1/4
 
@@ -23,7 +23,7 @@ from mipmap_plugin.recipes import default
 def brief(scale: float, network: bool) -> dict[str, Any]:
     """The settings at a scale, by the names of mipmap_plugin.config.AdaptConfig; `network`: whether one enlarges the base's images."""
     usual = default(scale, network)
-    return {**usual, "steps": usual["steps"] // 2, "rates": usual["rates"].model_copy(update={"shN": 0.001})}
+    return {**usual, "steps": usual["steps"] // 2, "rates": usual["rates"].model_copy(update={"shN": usual["rates"].shN / 4})}
 
 
 if __name__ == "__main__":

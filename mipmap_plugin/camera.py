@@ -1,4 +1,4 @@
-"""Camera: a pinhole view. Pixel centres lie at +0.5, axes are OpenCV's (x right, y down, z forward)."""
+"""Camera: a pinhole view. Pixel centers lie at +0.5, axes are OpenCV's (x right, y down, z forward)."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ DILATION = 0.3
 # two (diff-surfel-rasterization, auxiliary.h).
 SURFEL, LOW_PASS = "surfel", 0.5
 
-# World units: a splat whose centre is nearer than this is not drawn (diff-gaussian-rasterization, auxiliary.h).
+# World units: a splat whose center is nearer than this is not drawn (diff-gaussian-rasterization, auxiliary.h).
 NEAR_PLANE = 0.2
 
 # What every 3DGS rasterizer leaves out (diff-gaussian-rasterization, forward.cu).
@@ -29,7 +29,7 @@ MIN_TRANSMITTANCE = 1e-4  # a pixel this opaque is finished
 # everything behind the splat vanishes.
 MAX_ALPHA = 0.99
 
-# The share of the half field of view by which a centre may lie outside the image before the Jacobian is frozen there;
+# The share of the half field of view by which a center may lie outside the image before the Jacobian is frozen there;
 # further out the affine approximation would blow splats up (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
 FRUSTUM_MARGIN = 0.3
 
@@ -246,7 +246,7 @@ def _view_dependent_color(degree: int, gaussians: Gaussians) -> Effect:
 def _of_adapting(config: AdaptConfig | None, scale: float) -> list[Effect]:
     enlarges, counts = "an enlarged image for each view", "two sums and a norm a splat, for each view of each step"
     if config is None or not config.steps:
-        why = "nothing is optimised"
+        why = "nothing is optimized"
         return [Effect("upsampler", False, why, enlarges), Effect("densification statistics", False, why, counts)]
     grows = "none is cloned or split" if config.densify_gradient is None else f"splats above {config.densify_gradient:g} are cloned or split"
     return [

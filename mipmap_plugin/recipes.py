@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from mipmap_plugin.config import AdaptConfig, LearningRates
 from mipmap_plugin.errors import PluginError, SettingsError
+from mipmap_plugin.limits import check_scale
 from mipmap_plugin.registry import Registry
 
 # The settings, by the names of AdaptConfig, at a scale; and whether a network enlarges the base's images.
@@ -81,13 +82,20 @@ def register_recipe(name: str, target: Recipe | str, *, replace: bool = False) -
 
 
 def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
-    """The settings of a recipe at `scale`, with `overrides`. Raises SettingsError for an unknown name or a value out of range."""
+    """The settings of a recipe at `scale`, with `overrides`.
+
+    Raises SettingsError for an unknown name or a value out of range, PluginError for a stranger's recipe that fails.
+    """
+    check_scale(scale)
     if name not in RECIPES.names():
         raise SettingsError(f"there is no recipe {name!r}; known are {', '.join(RECIPES.names())}")
     found = RECIPES.get(name)
     if not callable(found):
         raise PluginError(f"recipe {name!r} is of type {type(found).__name__}; make it a function (scale, network) -> settings")
-    settings = found(scale, overrides.get("upsampler", "bicubic") not in KERNELS)
+    try:
+        settings = {**found(scale, str(overrides.get("upsampler", "bicubic")) not in KERNELS)}
+    except Exception as error:  # a stranger's code may fail in any way
+        raise PluginError(f"recipe {name!r} gives no settings at x{scale:g}: {type(error).__name__}: {error}") from error
     try:
         return AdaptConfig(**{"recipe": name, **settings, **overrides})
     except ValidationError as error:

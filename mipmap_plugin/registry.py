@@ -45,7 +45,7 @@ class Registry:
         """The object behind `name`. Raises SettingsError for an unknown name, PluginError for a broken target."""
         if name not in self._targets and name not in self._installed():
             raise SettingsError(f"{self.group}: there is no {name!r}; known are {', '.join(self.names())}")
-        target = self._targets.get(name) or self._installed()[name]
+        target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target
 
     def _installed(self) -> dict[str, str]:

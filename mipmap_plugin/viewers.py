@@ -143,8 +143,9 @@ ALIASES = {"supersplat": "playcanvas"}
 VIEWERS = Registry("mipmap_plugin.viewers", {})
 
 
-def register_viewer(name: str, viewer: Viewer | tuple[Viewer, ...] | str, *, replace: bool = False) -> None:
-    """Add a viewer under `name`: a record, or `"package.module:RECORD"` that is imported at first use; or several, that files can be for at once."""
+def register_viewer(name: str, viewer: Viewer | tuple[str, ...] | str, *, replace: bool = False) -> None:
+    """Add a viewer under `name`: a record, or `"package.module:RECORD"` that is imported at first use; or the names of several registered
+    ones, which a file can be for at once."""
     VIEWERS.add(name, viewer, replace=replace)
 
 
@@ -152,13 +153,20 @@ for _viewer in BUILT_IN:
     register_viewer(_viewer.name, _viewer)
 for _alias, _name in ALIASES.items():
     register_viewer(_alias, VIEWERS.get(_name))
-register_viewer("portable", BUILT_IN)
+register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN))
 
 
 def viewers_for(name: str) -> tuple[str, ...]:
-    """The viewers that a file made for `name` has to be right in: that one, or those that it stands for. Raises SettingsError when unknown."""
+    """The viewers that a file made for `name` has to be right in: that one, or those that it stands for.
+
+    Raises SettingsError when unknown, PluginError for several that are no names.
+    """
     viewer = VIEWERS.get(name)
-    return tuple(each.name for each in viewer) if isinstance(viewer, tuple) else (name,)
+    if not isinstance(viewer, tuple):
+        return (name,)
+    if not viewer or not all(isinstance(each, str) for each in viewer):
+        raise PluginError(f"viewer {name!r} stands for {viewer!r}; it has to be the names of registered viewers")
+    return viewer
 
 
 def find_viewer(name: str) -> Viewer:

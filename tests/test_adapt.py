@@ -76,7 +76,7 @@ def test_zooming_in_comes_closer_to_what_the_base_shows_at_its_own_scale():
     assert psnr(shrunk[1], base) > psnr(shrunk[0], base) + 1
 
 
-def test_optimising_comes_closer_to_the_pseudo_truth():
+def test_optimizing_comes_closer_to_the_pseudo_truth():
     curve = wrapped().adapt(1 / 4, views="given", steps=24, check_every=8).report.curve
     assert curve[0].psnr_db is None and curve[1].psnr_db < curve[2].psnr_db < curve[3].psnr_db
     assert curve[0].seconds < curve[3].seconds

@@ -1,4 +1,4 @@
-"""The start without optimisation: exact for one splat that faces the camera, sane for everything else."""
+"""The start without optimization: exact for one splat that faces the camera, sane for everything else."""
 
 import math
 from dataclasses import replace

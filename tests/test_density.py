@@ -18,7 +18,7 @@ from mipmap_plugin.adaptation.density import (
     strongest,
 )
 from mipmap_plugin.adaptation.loop import Run, Task
-from mipmap_plugin.adaptation.loop import adapt as optimise
+from mipmap_plugin.adaptation.loop import adapt as optimize
 from mipmap_plugin.adaptation.optimizer import make_optimizer, put_back, set_rates
 from mipmap_plugin.adaptation.validation import Validation
 from mipmap_plugin.backends.projection import project, rotations
@@ -278,7 +278,7 @@ def test_two_views_in_one_step_count_as_two_views_each_with_its_own_gradient():
     validation = Validation(views, views, 1.0, black, lambda gaussians, camera: torch.zeros(1, 1, 1), "area")
     task = Task(views, 1.0, black, render, white_background=False, validation=validation)
     run = Run.start(student, task, config)
-    optimise(run, task, config, lambda run: None)
+    optimize(run, task, config, lambda run: None)
     expected = ScreenGradients(COUNT, torch.device("cpu"))
     for view in views:
         expected.add(torch.ones(COUNT, 3), pull[view], view)  # the loss is the pull itself, whose gradient is `pull`

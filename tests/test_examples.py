@@ -45,7 +45,7 @@ def test_all_of_it_works_together(scene, tmp_path, capsys, name, words):
 
 def test_the_commands_that_list_know_of_it(scene, capsys):
     assert cli.main(["inspect", scene[0], "--no-viewers"]) == 0
-    assert "npz" in capsys.readouterr().out
+    assert "splats:       40" in capsys.readouterr().out
     assert cli.main(["backends"]) == 0
     assert "careful" in capsys.readouterr().out
 

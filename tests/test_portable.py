@@ -18,24 +18,23 @@ from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import BackendUnavailable, SettingsError
+from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
 from mipmap_plugin.evaluation.evaluate import Judge, adapted_row, training_free_rows
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.tags import provenance_of
-from mipmap_plugin.viewers import BUILT_IN, VIEWERS, find_viewer, viewers_for
+from mipmap_plugin.viewers import BUILT_IN, find_viewer, viewers_for
 
 BRIEF = dict(steps=2, extra_views=1, merge_to=1.0, warm_up=0, views_per_step=3, validation_views=2)
 PAIR = ("classic", "spark")
 
 
 @pytest.fixture
-def pair(monkeypatch):
+def pair():
     """The name of two viewers that disagree."""
-    monkeypatch.setattr(VIEWERS, "_targets", dict(VIEWERS._targets))
-    register_viewer("pair", tuple(find_viewer(name) for name in PAIR))
+    register_viewer("pair", PAIR)
     return "pair"
 
 
@@ -71,6 +70,19 @@ def test_the_command_does_not_draw_as_several(tmp_path, capsys):
 def test_files_of_a_family_that_keeps_its_filter_are_not_portable():
     with pytest.raises(SettingsError, match="its files are for its own project alone; leave the viewer portable out"):
         wrapped(keeps_filter=True).adapt(1 / 4, viewer="portable")
+
+
+def test_a_group_is_made_of_names():
+    for wrong in ((), (find_viewer("spark"),)):
+        register_viewer("wrong", wrong, replace=True)
+        with pytest.raises(PluginError, match="it has to be the names of registered viewers"):
+            viewers_for("wrong")
+
+
+def test_a_model_is_drawn_by_the_viewers_that_it_is_for():
+    adapted = wrapped().adapt(1 / 4, viewer="spark", recipe="instant")
+    with pytest.raises(SettingsError, match="not made for the viewer 'mip', but for spark"):
+        adapted.render(tiny.cameras(1)[0], viewer="mip")
 
 
 def test_the_extremes_speak_for_all():

@@ -19,6 +19,11 @@ def test_every_built_in_recipe_fits_every_scale():
         assert {recipe(name, scale).recipe for scale in (1 / 16, 1 / 4, 1, 4)} == {name}
 
 
+def test_a_scale_that_is_none_is_refused():
+    with pytest.raises(SettingsError, match="scale 0 is no zoom"):
+        recipe("default", 0)
+
+
 def test_an_unknown_recipe_is_told_the_known_ones():
     with pytest.raises(SettingsError, match="there is no recipe 'best'; known are default, instant, paper, thorough"):
         recipe("best", 2)
@@ -27,6 +32,9 @@ def test_an_unknown_recipe_is_told_the_known_ones():
 def test_what_is_no_recipe_is_named():
     register_recipe("mine", 3)
     with pytest.raises(PluginError, match="recipe 'mine' is of type int"):
+        recipe("mine", 2)
+    register_recipe("mine", lambda scale, network: None, replace=True)
+    with pytest.raises(PluginError, match="recipe 'mine' gives no settings at x2: TypeError"):
         recipe("mine", 2)
     register_recipe("mine", lambda scale, network: dict(stepps=3), replace=True)
     with pytest.raises(SettingsError, match="setting stepps"):

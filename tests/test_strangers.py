@@ -90,6 +90,8 @@ def test_results_of_a_training_are_found_in_a_place_of_their_own(tmp_path):
         (mine(name="other"), "calls itself 'other'"),
         (mine(api_version=API_VERSION + 1), f"is written for API version {API_VERSION + 1}, this package has {API_VERSION}"),
         (mine(recognize=lambda files: files.nothing), "has no attribute 'nothing'"),
+        (mine(recognize=lambda files: True), "its recognize returns a bool; it has to be a Match or None"),
+        (mine(before="3dgs"), "names '3dgs' as what it comes before; give a tuple of names"),
     ],
 )
 def test_a_broken_family_is_told_of_and_breaks_nothing(tmp_path, target, reason):
@@ -99,6 +101,29 @@ def test_a_broken_family_is_told_of_and_breaks_nothing(tmp_path, target, reason)
     assert wrap_model(found.path).model.family == "3dgs"
     with pytest.raises(CheckpointError, match="could not be asked"):
         detect(ply_files.write(tmp_path / "points.ply", {name: np.zeros(2, np.float32) for name in "xyz"}))
+
+
+@pytest.mark.parametrize("place", [("", r"(a\.ply"), ("", r"(?P<step>\w+)\.ply"), "weights", 7])
+def test_a_broken_place_is_passed_over(tmp_path, place):
+    register_model("mine", mine(place=place))
+    assert detect(ply(tmp_path / "a.ply").parent).family == "3dgs"
+
+
+def test_families_that_exclude_one_another_are_named(tmp_path):
+    register_model("mine", mine(before=("yours", "3dgs")))
+    register_model("yours", mine(name="yours", before=("mine",)))
+    with pytest.raises(CheckpointError, match="claimed by '3dgs', 'mine', 'yours', each of which another comes before"):
+        detect(ply(tmp_path / "a.ply", "mine"))
+
+
+def test_a_loader_that_fails_or_reads_its_own_family_alone_says_so(tmp_path):
+    path = ply(tmp_path / "a.ply", "mine")
+    register_model("mine", mine(load=lambda path, iteration: {}["means"]))
+    with pytest.raises(PluginError, match=r"family 'mine' cannot load .*a\.ply: KeyError: 'means'"):
+        load_model(path)
+    register_model("mine", mine(), replace=True)
+    with pytest.raises(CheckpointError, match=r"a\.ply is a checkpoint of My splats, which is read in another way; load it with load_model"):
+        load_vanilla(path)
 
 
 def test_a_loader_that_cannot_be_imported(tmp_path):

@@ -1,4 +1,4 @@
-"""The start that needs no optimisation: what a screen filter of fixed size in pixels does wrong at another scale, solved for.
+"""The start that needs no optimization: what a screen filter of fixed size in pixels does wrong at another scale, solved for.
 
 A checkpoint trained with a filter of e px² shows Σ + e·ρ², where ρ is the size of a base pixel at the splat's distance, in
 world units. At scale s a pixel measures ρ/s, and the filter of the adapted file, of e' px², adds e'·(ρ/s)² instead. So the splat
@@ -126,7 +126,7 @@ def _of_surfels(
 
 
 def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
-    """[N] world units: the size of a pixel at each centre in the closest view that sees it (of all views, if none does).
+    """[N] world units: the size of a pixel at each center in the closest view that sees it (of all views, if none does).
 
     Of many views some are asked, evenly spread.
     """

@@ -1,4 +1,4 @@
-"""Algorithm 1 of Mipmap-GS: optimise the splats against what the frozen base shows, resized to the new scale."""
+"""Algorithm 1 of Mipmap-GS: optimize the splats against what the frozen base shows, resized to the new scale."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ CHECKS_RISING = 10
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be optimised against what."""
+    """What is to be optimized against what."""
 
     views: Sequence[Camera]  # at the base scale
     scale: float
@@ -85,7 +85,7 @@ class Run:
 
 
 def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], None] = lambda run: None) -> str:
-    """Optimise `run.student` in place until its steps, its budget, its target or its patience end; return which of them did.
+    """Optimize `run.student` in place until its steps, its budget, its target or its patience end; return which of them did.
 
     `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise. `observe` is called before the first
     step and after each, while the clock stands.

@@ -24,7 +24,7 @@ class Report(BaseModel):
     settings: AdaptConfig
     backend: str  # which, and why
     views: str  # which, in a sentence
-    viewer: str | None = None  # what the file is for; None: what draws as the base's project does
+    viewer: str | None = None  # what the file is for; None: what draws as 3DGS does, or the base's own project where it keeps its filter
     filters: str  # of the pseudo truth, the base and the adapted file
     effects: list[Effect]  # what adapting and rendering simulate, what they do not, and why
     gaussians_before: int
@@ -33,7 +33,7 @@ class Report(BaseModel):
     ended_by: str
     returned: str  # which of the run's states the file holds, and why where it is not the last
     validation: dict[str, float]  # dB of each state on views that nothing was adapted to and that did not steer the run
-    viewers: dict[str, float] = {}  # where the file is for several: dB in each, on the same views; `validation` is of the worst
+    viewers: dict[str, float] = {}  # of a file for several: dB in each on the same views; `validation` is of the worst of those that go farthest
     peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without one
     curve: list[CurvePoint]
     versions: dict[str, str]

@@ -32,6 +32,7 @@ from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.files import together, write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
@@ -61,6 +62,9 @@ class Adapted:
 
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
         """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`. `viewer`: one of `viewers`."""
+        if viewer is not None and viewer not in self.viewers:
+            made_for = ", ".join(filter(None, self.viewers)) or "none by name"
+            raise SettingsError(f"this model is not made for the viewer {viewer!r}, but for {made_for}")
         effects = self.effects if viewer is None else self.viewers[viewer]
         return shown(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
 

@@ -68,7 +68,7 @@ def unit(quats: Tensor) -> Tensor:
 
 
 def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: float) -> Tensor:
-    """The projection's derivative at each centre [N, 2, 3]; slopes are frozen outside the widened frustum."""
+    """The projection's derivative at each center [N, 2, 3]; slopes are frozen outside the widened frustum."""
     half = slopes.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2
     left = slopes.new_tensor([camera.cx / camera.fx, camera.cy / camera.fy])
     margin = frozen_beyond * half

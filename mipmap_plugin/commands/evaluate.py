@@ -43,7 +43,7 @@ def evaluate(
         checkpoint: A PLY or a model folder, whose cameras tell the base scale; or several, which are also averaged.
         images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images), one for each checkpoint.
         scale: Target over base, such as 1/4 or 4; 1 is the base itself. May be given several times.
-        recipe: Adapt with this recipe, once on the checkpoint's training views and once on those that are judged; may be given several times.
+        recipe: Adapt with it (default, thorough, instant, paper), on the checkpoint's training views and on those that are judged. Several: each.
         viewer: What files are adapted for, and draws them and the base: spark, supersplat, ...; portable: the viewer that shows each worst.
         protocol: The truth at another scale: P1 box, cut off; P3 Pillow's bicubic on 8 bits; P4 the folders images_2, images_4, ... of COLMAP.
         lpips: Also measure LPIPS, with AlexNet or VGG; vgg-01 feeds images in 0..1, which is not LPIPS' definition but what the papers do.

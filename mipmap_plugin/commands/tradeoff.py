@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import tyro
 
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
+from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import load_scene
 
 
@@ -40,7 +42,7 @@ def tradeoff(
         scale: Target over base, such as 1/8 or 4. May be given several times.
         output: The folder for the results.
         images: Folder of the scene with real images (protocol P3). Without it the base itself is the truth; every axis and table says which.
-        recipe: default and paper, if none is given.
+        recipe: default, thorough, instant, paper, or one that is registered; default and paper, if none is given.
         viewer: What files are adapted for, and draws them and the base: spark, playcanvas (or supersplat), ...
         steps: Optimizer steps at most, one run for each; what each recipe says, if none is given.
         backend: What to adapt and render with; auto, if none is given.
@@ -63,5 +65,7 @@ def tradeoff(
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     model, scene = wrap(checkpoint, None, background, "auto", screen_filter), None if images is None else load_scene(images)
     model.target(viewer)
+    for name, each in product(plan.recipes, scale):
+        make_config(name, each)
     found = run(model, scene, each_once(scale), plan, views, output, picture=picture, overwrite=overwrite)
     tell(facts(found, complete=True), json) if json else print("\n\n".join(table(each) for each in found))

@@ -142,7 +142,9 @@ def evaluate(
     judged = test_views(scene, model.cameras[0], model.background)
     judge = Judge(judged, PROTOCOLS[protocol], perceptual, scene.source.name)
     viewer, rows = settings.get("viewer"), []
-    model.targets(viewer)  # what cannot be adapted for it is refused before anything is drawn
+    model.targets(viewer)  # what cannot be adapted for it, or with a recipe, is refused before anything is drawn
+    for name, each in product(recipes, scales):
+        make_config(name, each)
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
         if recipes and (scale != 1 or viewer):

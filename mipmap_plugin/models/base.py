@@ -131,7 +131,8 @@ def lacking(model: Any) -> list[str]:
     asked = [*_members(SplatModel)]
     if isinstance(traits := getattr(model, "traits", None), Traits):
         asked += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed + ["fused", "bare"] * traits.filtered
-    return [name for name in asked if not hasattr(model, name)]
+    missing = [name for name in asked if not hasattr(model, name)]
+    return missing if "traits" in missing or isinstance(traits, Traits) else [*missing, "traits of the type Traits"]
 
 
 def _members(protocol: type) -> list[str]:

@@ -1,4 +1,4 @@
-"""A pytest suite for the authors of families: every step that a checkpoint goes through here. This module alone needs pytest."""
+"""A pytest suite for the authors of families: what a checkpoint goes through here. This module alone needs pytest."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.base import PARAMETERS, SplatModel, lacking
 from mipmap_plugin.scenes.trajectories import orbit
@@ -82,6 +83,23 @@ class ModelSuite:
         assert all(copied.parameters()[name] is tensor for name, tensor in half.items())
         assert copied.row_opacities(base.cameras).shape == (len(half["means"]),)
         assert copied.gaussians(base.cameras[0]).means.isfinite().all()
+
+    def test_keeps_what_its_traits_promise(self, base):
+        view, traits = base.cameras[0], base.model.traits
+        shown = base.render(view).image
+        others = [base.model.fused()] if traits.filtered else []  # type: ignore[attr-defined]
+        if traits.same_for_all_views:
+            copied = base.model.copy()
+            copied.rebuild(lambda gaussians: gaussians[torch.arange(len(gaussians))])  # type: ignore[attr-defined]
+            others.append(copied)
+        for other in others:
+            same = Wrapped(other, base.cameras, "reference", base.trained).render(view).image
+            assert (shown - same).abs().max() <= SAME
+
+    def test_the_base_is_never_an_output(self, base):
+        for path in {base.model.source, base.model.folder} - {None}:
+            with pytest.raises((OutputError, OutputExists, SettingsError)):
+                base.model.refuse_output(path, overwrite=True, networks_move=False)
 
     def test_adapts_and_is_saved_and_loaded_again(self, base, checkpoint, tmp_path):
         with _untouched(base.model, checkpoint):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,9 +41,12 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
 def detect_as(path: str | Path, families: tuple[str, ...], *, iteration: int | None = None) -> Checkpoint:
     """As `detect`, where only these families will do. Raises CheckpointError for others."""
     found = detect(path, iteration=iteration)
-    if found.family not in families:
+    if found.family in families:
+        return found
+    family = find_family(found.family)
+    if family.load is None:
         raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
-    return found
+    raise CheckpointError(f"{found.path} is a checkpoint of {family.title}, which is read in another way; load it with load_model")
 
 
 def _recognize(path: Path) -> tuple[Checkpoint, Match]:
@@ -62,7 +66,10 @@ def _ask_all(files: Files) -> tuple[dict[str, tuple[Family, Match]], list[str]]:
     for name in FAMILIES.names():
         try:
             family = find_family(name)
-            if match := family.recognize(files):
+            match = family.recognize(files)
+            if not isinstance(match, Match | None):
+                raise PluginError(f"its recognize returns a {type(match).__name__}; it has to be a Match or None")
+            if match is not None:
                 claims[name] = family, match
         except CheckpointError:
             raise
@@ -76,6 +83,8 @@ def _surest(files: Files, claims: dict[str, tuple[Family, Match]], notes: list[s
     passed_over = {name for family, _ in claims.values() for name in family.before}
     left = [claim for name, claim in claims.items() if name not in passed_over]
     best = [(family, match) for family, match in left if match.sure == max(match.sure for _, match in left)]
+    if claims and not left:
+        raise CheckpointError(f"{files.path} is claimed by {', '.join(map(repr, claims))}, each of which another comes before; one has to let go of its `before`")
     if not best:
         raise CheckpointError("; ".join([_why_not(files), *notes]))
     if len(best) > 1:
@@ -105,9 +114,8 @@ def _why_not(files: Files) -> str:
 def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if (folder / "point_cloud").is_dir():
         return _detect_iteration(folder, iteration)
-    for family in _placed():
-        if steps := _steps(folder, family):
-            return _detect_step(family, folder, steps, iteration)
+    for family, steps in _placed(folder):
+        return _detect_step(family, folder, steps, iteration)
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     clouds = sorted(folder.glob("*.ply"))
@@ -141,20 +149,23 @@ def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
     raise CheckpointError(f"{folder} has no whole checkpoint: {'; '.join(troubles)}")
 
 
-def _placed() -> list[Family]:
-    """The families that have a place for their files; broken ones have none."""
-    found = []
+def _placed(folder: Path) -> Iterator[tuple[Family, dict[int, Path]]]:
+    """The families that find files of theirs in a folder of results; a broken one finds none, as `_ask_all` tells of the files themselves."""
     for name in FAMILIES.names():
         try:
-            found += [family] if (family := find_family(name)).place else []
-        except PluginError:
-            continue  # `_ask_all` tells
-    return found
+            family = find_family(name)
+            if steps := _steps(folder, family):
+                yield family, steps
+        except CheckpointError:
+            raise
+        except Exception:  # a stranger's code may fail in any way
+            continue
 
 
 def _steps(folder: Path, family: Family) -> dict[int, Path]:
     """The checkpoints of a training by their steps, 0 where a name has none; of several ranks the first."""
-    assert family.place
+    if family.place is None:
+        return {}
     below, pattern = family.place
     place = folder / below
     files = sorted(place.iterdir(), reverse=True) if place.is_dir() else []

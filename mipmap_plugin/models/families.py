@@ -213,6 +213,8 @@ def find_family(name: str) -> Family:
         raise PluginError(f"family {name!r} is of type {type(found).__name__}; make it a mipmap_plugin.models.Family")
     if found.name != name:
         raise PluginError(f"family {name!r} calls itself {found.name!r}; register it under its own name")
+    if not isinstance(found.before, tuple):
+        raise PluginError(f"family {name!r} names {found.before!r} as what it comes before; give a tuple of names")
     if found.api_version != API_VERSION:
         raise PluginError(f"family {name!r} is written for API version {found.api_version}, this package has {API_VERSION}")
     return found

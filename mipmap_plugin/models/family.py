@@ -101,7 +101,9 @@ class Family:
     title: str  # as its authors write it
     recognize: Callable[[Files], Match | None]  # None: the file is not its own
     api_version: int
-    load: str | Callable[..., Any] | None = None  # (path, *, iteration) -> SplatModel, or "package.module:function"; None: not read
+    # (path, *, iteration) -> SplatModel, or "package.module:function"; the path is what a user gave, a file or a folder, in which `detect`
+    # finds the file. None: it is not read.
+    load: str | Callable[..., Any] | None = None
     before: tuple[str, ...] = ()  # families whose claim to the same file counts for nothing
     place: tuple[str, str] | None = None  # below a folder of results: a folder, and the pattern of a file's name, perhaps with a group `step`
     not_loaded: str = ""  # what more is to be said of a family that is not read

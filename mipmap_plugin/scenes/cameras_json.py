@@ -52,7 +52,7 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
 def write_cameras(path: str | Path, cameras: Sequence[Camera], *, overwrite: bool = False) -> Path:
     """Write `cameras` as INRIA does, test views first; return the path. Raises OutputExists.
 
-    The format has no principal point: every view's is taken to be its centre.
+    The format has no principal point: every view's is taken to be its center.
     """
     ordered = sorted(cameras, key=lambda camera: camera.split != "test")
     write_json(Path(path), [_entry(index, camera) for index, camera in enumerate(ordered)], overwrite)
@@ -114,7 +114,7 @@ def _name(entry: Any, where: str) -> str:
 
 
 def _camera(entry: dict[str, Any], name: str, split: Any, where: str) -> Camera:
-    """`rotation` is camera to world, `position` the eye; the principal point is the image centre by construction."""
+    """`rotation` is camera to world, `position` the eye; the principal point is the image center by construction."""
     camera_to_world = rotation(present(entry, "rotation", where), f"{where}, rotation")
     position = numbers(present(entry, "position", where), (3,), f"{where}, position")
     viewmat = torch.eye(4, dtype=torch.float64)

@@ -58,8 +58,8 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
         "covariances": (False, "quaternions and scales suffice"),
         "depth": (False, "not asked for"),
         "normals": (False, "not asked for"),
-        "upsampler": (False, "nothing is optimised"),
-        "densification statistics": (False, "nothing is optimised"),
+        "upsampler": (False, "nothing is optimized"),
+        "densification statistics": (False, "nothing is optimized"),
     }
 
 
@@ -97,7 +97,7 @@ def test_each_effect_tells_its_cost():
     [
         (1 / 4, {}, "no image has to become larger"),
         (4, {}, "images are shrunk and compared with the base's own"),
-        (4, dict(steps=0), "nothing is optimised"),
+        (4, dict(steps=0), "nothing is optimized"),
     ],
 )
 def test_why_no_upsampler_is_called_for(scale, settings, reason):

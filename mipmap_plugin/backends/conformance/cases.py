@@ -179,7 +179,7 @@ def _row(**values: tuple[float, ...] | float) -> dict[str, Tensor]:
 
 
 TURN = (0.8, 0.1, -0.3, 0.5)  # an ordinary quaternion, almost of norm 1
-WIDE = (0.9, 0.7, 0.5)  # many pixels lie so near the centre that an opaque splat's alpha is cut off at 0.99 there
+WIDE = (0.9, 0.7, 0.5)  # many pixels lie so near the center that an opaque splat's alpha is cut off at 0.99 there
 
 # One splat of a crowd. Near plane: NEAR. Eye: the origin.
 ROWS = {
