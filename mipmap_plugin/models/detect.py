@@ -84,7 +84,8 @@ def _surest(files: Files, claims: dict[str, tuple[Family, Match]], notes: list[s
     left = [claim for name, claim in claims.items() if name not in passed_over]
     best = [(family, match) for family, match in left if match.sure == max(match.sure for _, match in left)]
     if claims and not left:
-        raise CheckpointError(f"{files.path} is claimed by {', '.join(map(repr, claims))}, each of which another comes before; one has to let go of its `before`")
+        names = ", ".join(map(repr, claims))
+        raise CheckpointError(f"{files.path} is claimed by {names}, each of which another comes before; one has to let go of its `before`")
     if not best:
         raise CheckpointError("; ".join([_why_not(files), *notes]))
     if len(best) > 1:
