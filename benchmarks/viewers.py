@@ -51,7 +51,7 @@ INTRO = """# What real viewers show
 Made by `python benchmarks/viewers.py DATA`: pictures of the viewers themselves, in Chromium with software WebGL and WebGPU and with exact cameras,
 against photographs (protocol P3); dB, mean of 8 test views. *base*: as it is. *classic*: adapted for classic dilation of 0.3 px². *viewer*: adapted
 for the viewer that shows it. *portable*: one file for all of them. *splat-transform*: the base decimated by version 3.7.0 to the count of the
-classic file, uniformly or adaptively.
+viewer's file, uniformly or adaptively. In brackets the splats, thousands.
 """
 
 
@@ -100,12 +100,12 @@ def for_all(work: Work, viewer: str) -> Path | None:
 
 
 def decimated(how: str) -> Callable[[Work, str], Path | None]:
-    """A rival's file with as many splats as the classic one; none at x1."""
+    """A rival's file with as many splats as the one for the viewer; none at x1, where those are about as many as the base's."""
 
     def file(work: Work, viewer: str) -> Path | None:
-        made = work.folder / f"{how}.ply"
+        made = work.folder / f"{how}_{viewer}.ply"
         if work.scale != 1 and not made.exists():
-            tool, count = BROWSER / "node_modules" / ".bin" / "splat-transform", count_of(work.adapted("classic"))
+            tool, count = BROWSER / "node_modules" / ".bin" / "splat-transform", count_of(work.adapted(viewer, viewer=viewer))
             source = str(work.base.model.source)
             subprocess.run(["node", str(tool), "-q", "-g", "cpu", source, f"--{how}", str(count), str(made)], check=True)
         return made if work.scale != 1 else None
@@ -212,7 +212,7 @@ def page(rows: Sequence[Row]) -> str:
 
 
 def cell(row: Row | None) -> str:
-    return "–" if row is None else f"{row.psnr_db:.1f}"
+    return "–" if row is None else f"{row.psnr_db:.1f} ({row.splats / 1000:.1f})"
 
 
 def mosaic(pictures: Path) -> Image.Image | None:

@@ -78,13 +78,14 @@ def test_torch_files_that_are_no_model(tmp_path, content, sentence):
 
 
 def test_result_folders_of_gsplat_and_splatfacto(tmp_path):
+    contents = {"gsplat": {"splats": {}}, "splatfacto": {"pipeline": {}}}
     strays = {"gsplat": "ckpts/ckpt_99999_x4.pt", "splatfacto": "nerfstudio_models/step-latest.ckpt"}
     written = {"gsplat": ["ckpts/ckpt_29999_rank0.pt", "ckpts/ckpt_29999_rank1.pt", "ckpts/ckpt_6999_rank0.pt"]}
     written["splatfacto"] = ["nerfstudio_models/step-000029999.ckpt"]
     for family, names in written.items():
         for name in [*names, strays[family]]:
             (tmp_path / family / name).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / family / name).touch()
+            torch.save(contents[family], tmp_path / family / name)
         found = detect(tmp_path / family)
         assert (found.family, found.path, found.iteration) == (family, tmp_path / family / names[0], 29_999)
 

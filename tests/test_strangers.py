@@ -8,6 +8,7 @@ import numpy as np
 import ply_files
 import pytest
 import tiny
+import torch
 
 from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
@@ -80,6 +81,13 @@ def test_results_of_a_training_are_found_in_a_place_of_their_own(tmp_path):
     found = detect(tmp_path / "run")
     assert (found.family, found.path.name, found.iteration) == ("mine", "step_20.ply", 20)
     assert detect(tmp_path / "run", iteration=5).path.name == "step_5.ply"
+
+
+def test_a_place_that_another_family_has_too_is_no_claim(tmp_path):
+    (tmp_path / "run/ckpts").mkdir(parents=True)
+    torch.save({"splats": {}}, tmp_path / "run/ckpts/ckpt_29999_rank0.pt")
+    register_model("a first one", mine(name="a first one", place=("ckpts", r".*\.pt")))
+    assert detect(tmp_path / "run").family == "gsplat"
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,10 @@ def test_what_is_not_measured_again_is_kept(tmp_path):
 
 
 def test_a_file_that_was_not_measured_is_a_dash():
-    rows = [Row("lego", 1.0, "spark", "base", 9, 20.0), Row("lego", 0.5, "spark", "base", 9, 21.0), Row("lego", 0.5, "spark", "classic", 9, 13.0)]
+    facts = [(1.0, "base", 20.0), (0.5, "base", 21.0), (0.5, "classic", 13.0)]
+    rows = [Row("lego", scale, "spark", file, 9000, quality) for scale, file, quality in facts]
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page(rows).splitlines() if line.startswith("| x")]
-    assert lines == [["x1", "spark", "20.0", "–"], ["x0.5", "spark", "21.0", "13.0"]]
+    assert lines == [["x1", "spark", "20.0 (9.0)", "–"], ["x0.5", "spark", "21.0 (9.0)", "13.0 (9.0)"]]
 
 
 def test_splats_are_counted_in_the_header(tmp_path):

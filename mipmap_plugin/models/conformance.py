@@ -24,7 +24,7 @@ SAME = 1 / 255
 
 
 class ModelSuite:
-    """Subclass it in a test file, say where a checkpoint of your family lies, and pytest checks the family::
+    """Subclass it in a test file, with a fixture that makes a checkpoint of your family, and pytest checks the family::
 
         class TestMine(ModelSuite):
             family = "mine"
@@ -40,10 +40,6 @@ class ModelSuite:
     scale = 1 / 2
     device = "cpu"  # where it is taken to
     settings: dict[str, Any] = dict(steps=2, extra_views=2, merge_to=1.0)  # of adapting  # noqa: RUF012
-
-    @pytest.fixture
-    def checkpoint(self, tmp_path: Path) -> Path:
-        raise NotImplementedError(f"{type(self).__name__} needs a fixture `checkpoint` that returns the path of one")
 
     @pytest.fixture
     def base(self, checkpoint: Path) -> Wrapped:

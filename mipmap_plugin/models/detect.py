@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mipmap_plugin.errors import CheckpointError, PluginError
@@ -181,4 +181,5 @@ def _detect_step(family: Family, folder: Path, steps: dict[int, Path], wanted: i
     step = max(steps) if wanted is None else wanted
     if step not in steps:
         raise CheckpointError(f"{folder} has no checkpoint of step {step}; it has {', '.join(map(str, sorted(steps)))}")
-    return Checkpoint(family.name, steps[step], folder, step) if family.place and family.place[0] else detect(steps[step])
+    found = detect(steps[step])  # a place may be another family's too, so that all are asked
+    return replace(found, folder=folder, iteration=step) if family.place and family.place[0] else found

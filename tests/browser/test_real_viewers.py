@@ -13,7 +13,7 @@ from browser import VIEWERS, Browser, BrowserError, missing
 
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.demo.run import embedded
-from mipmap_plugin.models.ply import write_ply
+from mipmap_plugin.models.ply import read_ply, write_ply
 from mipmap_plugin.wrap import Wrapped
 
 pytestmark = pytest.mark.browser
@@ -126,12 +126,27 @@ def test_a_real_capture_looks_as_we_say(browser: Browser, shared_data: Path, vie
     assert likeness(browser, viewer, capture, cameras) > SURROUNDED.get(viewer, ALIKE)
 
 
+@pytest.mark.parametrize("viewer", VIEWERS)
+def test_a_column_filter_3d_is_not_read(browser: Browser, viewer: str, tmp_path: Path) -> None:
+    """So that what a viewer shows of Mip-Splatting's own file is its splats without their filter."""
+    base = embedded()
+    columns = read_ply(base.model.source).columns
+    path = write_ply(tmp_path / "mip.ply", {**columns, "filter_3D": np.full(len(columns["x"]), 0.02, np.float32)})
+    model, views = wrap_model(path, background=WHITE), at(base.cameras[:1], 1 / 2)
+    assert model.model.family == "mip"
+    assert likeness(browser, viewer, model, views) > ALIKE
+    assert likeness(browser, viewer, wrap_model(model.model.fused(), background=WHITE), views, path) < ALIKE - 10
+
+
 def at(cameras: Sequence[Camera], scale: float) -> list[Camera]:
     return [camera.zoomed(scale) for camera in cameras]
 
 
-def likeness(browser: Browser, viewer: str, model: Wrapped, cameras: Sequence[Camera]) -> float:
-    """dB between our render under a viewer's convention and the viewer's own picture, both of 8 bits; the mean of the views."""
-    real = browser.open(viewer, model.model.source).draw(cameras, model.background)
+def likeness(browser: Browser, viewer: str, model: Wrapped, cameras: Sequence[Camera], file: Path | None = None) -> float:
+    """dB between our render under a viewer's convention and the viewer's own picture, both of 8 bits; the mean of the views.
+
+    `file`: what the viewer opens, where it is not the model's own.
+    """
+    real = browser.open(viewer, file or model.model.source).draw(cameras, model.background)
     ours = [model.render(camera, viewer=viewer).image.detach().clamp(0, 1).mul(255).round().div(255).numpy() for camera in cameras]
     return fmean(psnr(image, picture) for image, picture in zip(ours, real, strict=True))
