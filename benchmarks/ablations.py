@@ -19,7 +19,7 @@ from mipmap_plugin.evaluation.evaluate import Judge, adapted_row
 from mipmap_plugin.evaluation.measure import warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import table
-from mipmap_plugin.files import new_file
+from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.recipes import recipe as make_config
 
 OURS = make_config("default", 1 / 4).rates

@@ -29,7 +29,7 @@ from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.backends import survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
-from mipmap_plugin.files import write_json
+from mipmap_plugin.formats.atomic import write_json
 
 # Imports and compilation are done on this scene before anything is timed.
 WARM_UP: Name = "T"

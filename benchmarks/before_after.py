@@ -12,7 +12,7 @@ import tyro
 
 from mipmap_plugin.demo.run import PROTOCOL, WorldView, embedded, side_by_side
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.scenes.images import write_image
+from mipmap_plugin.formats.images import write_image
 
 
 def main(output: Path = Path("docs/before_after.png"), seed: int = 0) -> None:

@@ -28,19 +28,19 @@ import anchor_checkpoints
 import moving
 
 from mipmap_plugin import Camera, Effects, Gaussians, load_model, wrap_model
-from mipmap_plugin.adaptation.upsamplers import find_upsampler
+from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
 from mipmap_plugin.backends import choose_backend, geometry, supersample
 from mipmap_plugin.backends.base import Needs
-from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.evaluation.report import markdown
-from mipmap_plugin.files import new_file
+from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.deformable import DeformNetwork
 from mipmap_plugin.models.exposure import exposed
-from mipmap_plugin.models.hexplane import HexPlane
 from mipmap_plugin.models.mip import MipModel
-from mipmap_plugin.models.moving import MovingModel
+from mipmap_plugin.models.moving.deformable import DeformNetwork
+from mipmap_plugin.models.moving.hexplane import HexPlane
+from mipmap_plugin.models.moving.model import MovingModel
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting.rotations import rotations
 
 ANCHORS = 1_000  # of ten splats each
 

@@ -25,10 +25,10 @@ from family_scenes import FAMILIES, HELD_OUT_VIEWS, SIZE, TRAIN_VIEWS, Scene, ma
 from torch import Tensor
 
 from mipmap_plugin import Camera, load_model, wrap_model
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.report import markdown
-from mipmap_plugin.files import new_file, write_json
+from mipmap_plugin.formats.atomic import new_file, write_json
 from mipmap_plugin.wrap import Wrapped
 
 SCALES = {"×1/4": 1 / 4, "×4": 4.0}

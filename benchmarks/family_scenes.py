@@ -25,9 +25,10 @@ import tiny
 import torch_checkpoints
 
 from mipmap_plugin import Camera, Effects, load_model
-from mipmap_plugin.adaptation.loop import Run, Task, adapt
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.validation import unjudged
+from mipmap_plugin.adaptation.optimization.loop import adapt
+from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.optimization.validation import unjudged
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.config import AdaptConfig, LearningRates

@@ -30,7 +30,7 @@ from mipmap_plugin.backends import get_backend, survey
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.backends.conformance import Outcome, check_backend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.files import write_json
+from mipmap_plugin.formats.atomic import write_json
 
 SizeName = Literal["800", "1080p", "4K"]
 SIZES: dict[SizeName, tuple[int, int]] = {"800": (800, 800), "1080p": (1920, 1080), "4K": (3840, 2160)}  # px

@@ -20,7 +20,7 @@ from workloads import Workload, activated, effects_of
 
 from mipmap_plugin import register_backend
 from mipmap_plugin.backends import get_backend
-from mipmap_plugin.evaluation.tradeoff import Spread
+from mipmap_plugin.evaluation.tradeoff.points import Spread
 
 YARDSTICK = "gsplat-twins"
 register_backend(YARDSTICK, "gsplat_twins:GsplatTwins")

@@ -19,11 +19,11 @@ from numerics_usual import UsualFormulas, gsplat_compensation_slope, mip_light, 
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.conformance.cases import HardCase, crowd, far_from_the_origin, odd_row, view
 from mipmap_plugin.backends.conformance.checks import Answer, draw
-from mipmap_plugin.backends.filters import LEAST_LIGHT, footprint
-from mipmap_plugin.backends.projection import Projected, _from_factors
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.filters import LEAST_LIGHT, footprint
+from mipmap_plugin.splatting.projection import Projected, _from_factors
 
 HERE = Path(__file__).parent
 SUBJECTS = {"reference": lambda: get_backend("reference"), "cpu": lambda: get_backend("cpu"), "usual formulas": UsualFormulas}

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import Rendered
-from mipmap_plugin.backends.harmonics import colors
-from mipmap_plugin.backends.projection import FRUSTUM_MARGIN, rotations
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import MAX_ALPHA, Effects
+from mipmap_plugin.effects import FRUSTUM_MARGIN, MAX_ALPHA, Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.harmonics import colors
+from mipmap_plugin.splatting.rotations import rotations
 
 # What diff-gaussian-rasterization adds to det² in the gradient of a covariance (backward.cu).
 PUBLISHED_GUARD = 1e-7

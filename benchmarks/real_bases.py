@@ -21,7 +21,7 @@ from pages import write_page
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.evaluate import Row, evaluate
 from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.files import write_json
+from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.recipes import RECIPES as KNOWN
 
 # The scales that each base was trained for the study of; see its own page.

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from numpy.random import Generator
 
-from mipmap_plugin.backends.harmonics import C0
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.splatting.harmonics import C0
 
 Name = Literal["A", "B", "C", "N1", "N10", "P1", "P10", "T"]
 

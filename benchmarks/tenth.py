@@ -19,7 +19,7 @@ from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.files import write_json
+from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
 
 INTRO = """# A tenth of the time

@@ -23,17 +23,18 @@ from pages import write_page
 from torch import Tensor
 
 from mipmap_plugin import Camera, wrap_model
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import register_upsampler
-from mipmap_plugin.adaptation.views import choose_views, evenly
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
 from mipmap_plugin.evaluation.measure import RESIZED, Show, resized_base, rivals, seen_before, warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView
 from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.evaluation.tradeoff_truth import JUDGES_SEED
-from mipmap_plugin.files import write_json
-from mipmap_plugin.scenes.images import read_image
+from mipmap_plugin.evaluation.tradeoff.truth import JUDGES_SEED
+from mipmap_plugin.formats.atomic import write_json
+from mipmap_plugin.formats.images import read_image
 from mipmap_plugin.wrap import Wrapped
 
 INTRO = """# Captures

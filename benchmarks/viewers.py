@@ -27,7 +27,7 @@ from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, TestView, test_views
 from mipmap_plugin.evaluation.report import markdown
-from mipmap_plugin.files import write_json
+from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
 
 BROWSER = Path(__file__).parents[1] / "tests" / "browser"

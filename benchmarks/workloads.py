@@ -10,9 +10,9 @@ from scenes import Name, make
 from torch import Tensor
 
 from mipmap_plugin import Camera, Effects, Gaussians, wrap_model
-from mipmap_plugin.backends.projection import project
 from mipmap_plugin.effects import DILATION, MIN_ALPHA
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.splatting.projection import project
 
 # Splats counted at once, so that counting pairs takes little memory whatever the checkpoint.
 CHUNK = 1 << 16

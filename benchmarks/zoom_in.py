@@ -25,7 +25,7 @@ from mipmap_plugin.evaluation.measure import BASE, resized_base, warm_up
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.files import write_json
+from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.wrap import Wrapped
 
 INTRO = """# Zoom-in: dB against LPIPS

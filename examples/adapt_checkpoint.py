@@ -9,7 +9,7 @@ import sys
 from fractions import Fraction
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.scenes.images import write_image
+from mipmap_plugin.formats.images import write_image
 
 
 def main(path: str, scale: float) -> None:

@@ -17,7 +17,7 @@ import sys
 from torch import Tensor
 
 from mipmap_plugin import register_upsampler, wrap_model
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize
 
 
 def sharp(image: Tensor, size: tuple[int, int]) -> Tensor:

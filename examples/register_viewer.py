@@ -17,7 +17,7 @@ from fractions import Fraction
 
 from mipmap_plugin import register_viewer, wrap_model
 from mipmap_plugin.effects import RenderSettings
-from mipmap_plugin.viewers import Viewer
+from mipmap_plugin.splatting.viewers import Viewer
 
 KIOSK = Viewer(
     "kiosk", "The kiosk in our hall", "kiosk.glsl of 2026-11", "classic", eps2d=0.5, settings=RenderSettings(min_alpha=1 / 255), sh_degree=1

@@ -14,11 +14,10 @@ import tyro
 from torch import Tensor
 from tqdm import tqdm
 
-from mipmap_plugin.adaptation.loop import Run, Task, adapt
-from mipmap_plugin.adaptation.validation import unjudged
+from mipmap_plugin.adaptation.optimization.loop import Run, Task, adapt
+from mipmap_plugin.adaptation.optimization.validation import unjudged
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
-from mipmap_plugin.backends.harmonics import C0
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig, LearningRates
 from mipmap_plugin.demo.world import cameras, render_world, surface_points
@@ -28,6 +27,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.cameras_json import write_cameras
+from mipmap_plugin.splatting.harmonics import C0
 
 WHITE = (1.0, 1.0, 1.0)
 DEGREE = 2

@@ -1,6 +1,6 @@
 """Adapt trained Gaussian-splatting checkpoints to another zoom, without their training images and without retraining."""
 
-from mipmap_plugin.adaptation.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends import register_backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -9,7 +9,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model, register_model
 from mipmap_plugin.recipes import register_recipe
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.viewers import Viewer, register_viewer
+from mipmap_plugin.splatting.viewers import Viewer, register_viewer
 from mipmap_plugin.wrap import Adapted, Wrapped, wrap_model
 
 __all__ = [

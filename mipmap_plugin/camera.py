@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.limits import check_scale
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,3 +94,13 @@ class Camera:
     def looking_from(self, viewmat: Tensor, name: str) -> Camera:
         """The same lens at another pose."""
         return replace(self, viewmat=viewmat, name=name)
+
+
+def evenly(views: Sequence[Item], most: int | None) -> list[Item]:
+    """At most `most` of the views, spread over their order; all of them for None."""
+    return [views[place * len(views) // most] for place in range(most)] if most is not None and len(views) > most else list(views)
+
+
+def every_nth(views: Sequence[Item], most: int) -> Sequence[Item]:
+    """Every n-th of the views, the first among them, where n is the least that leaves at most `most`."""
+    return views[:: -(-len(views) // most)]

@@ -14,7 +14,7 @@ from mipmap_plugin.gaussians import Gaussians
 # px²: the variance that every 3DGS rasterizer adds to a projected splat (diff-gaussian-rasterization, forward.cu).
 DILATION = 0.3
 
-# The screen filter of 2D Gaussian Splatting (`backends.surfels`), and the variance of its low-pass, px²: a deviation of half the root of
+# The screen filter of 2D Gaussian Splatting (`splatting.surfels`), and the variance of its low-pass, px²: a deviation of half the root of
 # two (diff-surfel-rasterization, auxiliary.h).
 SURFEL, LOW_PASS = "surfel", 0.5
 
@@ -57,7 +57,7 @@ class Packing:
     downwards: bool = False  # opacities and colors are kept as the next lower multiple
     bands: tuple[float, ...] = ()  # steps of the coefficients of SH degree 1, 2, ..., kept within -1..1
     log_scales: tuple[float, float, float] | None = None  # the least, the most, and the step between, of natural logarithms
-    quats: Literal["octahedral", "stereographic"] | None = None  # `backends.packing`
+    quats: Literal["octahedral", "stereographic"] | None = None  # `splatting.packing`
     half_means: bool = False  # float16, in the world and again relative to the eye
 
 
@@ -65,7 +65,7 @@ class Packing:
 class RenderSettings:
     """How a splat becomes pixels, and what is left out. `tile` changes nothing but the time. A viewer's own are in `viewers`.
 
-    A splat that is culled (by `min_variance`, `min_contribution` or `least_spread`) is not drawn, but has a gradient (`backends.culls`).
+    A splat that is culled (by `min_variance`, `min_contribution` or `least_spread`) is not drawn, but has a gradient (`splatting.culls`).
     """
 
     min_alpha: float = MIN_ALPHA  # below it a splat is not drawn on a pixel
@@ -77,7 +77,7 @@ class RenderSettings:
     max_color: float | None = None  # of a splat, in each channel
     color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are the nearest multiples
     radial: bool = False  # nearer is what lies nearer to the eye, instead of what lies less deep
-    bucketed: bool = False  # the order is that of PlayCanvas's buckets of depth (`backends.buckets`)
+    bucketed: bool = False  # the order is that of PlayCanvas's buckets of depth (`splatting.buckets`)
     min_variance: float = 0.0  # px², after dilation: a splat is culled whose variance along its longer axis is less,
     boxed: bool = False  # or, where this is set, the larger of those along x and y; `max_half_axis` then measures those too
     min_contribution: float = 0.0  # px², after dilation: a splat is culled whose opacity · sqrt(det) is less

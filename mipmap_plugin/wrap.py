@@ -6,23 +6,23 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import torch
 
-from mipmap_plugin.adaptation.photographs import Photographs
-from mipmap_plugin.adaptation.resume import Interrupted as Interrupted  # what `adapt` raises
-from mipmap_plugin.adaptation.session import Adapted, Base, Observer, Session, shown
-from mipmap_plugin.adaptation.several import for_several
+from mipmap_plugin.adaptation.adapted import Adapted, shown
+from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
+from mipmap_plugin.adaptation.session import Base, Observer, Session
+from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.target.portable import for_several
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend, device_for
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
-from mipmap_plugin.backends.filters import INTEGRALS, USUAL_EPS2D
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
-from mipmap_plugin.files import named, refuse_output, refuse_unwritable
+from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_background, check_image, check_scale
 from mipmap_plugin.models import load_model
@@ -34,7 +34,20 @@ from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import REPORT, parts_of
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene, model_cameras
-from mipmap_plugin.viewers import find_viewer, viewers_for
+from mipmap_plugin.splatting.filters import INTEGRALS, USUAL_EPS2D
+from mipmap_plugin.splatting.viewers import find_viewer, viewers_for
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class Drawn(TypedDict, total=False):
+    """What a view is drawn with besides."""
+
+    viewer: str | None  # as that viewer draws it, instead of a screen filter: without a filter_3D that it does not read
+    filter_3d: bool  # every splat is smoothed first by what the cameras could see of it at best (Mip-Splatting's 3D filter)
+    outputs: Sequence[str]  # "depth" and "normals", beside the image (`Rendered`)
+    exposure: bool  # the colors become those of the photograph that the camera is named after, where exposure.json has them
 
 
 class Wrapped:
@@ -86,24 +99,18 @@ class Wrapped:
         scale: float = 1.0,
         screen_filter: str | None = None,
         supersampling: int = 1,
-        filter_3d: bool = False,
-        *,
-        outputs: Sequence[str] = (),
-        exposure: bool = False,
-        viewer: str | None = None,
+        **drawn: Unpack[Drawn],
     ) -> Rendered:
         """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did.
 
-        `filter_3d`: every splat is smoothed first by what the cameras could see of it at best (Mip-Splatting's 3D filter).
-        `outputs`: "depth" and "normals" are drawn beside the image (`Rendered`). `exposure`: the colors become those of the
-        photograph that `camera` is named after, as the checkpoint's exposure.json has it. Raises SettingsError where it has none.
-        `viewer`: the view as that viewer draws it, instead of `screen_filter`: without a filter_3D that it does not read.
+        `screen_filter`: as of `effects`. `supersampling`: samples a pixel along each side. `drawn`: see `Drawn`. Raises SettingsError.
         """
+        viewer, exposure = drawn.get("viewer"), drawn.get("exposure", False)
         check_scale(scale)
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
-        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(outputs), exposure=exposure)
+        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(drawn.get("outputs", ())), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
-        form = self._smoothed if filter_3d else None
+        form = self._smoothed if drawn.get("filter_3d") else None
         return shown(self._read_by(viewer), backend, camera, effects, form)
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:

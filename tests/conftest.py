@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
+from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.models.families import FAMILIES
 from mipmap_plugin.recipes import RECIPES
-from mipmap_plugin.viewers import VIEWERS
+from mipmap_plugin.splatting.viewers import VIEWERS
 
 SHARED = Path(__file__).parents[1].parent / "shared"
 

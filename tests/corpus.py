@@ -17,13 +17,13 @@ import torch
 import torch_checkpoints
 from PIL import Image
 
-from mipmap_plugin.adaptation import resume
-from mipmap_plugin.adaptation.session import Adapted
+from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.optimization import resume
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.magic import SPLAT_RECORD
+from mipmap_plugin.formats.state_dict import read_state_dict
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.hosts import Taken
-from mipmap_plugin.models.magic import SPLAT_RECORD
-from mipmap_plugin.models.state_dict import read_state_dict
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import wrap_model
 

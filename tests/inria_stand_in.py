@@ -7,14 +7,14 @@ from types import SimpleNamespace
 
 import torch
 
-from mipmap_plugin.backends.compositing import Splats, alone, composite
-from mipmap_plugin.backends.filters import Footprint
-from mipmap_plugin.backends.harmonics import colors as colors_of
 from mipmap_plugin.backends.inria import NEWER, OLDER
-from mipmap_plugin.backends.projection import project
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import MIN_ALPHA, USUAL
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.compositing import Splats, alone, composite
+from mipmap_plugin.splatting.filters import Footprint
+from mipmap_plugin.splatting.harmonics import colors as colors_of
+from mipmap_plugin.splatting.projection import project
 
 DILATION, NEAR, LEAST_LIGHT = 0.3, 0.2, 0.005
 

@@ -10,8 +10,8 @@ import tiny
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.scenes import write_cameras

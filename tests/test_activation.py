@@ -5,7 +5,7 @@ import tiny
 import torch
 from anchor_checkpoints import write
 
-from mipmap_plugin.adaptation.activation import Activation
+from mipmap_plugin.adaptation.optimization.activation import Activation
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models import load_model

@@ -12,17 +12,17 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.interrupt import interruptible
+from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.report import Peak
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import provenance_of, render_mode
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.tags import provenance_of, render_mode
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.wrap import Interrupted, wrap_model
 

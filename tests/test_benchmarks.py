@@ -28,12 +28,12 @@ from zoom_in import kept as kept_with_networks  # noqa: E402
 from zoom_in_plot import draw  # noqa: E402
 
 from mipmap_plugin.backends import get_backend  # noqa: E402
-from mipmap_plugin.backends.projection import project  # noqa: E402
 from mipmap_plugin.evaluation.evaluate import Row as Judged  # noqa: E402
 from mipmap_plugin.evaluation.measure import seen_before  # noqa: E402
 from mipmap_plugin.evaluation.report import records  # noqa: E402
-from mipmap_plugin.files import write_json  # noqa: E402
+from mipmap_plugin.formats.atomic import write_json  # noqa: E402
 from mipmap_plugin.recipes import recipe as make_config  # noqa: E402
+from mipmap_plugin.splatting.projection import project  # noqa: E402
 from mipmap_plugin.wrap import wrap_model  # noqa: E402
 
 

@@ -21,9 +21,9 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import read_scale
 from mipmap_plugin.evaluation import backends as backends_module
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.tags import provenance_of
 
 QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
 NO_STEP = ["--backend", "reference", "--steps", "0"]
@@ -383,7 +383,7 @@ def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path,
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("mipmap_plugin.files.os.replace", full)
+    monkeypatch.setattr("mipmap_plugin.formats.atomic.os.replace", full)
     words = ["--output", output, "--overwrite", *NO_STEP]
     refused(run("adapt", base, "--scale", "4", *words), "new.ply cannot be written: No space left on device")
     assert output.read_text() == "precious" and sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply"]

@@ -6,16 +6,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mipmap_plugin.adaptation.closed_form import CLEAR_OF_CULLS, THINNEST, Form, closed_form, needs_nothing, pixel_size
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.surfel_form import shown_area
-from mipmap_plugin.backends.filters import footprint, keeps_light
-from mipmap_plugin.backends.projection import project
+from mipmap_plugin.adaptation.start.closed_form import CLEAR_OF_CULLS, THINNEST, Form, closed_form, needs_nothing, pixel_size
+from mipmap_plugin.adaptation.start.surfel_form import shown_area
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.viewers import find_viewer
+from mipmap_plugin.splatting.filters import footprint, keeps_light
+from mipmap_plugin.splatting.projection import project
+from mipmap_plugin.splatting.viewers import find_viewer
 
 BACKEND = ReferenceBackend()
 DEPTH, FOCAL = 4.0, 40.0

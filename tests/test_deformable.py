@@ -12,10 +12,10 @@ from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.state_dict import read_state_dict
 from mipmap_plugin.models import detect, load_model
-from mipmap_plugin.models.deformable import move_along_screw
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.state_dict import read_state_dict
+from mipmap_plugin.models.moving.deformable import move_along_screw
 from mipmap_plugin.wrap import wrap_model
 
 VARIANTS = [(timenet, six_dof) for timenet in (False, True) for six_dof in (False, True)]

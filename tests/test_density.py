@@ -6,8 +6,8 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation import optimizer as optimizer_module
-from mipmap_plugin.adaptation.density import (
+from mipmap_plugin.adaptation.optimization import optimizer as optimizer_module
+from mipmap_plugin.adaptation.optimization.density import (
     HALF_APART,
     SPLIT_SHRINK,
     ScreenGradients,
@@ -17,16 +17,17 @@ from mipmap_plugin.adaptation.density import (
     reset_opacities,
     strongest,
 )
-from mipmap_plugin.adaptation.loop import Run, Task
-from mipmap_plugin.adaptation.loop import adapt as optimize
-from mipmap_plugin.adaptation.optimizer import make_optimizer, put_back, set_rates
-from mipmap_plugin.adaptation.validation import Validation
-from mipmap_plugin.backends.projection import project, rotations
+from mipmap_plugin.adaptation.optimization.loop import adapt as optimize
+from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, put_back, set_rates
+from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig, LearningRates
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.projection import project
+from mipmap_plugin.splatting.rotations import rotations
 
 COUNT = 6
 

@@ -5,10 +5,10 @@ import tiny
 import torch
 from skimage.metrics import structural_similarity
 
-from mipmap_plugin.adaptation.detail import SURE, Detail
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.structure import similarity
-from mipmap_plugin.adaptation.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.target.detail import SURE, Detail
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.structure import similarity
+from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.recipes import recipe

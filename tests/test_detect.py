@@ -8,8 +8,8 @@ import torch
 from ply_files import splat_columns, write, write_model_folder, write_splats
 
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.cfg_args import format_cfg_args, read_cfg_args
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args
 from mipmap_plugin.models.detect import detect
 
 
@@ -92,7 +92,7 @@ def test_result_folders_of_gsplat_and_splatfacto(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "sentence"),
-    [(b"glTF" + bytes(20), "glTF"), (gzip.compress(b"x"), "gzip"), (b"PK\3\4broken", "damaged zip"), (b"hello", "no checkpoint")],
+    [(b"glTF" + bytes(20), "glTF"), (gzip.compress(b"x", mtime=0), "gzip"), (b"PK\3\4broken", "damaged zip"), (b"hello", "no checkpoint")],
 )
 def test_other_files(tmp_path, content, sentence):
     (tmp_path / "a.bin").write_bytes(content)

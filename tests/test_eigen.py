@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from mipmap_plugin.backends.eigen import eigh3
-from mipmap_plugin.backends.projection import rotations
+from mipmap_plugin.splatting.eigen import eigh3
+from mipmap_plugin.splatting.rotations import rotations
 
 
 def turned(variances: torch.Tensor, seed: int = 0) -> torch.Tensor:

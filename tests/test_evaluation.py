@@ -10,7 +10,7 @@ import tiny
 import torch
 from PIL import Image
 
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import measure, protocols
 from mipmap_plugin.evaluation.evaluate import Judge, evaluate, means, training_free_rows
@@ -18,9 +18,9 @@ from mipmap_plugin.evaluation.metrics import SAME_DB, psnr, ssim
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.published import PUBLISHED, published
 from mipmap_plugin.evaluation.report import markdown, published_table, records, table
+from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.scenes.images import write_image
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 BRIEF = dict(steps=2, extra_views=1, check_every=1)

@@ -19,8 +19,8 @@ from ply_files import write
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
+from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import detect, load_model
-from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 
 # FORMATS §13, T5: a real record of a .splat file.

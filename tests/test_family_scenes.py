@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules im
 from families import Change, Quality, Row, main, table
 from family_scenes import FAMILIES, Pictures, views
 
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.models import load_model
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from mipmap_plugin import staging
 from mipmap_plugin.errors import OutputError, OutputExists
-from mipmap_plugin.files import json_text, new_file, new_folder, refuse_output, refuse_unwritable, together, write_json
-from mipmap_plugin.staging import settle
+from mipmap_plugin.formats import staging
+from mipmap_plugin.formats.atomic import json_text, new_file, new_folder, refuse_output, refuse_unwritable, together, write_json
+from mipmap_plugin.formats.staging import settle
 
 FACTS = {"psnr_db": math.inf, "rows": [{"gain": -math.inf}, (1.5, math.nan)], "name": "Infinity", "count": 3, "known": True, "none": None}
 WRITTEN = {"psnr_db": None, "rows": [{"gain": None}, [1.5, None]], "name": "Infinity", "count": 3, "known": True, "none": None}

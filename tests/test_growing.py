@@ -9,10 +9,10 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation import growing
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import register_upsampler
-from mipmap_plugin.adaptation.validation import Validation
+from mipmap_plugin.adaptation.optimization import growing
+from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.recipes import recipe

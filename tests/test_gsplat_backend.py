@@ -21,10 +21,10 @@ from mipmap_plugin.backends.conformance import CASES, check_backend
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.gsplat import NO_GSPLAT, NOT_COMPILED, GsplatBackend, arguments
 from mipmap_plugin.backends.guests import NO_CUDA
-from mipmap_plugin.backends.projection import unit
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects, RenderSettings
 from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.splatting.rotations import unit
 
 gsplat = pytest.importorskip("gsplat", reason="gsplat is in the test extra")
 

@@ -12,12 +12,12 @@ from torch_checkpoints import aim, gsplat_folder, normalized_by_numpy, splats
 
 from mipmap_plugin.errors import CheckpointError, OutputExists, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import provenance_of
+from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.hosts import Taken
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.tags import provenance_of
-from mipmap_plugin.models.yaml_scalars import read_scalars
 from mipmap_plugin.wrap import wrap_model
 
 NAMES = ["means", "scales", "quats", "opacities", "sh0", "shN"]

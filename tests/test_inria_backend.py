@@ -94,7 +94,7 @@ def test_alpha_is_drawn_when_it_is_asked_for(package):
     assert len(package.asked) == 1
     torch.testing.assert_close(rendered.alpha, ReferenceBackend().render(splats, WIDE, Effects(1)).alpha, atol=1e-5, rtol=0)
     assert rendered.alpha is rendered.alpha and len(package.asked) == 2
-    assert replace(rendered, effects=()).alpha is rendered.alpha
+    assert rendered.but(effects=()).alpha is rendered.alpha
 
 
 @pytest.mark.parametrize("near", [0.0, 0.01, 0.2, 1.5])

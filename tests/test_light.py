@@ -4,12 +4,12 @@ import pytest
 import torch
 from tiny import cameras, model
 
-from mipmap_plugin.adaptation.light import light
+from mipmap_plugin.adaptation.start.blend_weights import light
 from mipmap_plugin.backends import get_backend
-from mipmap_plugin.backends.harmonics import C0
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.harmonics import C0
 
 
 def opacity(gaussians: Gaussians, view) -> torch.Tensor:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mipmap_plugin.adaptation.light import light
-from mipmap_plugin.adaptation.matching import MOST, ROUNDS, matched
+from mipmap_plugin.adaptation.start.blend_weights import light
+from mipmap_plugin.adaptation.start.matching import MOST, ROUNDS, matched
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects

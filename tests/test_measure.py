@@ -9,15 +9,15 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.evaluation import protocols
 from mipmap_plugin.evaluation.evaluate import Judge, training_free_rows
 from mipmap_plugin.evaluation.measure import resized_base, rivals, seen_before, warm_up, warm_watch
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol
-from mipmap_plugin.evaluation.tradeoff import Plan, measure
-from mipmap_plugin.evaluation.tradeoff_truth import photographs
+from mipmap_plugin.evaluation.tradeoff.points import Plan, measure
+from mipmap_plugin.evaluation.tradeoff.truth import photographs
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import load_scene

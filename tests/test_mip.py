@@ -13,15 +13,15 @@ import torch
 from mip_checkpoints import folder, splats
 from oracle import brute_force
 
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, sharpen_3d, smooth_3d
-from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 

@@ -13,14 +13,15 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
 from mipmap_plugin.evaluation import looks
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.files import sha256
-from mipmap_plugin.models import exchange, load_model
-from mipmap_plugin.models.cfg_args import read_cfg_args
+from mipmap_plugin.formats import splat_transform as exchange
+from mipmap_plugin.formats.atomic import sha256
+from mipmap_plugin.formats.cfg_args import read_cfg_args
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import provenance_of
+from mipmap_plugin.models import load_model
 from mipmap_plugin.models.mip import MipModel
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.tags import provenance_of
 from mipmap_plugin.scenes import write_cameras
-from mipmap_plugin.viewers import find_viewer
+from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 FAMILIES = ("mip", "gof", "analytic")

@@ -11,8 +11,8 @@ from ply_files import splat_columns, write, write_model_folder, write_splats
 from torch_checkpoints import gsplat_folder, splats
 
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.models import detect, load_model
-from mipmap_plugin.models.cfg_args import read_cfg_args
 from mipmap_plugin.models.live import adopt
 
 COLUMNS = splat_columns(4, bands=0)

@@ -10,9 +10,9 @@ from anchor_checkpoints import STANDARD, VOXEL, Layout
 from test_scaffold import VIEWS, agrees, gain, is_same, refused, state_of
 
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.torchscript import read_torchscript
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.torchscript import read_torchscript
 
 ALL = ("opacity_mlp", "cov_mlp", "color_mlp")
 

@@ -15,15 +15,15 @@ import torch
 import torch_checkpoints
 
 from mipmap_plugin import load_model, load_scene, wrap_model
-from mipmap_plugin.adaptation import growing, optimizer
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.optimization import growing, optimizer
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
-from mipmap_plugin.backends.filters import USUAL_EPS2D
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.evaluation.evaluate import evaluate
-from mipmap_plugin.scenes.images import write_image
+from mipmap_plugin.formats.images import write_image
+from mipmap_plugin.splatting.filters import USUAL_EPS2D
 
 # Older torch takes more operations apart there than the products of networks.
 EXACT = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 10)

@@ -7,10 +7,10 @@ import urllib.error
 import pytest
 import torch
 
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.scenes.images import read_image
+from mipmap_plugin.formats.images import read_image
 
 
 @pytest.fixture(autouse=True)

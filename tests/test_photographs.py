@@ -4,9 +4,9 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.photographs import Photographs
-from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects

@@ -10,11 +10,11 @@ import torch
 from oracle import below
 
 from mipmap_plugin.backends.cpu import CpuBackend
-from mipmap_plugin.backends.pixel_integral import BOUND, CUBIC, LINEAR, integral
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.pixel_integral import BOUND, CUBIC, LINEAR, integral
 
 needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
 VIEW = Camera(24, 18, 30.0, 30.0, 12.0, 9.0, torch.eye(4))

@@ -16,10 +16,10 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.images import read_image, write_image
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.scenes.images import read_image, write_image
 from mipmap_plugin.wrap import placed, wrap_model
 
 # COLMAP's world to that of a nerfstudio transforms.json, and that to the checkpoint's; the file of the run tells their product.

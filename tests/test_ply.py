@@ -8,8 +8,8 @@ import pytest
 from ply_files import splat_columns, write, write_splats
 
 from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError
-from mipmap_plugin.models import ply as ply_module
-from mipmap_plugin.models.ply import read_header, read_ply, write_ply
+from mipmap_plugin.formats import ply as ply_module
+from mipmap_plugin.formats.ply import read_header, read_ply, write_ply
 
 
 def header(*lines: str) -> bytes:

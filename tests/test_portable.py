@@ -11,9 +11,9 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
-from mipmap_plugin.adaptation.loop import Task
-from mipmap_plugin.adaptation.several import FEWER, extremes, middle
-from mipmap_plugin.adaptation.validation import Validation
+from mipmap_plugin.adaptation.optimization.run import Task
+from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.target.portable import FEWER, extremes, middle
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -22,10 +22,10 @@ from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
 from mipmap_plugin.evaluation.evaluate import Judge, adapted_row, training_free_rows
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.tags import provenance_of
-from mipmap_plugin.viewers import BUILT_IN, find_viewer, viewers_for
+from mipmap_plugin.splatting.viewers import BUILT_IN, find_viewer, viewers_for
 
 BRIEF = dict(steps=2, extra_views=1, merge_to=1.0, warm_up=0, views_per_step=3, validation_views=2)
 PAIR = ("classic", "spark")

@@ -7,11 +7,12 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation import views as views_module
-from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import register_upsampler
-from mipmap_plugin.adaptation.views import Order, Rounds, choose_views, evenly, extent
+from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.views import Order, Rounds, choose_views, extent
 from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError

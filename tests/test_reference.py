@@ -9,15 +9,15 @@ import torch
 from oracle import brute_force
 from samples import camera, gaussians, leaves
 
-from mipmap_plugin.backends import compositing
-from mipmap_plugin.backends.filters import SCREEN_FILTERS, footprint
-from mipmap_plugin.backends.harmonics import basis
-from mipmap_plugin.backends.projection import project
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.supersample import render
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting import compositing
+from mipmap_plugin.splatting.filters import SCREEN_FILTERS, footprint
+from mipmap_plugin.splatting.harmonics import basis
+from mipmap_plugin.splatting.projection import project
 
 BACKEND = ReferenceBackend()
 

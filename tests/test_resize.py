@@ -5,10 +5,10 @@ import pytest
 import torch
 from PIL import Image
 
-from mipmap_plugin.adaptation import upsamplers
-from mipmap_plugin.adaptation.resampling import matrix_of
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS, register_upsampler
+from mipmap_plugin.adaptation.target import upsamplers
+from mipmap_plugin.adaptation.target.resampling import matrix_of
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, register_upsampler
 from mipmap_plugin.errors import PluginError, SettingsError
 
 SMALLER, LARGER = (7, 10), (50, 45)
@@ -113,7 +113,7 @@ def test_built_in_upsamplers_equal_pillow(image, name, pillows):
 
 def test_an_upsampler_is_registered_as_a_function_or_as_a_string(image):
     register_upsampler("mine", lambda image, size: image.new_zeros(*size, 3))
-    register_upsampler("also-mine", "mipmap_plugin.adaptation.upsamplers:lanczos")
+    register_upsampler("also-mine", "mipmap_plugin.adaptation.target.upsamplers:lanczos")
     assert UPSAMPLERS.get("mine")(image, LARGER).shape == (*LARGER, 3)
     assert UPSAMPLERS.get("also-mine") is upsamplers.lanczos
     assert {"mine", "also-mine"} <= set(UPSAMPLERS.names())

@@ -11,16 +11,16 @@ import tiny
 import torch
 from anchor_checkpoints import Layout
 
-from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError, ShapeError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.anchors.prefilter import in_view
 from mipmap_plugin.models.columns import C0
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.prefilter import in_view
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.wrap import wrap_model

@@ -11,9 +11,9 @@ import torch
 from PIL import Image
 
 from mipmap_plugin.errors import OutputExists, SceneError, SettingsError, ShapeError
+from mipmap_plugin.formats.images import composite, image_size, read_image, write_image
 from mipmap_plugin.scenes import load_scene, model_cameras, read_cameras, read_transforms
 from mipmap_plugin.scenes.cameras_json import count_test_cameras, trained_size
-from mipmap_plugin.scenes.images import composite, image_size, read_image, write_image
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 

@@ -5,7 +5,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.snapshot import Snapshot
+from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 

@@ -11,10 +11,10 @@ from torch_checkpoints import aim, splatfacto_content, splatfacto_folder, splatf
 
 from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SceneError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.hosts import Taken
-from mipmap_plugin.models.yaml_scalars import read_scalars
 from mipmap_plugin.wrap import wrap_model
 
 CKPT = "nerfstudio_models/step-000029999.ckpt"

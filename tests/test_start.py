@@ -4,8 +4,8 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation import start
-from mipmap_plugin.adaptation.validation import Validation
+from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.wrap import wrap_model
 
 SCALE, COUNT = 1 / 4, 80

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import nn
 
-from mipmap_plugin.adaptation import super_resolution
-from mipmap_plugin.adaptation.disk_cache import cache_folder, cached, fingerprint
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.super_resolution import Network
-from mipmap_plugin.adaptation.upsamplers import find_upsampler
+from mipmap_plugin.adaptation.target import super_resolution
+from mipmap_plugin.adaptation.target.disk_cache import cache_folder, cached, fingerprint
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.super_resolution import Network
+from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.torchvision_absent import torchvision_optional
@@ -113,7 +113,7 @@ def test_without_spandrel_the_remedy_is_named(monkeypatch, tmp_path):
 @pytest.mark.parametrize(("name", "least_gain"), [("X2.pt", 0.5), ("X4.pt", 0.5), ("realesr-animevideov3.pth", -9)])
 def test_real_weights_restore_detail(spandrel, shared_data, name, least_gain):
     """Above bicubic in dB; the last is trained to look sharp, which costs dB."""
-    from mipmap_plugin.scenes.images import read_image
+    from mipmap_plugin.formats.images import read_image
 
     truth = read_image(shared_data / "images" / "lego" / "test" / "r_0.png", (1.0, 1.0, 1.0))[300:492, 300:492]
     network = Network(shared_data / "upsamplers" / name)

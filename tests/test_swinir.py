@@ -11,8 +11,8 @@ import tiny
 import torch
 
 from mipmap_plugin import cli
-from mipmap_plugin.adaptation import super_resolution
-from mipmap_plugin.adaptation.super_resolution import Network
+from mipmap_plugin.adaptation.target import super_resolution
+from mipmap_plugin.adaptation.target.super_resolution import Network
 from mipmap_plugin.torchvision_absent import torchvision_optional
 from mipmap_plugin.wrap import wrap_model
 
@@ -98,7 +98,8 @@ def test_it_is_fused_with_the_base_at_zoom_in(swinir, tmp_path):
 def test_nothing_that_its_code_warns_of_reaches_the_caller(swinir, tmp_path):
     """It calls torch.meshgrid without an index order, of which torch warns."""
     path = saved(tmp_path / "net.pth", swinir(2, LIGHT))
-    code = f"import torch; from mipmap_plugin.adaptation.super_resolution import Network; Network({str(path)!r})(torch.zeros(8, 8, 3), (16, 16))"
+    load = "from mipmap_plugin.adaptation.target.super_resolution import Network"
+    code = f"import torch; {load}; Network({str(path)!r})(torch.zeros(8, 8, 3), (16, 16))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == "" and done.stdout == ""
 
@@ -109,7 +110,7 @@ def test_warnings_of_others_do_not_reach_the_terminal_and_ours_do(monkeypatch, a
 
     def command(**_):
         warnings.warn_explicit("theirs", UserWarning, "x.py", 1, module="torch.functional")
-        warnings.warn_explicit("ours", UserWarning, "y.py", 1, module="mipmap_plugin.adaptation.resume")
+        warnings.warn_explicit("ours", UserWarning, "y.py", 1, module="mipmap_plugin.adaptation.optimization.resume")
 
     monkeypatch.setattr(sys, "warnoptions", asked)
     monkeypatch.setattr(cli.app, "cli", command)

@@ -11,7 +11,7 @@ from anchor_checkpoints import Embedding, trace
 from torch import nn
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.models.torchscript import read_torchscript
+from mipmap_plugin.formats.torchscript import read_torchscript
 
 
 def traced(path):

@@ -14,9 +14,9 @@ from torch_checkpoints import gsplat_folder, splats
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.evaluation import protocols
+from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models import load_model
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.scenes.images import write_image
 from mipmap_plugin.wrap import placed, wrap_model
 
 pycolmap = pytest.importorskip("pycolmap")

@@ -9,14 +9,15 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation import loop, start
-from mipmap_plugin.adaptation.optimizer import make_optimizer, take_back
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.snapshot import Snapshot
-from mipmap_plugin.adaptation.validation import FIRST, GENTLER, HARDLY, HARM, KEPT_BACK, WINDOW, Steering, Validation, hold_back
+from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, take_back
+from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
+from mipmap_plugin.adaptation.optimization.validation import FIRST, GENTLER, HARDLY, HARM, KEPT_BACK, WINDOW, Steering, Validation, hold_back
+from mipmap_plugin.adaptation.start import candidates as start
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.models.ply import read_ply
+from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model

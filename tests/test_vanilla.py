@@ -9,15 +9,16 @@ import pytest
 import torch
 from ply_files import splat_columns, splat_names, write, write_model_folder, write_splats
 
-from mipmap_plugin import staging
 from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError, ShapeError
+from mipmap_plugin.formats import staging
+from mipmap_plugin.formats.cfg_args import read_cfg_args
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import inria_folder, load_model
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.cfg_args import read_cfg_args
-from mipmap_plugin.models.ply import read_ply
-from mipmap_plugin.models.tags import provenance_of
-from mipmap_plugin.models.vanilla import MIN_SCALE, OPACITY_MARGIN, VanillaModel, load_vanilla, unit_quaternions
+from mipmap_plugin.models.vanilla import MIN_SCALE, OPACITY_MARGIN, VanillaModel, load_vanilla
+from mipmap_plugin.splatting.rotations import unit_quaternions
 
 PROVENANCE = {"scale": 0.25, "settings": {"steps": 500}}
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}

@@ -9,13 +9,13 @@ import torch
 from test_exchange import RECORD
 from test_reference import BACKEND, t2_camera, t3_gaussian
 
-from mipmap_plugin.backends.filters import footprint
-from mipmap_plugin.backends.harmonics import colors
-from mipmap_plugin.backends.projection import project
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.formats.magic import SPLAT_RECORD, kind_of
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.magic import SPLAT_RECORD, kind_of
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting.filters import footprint
+from mipmap_plugin.splatting.harmonics import colors
+from mipmap_plugin.splatting.projection import project
 
 LEAST_LOGIT = -5.537334267  # logit(1/255), of the faintest splat that is drawn
 

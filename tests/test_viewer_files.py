@@ -10,10 +10,10 @@ import tiny
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.ply import read_ply
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained, flattened
-from mipmap_plugin.models.tags import provenance_of
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import Interrupted, wrap_model
 

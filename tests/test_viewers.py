@@ -10,18 +10,18 @@ import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
 from mipmap_plugin.backends.base import Needs
-from mipmap_plugin.backends.buckets import ranks
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.gsplat import GsplatBackend
 from mipmap_plugin.backends.inria import InriaBackend
-from mipmap_plugin.backends.packing import packed
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.triton import TritonBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings, explain
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.viewers import BUILT_IN, EDGE, Viewer, find_viewer
+from mipmap_plugin.splatting.buckets import ranks
+from mipmap_plugin.splatting.packing import packed
+from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer
 from mipmap_plugin.wrap import Wrapped
 
 C0 = 0.28209479177387814

@@ -12,10 +12,10 @@ import torch
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.supersample import render
-from mipmap_plugin.backends.window import WIDE, moments
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.window import WIDE, moments
 
 needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
 BACKENDS = [ReferenceBackend(), pytest.param(CpuBackend(), marks=needs_numba)]

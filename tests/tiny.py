@@ -11,11 +11,11 @@ import torch
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import orbit, write_cameras
-from mipmap_plugin.scenes.images import write_image
 
 WIDTH, HEIGHT = 32, 24  # px
 

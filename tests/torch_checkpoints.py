@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import UPSAMPLERS
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
 
 # What yaml.dump(vars(cfg)) of gsplat's simple_trainer leaves: a tag of a Python object, and lists, among plain lines.
 CFG_YML = """antialiased: {antialiased}

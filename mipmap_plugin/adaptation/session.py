@@ -6,38 +6,34 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
-from mipmap_plugin.adaptation.detail import Detail
-from mipmap_plugin.adaptation.growing import verdict
-from mipmap_plugin.adaptation.loop import Run, Task, adapt
-from mipmap_plugin.adaptation.photographs import Photographs
-from mipmap_plugin.adaptation.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.optimization.growing import verdict
+from mipmap_plugin.adaptation.optimization.loop import adapt
+from mipmap_plugin.adaptation.optimization.resume import Keeper
+from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.optimization.state_file import StateFile
+from mipmap_plugin.adaptation.optimization.validation import HARM, WINDOW, Validation, hold_back
 from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
-from mipmap_plugin.adaptation.resume import Keeper
-from mipmap_plugin.adaptation.several import extremes, middle
-from mipmap_plugin.adaptation.start import Start, warm
-from mipmap_plugin.adaptation.state_file import StateFile
-from mipmap_plugin.adaptation.validation import HARM, WINDOW, Validation, hold_back
-from mipmap_plugin.adaptation.views import choose_views, evenly, with_times
-from mipmap_plugin.backends import supersample
-from mipmap_plugin.backends.base import Backend, Rendered
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.adaptation.start.candidates import Problem, Start, warm
+from mipmap_plugin.adaptation.target.detail import Detail
+from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.target.portable import extremes, middle
+from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.views import choose_views, with_times
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
-from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.files import together, write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
-from mipmap_plugin.models.exposure import exposed
-from mipmap_plugin.models.outputs import REPORT
 
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
@@ -46,36 +42,6 @@ AS_IT_IS = "the base as it is"
 
 # What a zoom-in is validated against: the base's own image, whatever it is adapted to.
 AS_THE_BASE = {"compare_at": "base", "quantize_truth": False}
-
-
-@dataclass(frozen=True, eq=False)
-class Adapted:
-    """A model that looks right at its scale, and the report of how it came to."""
-
-    model: SplatModel
-    report: Report
-    backend: Backend
-    effects: Effects
-    viewers: Mapping[str, Effects] = field(default_factory=dict)  # how each viewer that the file is for renders it
-    state: StateFile | None = None  # of the run, which is of use until the model is saved
-    views: Sequence[Camera] = ()  # of the base scale, that were adapted to or selected on
-
-    def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
-        """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`. `viewer`: one of `viewers`."""
-        if viewer is not None and viewer not in self.viewers:
-            made_for = ", ".join(filter(None, self.viewers)) or "none by name"
-            raise SettingsError(f"this model is not made for the viewer {viewer!r}, but for {made_for}")
-        effects = self.effects if viewer is None else self.viewers[viewer]
-        return shown(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
-
-    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
-        with together(Path(path)):  # no new model without its report
-            saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
-            write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=True)
-        if self.state is not None:
-            self.state.remove()
-        return saved
 
 
 @dataclass(frozen=True)
@@ -127,7 +93,9 @@ class Session:
         with self.phase("compilation"):
             warm(self.backend, self.base.gaussians(self.views[0]), (self.trained, *self.targets.values()), gradients=self.config.steps > 0)
         as_it_is = self._to_be_shown(self._given)
-        student, start = Start(self).best()
+        weighs = self.differentiates and self.base.traits.same_for_all_views
+        problem = Problem(self.fresh, self.views, self.scale, self.trained, self.aim, self.config, self.backend, weighs, self.steer, self.phase)
+        student, start = Start(problem).best()
         initial = student.copy()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
         curve: list[CurvePoint] = []
@@ -259,21 +227,6 @@ class Session:
             curve=curve,
             versions=versions(),
         )
-
-
-@torch.no_grad()
-def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None) -> Rendered:
-    """What the model, its splats changed by `form`, shows to a camera, and the effects that it called for. Raises SettingsError."""
-    matrix = model.traits.exposures.of(camera) if effects.exposure else None
-    gaussians = model.gaussians(camera) if form is None else form(model.gaussians(camera))
-    rendered = supersample.render(backend, gaussians, camera, effects)
-    if effects.outputs:
-        from mipmap_plugin.backends import geometry  # an effect that is off is not imported
-
-        rendered = geometry.beside(rendered, backend, gaussians, camera, effects)
-    if matrix is not None:
-        rendered = replace(rendered, image=exposed(rendered.image, matrix))
-    return replace(rendered, effects=explain(effects, gaussians, effects_of(model)))
 
 
 def _shows(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:

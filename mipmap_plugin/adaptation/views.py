@@ -76,11 +76,6 @@ class Rounds:
         return self.views[self._order[place]]
 
 
-def evenly(views: Sequence[Camera], most: int) -> list[Camera]:
-    """At most `most` of the views, spread over their order."""
-    return [views[place * len(views) // most] for place in range(most)] if len(views) > most else list(views)
-
-
 def extent(views: Sequence[Camera]) -> float:
     """World units: 1.1 times the largest distance of a camera from their mean, INRIA's `spatial_lr_scale`.
 

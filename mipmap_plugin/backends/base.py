@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -45,16 +46,30 @@ OF_INTEGRALS = frozenset(
 API_VERSION = 1
 
 
-@dataclass(frozen=True, eq=False)
 class Rendered:
     """One image. Differentiable in the Gaussians that it was rendered from."""
 
-    image: Tensor  # [H, W, 3], background included, not clamped
-    alpha: Tensor  # [H, W], 1 - transmittance
-    # What a wrapped model adds, and a backend need not.
-    depth: Tensor | None = None  # [H, W] world units, where asked for (`geometry.depth`)
-    normals: Tensor | None = None  # [H, W, 3] unit, world axes, where asked for (`geometry.normals`)
-    effects: tuple[Effect, ...] = ()  # what was simulated for it and what was not
+    def __init__(
+        self,
+        image: Tensor,  # [H, W, 3], background included, not clamped
+        alpha: Tensor | Callable[[], Tensor],  # [H, W], 1 - transmittance; or what draws it, where it takes another pass
+        depth: Tensor | None = None,  # [H, W] world units, where asked for (`geometry.depth`); a wrapped model adds this and what follows
+        normals: Tensor | None = None,  # [H, W, 3] unit, world axes, where asked for (`geometry.normals`)
+        effects: tuple[Effect, ...] = (),  # what was simulated for it and what was not
+    ) -> None:
+        self.image, self.depth, self.normals, self.effects, self._alpha = image, depth, normals, effects, alpha
+
+    @property
+    def alpha(self) -> Tensor:
+        """[H, W]: 1 - transmittance, drawn when it is first asked for."""
+        if callable(self._alpha):
+            self._alpha = self._alpha()
+        return self._alpha
+
+    def but(self, **changes: Any) -> Rendered:
+        """The same with other parts, by the names of the arguments above."""
+        parts: dict[str, Any] = dict(image=self.image, alpha=self._alpha, depth=self.depth, normals=self.normals, effects=self.effects)
+        return Rendered(**parts | changes)
 
 
 @dataclass(frozen=True)

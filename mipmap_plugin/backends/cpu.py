@@ -7,13 +7,13 @@ import importlib.util
 import torch
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends import buckets
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.packing import packed
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import INTEGRATED, Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting import buckets
+from mipmap_plugin.splatting.packing import packed
 
 NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
 

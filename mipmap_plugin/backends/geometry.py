@@ -14,17 +14,17 @@ from torch.nn.functional import normalize
 
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
-from mipmap_plugin.backends.harmonics import C0
-from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.harmonics import C0
+from mipmap_plugin.splatting.rotations import rotations
 
 
 def beside(rendered: Rendered, backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
     """`rendered` with what `effects.outputs` ask for."""
     asked, shown = effects.outputs, (backend, gaussians, camera, effects)
-    return replace(rendered, depth=depth(*shown) if "depth" in asked else None, normals=normals(*shown) if "normals" in asked else None)
+    return rendered.but(depth=depth(*shown) if "depth" in asked else None, normals=normals(*shown) if "normals" in asked else None)
 
 
 def depth(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor:

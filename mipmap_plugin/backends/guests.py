@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import Backend, Needs
-from mipmap_plugin.backends.projection import unit
 from mipmap_plugin.backends.reference import finite_rows
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.rotations import unit
 
 NO_CUDA = "it needs a CUDA GPU, and torch sees none here"
 UNTRIED = "never run on a GPU by this package's author"

@@ -20,22 +20,21 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.filters import footprint
 from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, Asked, sound, turned
-from mipmap_plugin.backends.projection import project, rotations
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.filters import footprint
+from mipmap_plugin.splatting.projection import project
+from mipmap_plugin.splatting.rotations import rotations
 
 PACKAGE = "diff_gaussian_rasterization"
 NO_PACKAGE = f"it needs {PACKAGE}, which is built from INRIA's sources (for non-commercial use)"
@@ -90,20 +89,8 @@ class InriaBackend:
             image = package.GaussianRasterizer(raster_settings=settings)(**splats, **painted)[0]
             return frame.cut(image.permute(1, 2, 0))
 
-        return _AlphaAtUse(draw(effects.background, colors), lambda: draw((0.0, 0.0, 0.0), white)[..., 0])
-
-
-class _AlphaAtUse(Rendered):
-    """An image whose alpha is drawn when somebody asks for it."""
-
-    def __init__(self, image: Tensor, alpha: Tensor | Callable[[], Tensor], **others: Any) -> None:
-        super().__init__(image, alpha, **others)  # type: ignore[arg-type]
-        if callable(alpha):
-            self.__dict__["_draw_alpha"] = self.__dict__.pop("alpha")
-
-    @cached_property
-    def alpha(self) -> Tensor:  # type: ignore[override]
-        return self.__dict__["_draw_alpha"]()
+        # This rasterizer has no alpha of its own: it is what white splats on black show, in a pass that most never ask for.
+        return Rendered(draw(effects.background, colors), lambda: draw((0.0, 0.0, 0.0), white)[..., 0])
 
 
 def missing() -> list[str]:

@@ -7,19 +7,19 @@ import math
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends import buckets
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.compositing import Splats, alone, composite
-from mipmap_plugin.backends.filters import SCREEN_FILTERS, Footprint, footprint
-from mipmap_plugin.backends.harmonics import colors
-from mipmap_plugin.backends.packing import in_steps, packed
-from mipmap_plugin.backends.pixel_integral import PixelIntegral
-from mipmap_plugin.backends.projection import Projected, project
-from mipmap_plugin.backends.surfels import Surfels, surfels
-from mipmap_plugin.backends.window import WindowIntegral
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import SURFEL, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting import buckets
+from mipmap_plugin.splatting.compositing import Splats, alone, composite
+from mipmap_plugin.splatting.filters import SCREEN_FILTERS, Footprint, footprint
+from mipmap_plugin.splatting.harmonics import colors
+from mipmap_plugin.splatting.packing import in_steps, packed
+from mipmap_plugin.splatting.pixel_integral import PixelIntegral
+from mipmap_plugin.splatting.projection import Projected, project
+from mipmap_plugin.splatting.surfels import Surfels, surfels
+from mipmap_plugin.splatting.window import WindowIntegral
 
 
 class ReferenceBackend:

@@ -9,7 +9,7 @@ from typing import Any
 from mipmap_plugin.backends import BACKENDS
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.commands.types import Background, ScreenFilter
-from mipmap_plugin.files import json_text
+from mipmap_plugin.formats.atomic import json_text
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import Wrapped, wrap_model

@@ -11,7 +11,7 @@ import tyro
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, each_once
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.files import refuse_output, refuse_unwritable, write_json
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.scenes import Scene, load_scene
 

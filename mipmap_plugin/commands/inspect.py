@@ -6,7 +6,7 @@ from mipmap_plugin.commands.common import summary, tell
 from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
 from mipmap_plugin.effects import explain
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.anchors import AnchorModel
+from mipmap_plugin.models.anchors.model import AnchorModel
 from mipmap_plugin.models.base import effects_of
 from mipmap_plugin.models.health import examine
 from mipmap_plugin.wrap import wrap_model

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.models.exchange import READ_ONLY, WRITTEN
+from mipmap_plugin.formats.splat_transform import READ_ONLY, WRITTEN
 
 
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:

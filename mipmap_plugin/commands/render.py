@@ -13,10 +13,10 @@ from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.files import refuse_output, refuse_unwritable
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+from mipmap_plugin.formats.images import write_array, write_image
 from mipmap_plugin.models.outputs import parts_of
-from mipmap_plugin.scenes.images import write_array, write_image
-from mipmap_plugin.wrap import Wrapped
+from mipmap_plugin.wrap import Drawn, Wrapped
 
 
 def render(
@@ -71,7 +71,8 @@ def render(
             wrapped.model.traits.exposures.of(camera)  # before anything is written
     refuse_unwritable(pictures[0])
     for camera, picture in zip(views, pictures, strict=True):
-        shown = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, filter_3d, outputs=outputs, exposure=exposure, viewer=viewer)
+        drawn = Drawn(viewer=viewer, filter_3d=filter_3d, outputs=outputs, exposure=exposure)
+        shown = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, **drawn)
         write_image(picture, shown.image, overwrite=overwrite)
         for name in outputs:
             write_array(_beside(picture, name), getattr(shown, name), overwrite=overwrite)

@@ -57,9 +57,9 @@ def tradeoff(
         overwrite: Replace results that exist.
         json: Print JSON instead of tables.
     """
-    from mipmap_plugin.evaluation.tradeoff import Plan
-    from mipmap_plugin.evaluation.tradeoff_files import facts, refuse, table
-    from mipmap_plugin.evaluation.tradeoff_run import run
+    from mipmap_plugin.evaluation.tradeoff.files import Folder, facts, refuse, table
+    from mipmap_plugin.evaluation.tradeoff.points import Plan
+    from mipmap_plugin.evaluation.tradeoff.run import run
 
     refuse(output, picture, overwrite)
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
@@ -67,5 +67,5 @@ def tradeoff(
     model.target(viewer)
     for name, each in product(plan.recipes, scale):
         make_config(name, each)
-    found = run(model, scene, each_once(scale), plan, views, output, picture=picture, overwrite=overwrite)
+    found = run(model, scene, each_once(scale), plan, views, Folder(output, picture, overwrite))
     tell(facts(found, complete=True), json) if json else print("\n\n".join(table(each) for each in found))

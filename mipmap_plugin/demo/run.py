@@ -10,15 +10,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.demo.world import render_world
 from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row, training_free_rows
 from mipmap_plugin.evaluation.protocols import Protocol
 from mipmap_plugin.evaluation.report import table
-from mipmap_plugin.files import refuse_output, refuse_unwritable
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.scenes import read_cameras
-from mipmap_plugin.scenes.images import write_image
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 PROTOCOL = Protocol("demo", "box", truncate=False)

@@ -20,7 +20,7 @@ from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, Test
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.viewers import viewers_for
+from mipmap_plugin.splatting.viewers import viewers_for
 from mipmap_plugin.wrap import Adapted, Wrapped
 
 

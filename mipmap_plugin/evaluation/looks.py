@@ -6,6 +6,7 @@ from statistics import fmean
 
 import torch
 
+from mipmap_plugin.camera import evenly
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr
 from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.wrap import Wrapped
@@ -34,7 +35,7 @@ def looks(wrapped: Wrapped) -> str:
     most = min(VIEWS, len(views), SPLATS // max(1, count), PIXELS // pixels)
     if most == 0:
         return f"not drawn: {count:,} splats on {pixels:,} pixels take too long; `mipmap-plugin render --viewer NAME` draws them"
-    chosen = [views[nth * len(views) // most] for nth in range(most)]
+    chosen = evenly(views, most)
     truths = [wrapped.render(view).image for view in chosen]
     told = []
     for viewer in VIEWERS:

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import Stopwatch
-from mipmap_plugin.adaptation.resize import resize
-from mipmap_plugin.adaptation.upsamplers import find_upsampler
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
 from mipmap_plugin.adaptation.views import extent
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.wrap import Wrapped

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
-from mipmap_plugin.models.torch_file import load_torch
+from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.torchvision_absent import torchvision_optional
 
 # A backbone, and what it is fed with: images in -1..1 as LPIPS is defined, or (01) in 0..1, as the papers of this field do with VGG.

@@ -13,20 +13,17 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 from typing import Protocol as TypingProtocol
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.photographs import as_sampled
-from mipmap_plugin.adaptation.resize import resize
+from mipmap_plugin.adaptation.target.photographs import as_sampled
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.images import image_size, pillow_bicubic, read_image
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.scenes.images import image_size, pillow_bicubic, read_image
-
-ProtocolName = Literal["P1", "P3", "P4"]
 
 # COLMAP scenes come with their photographs made smaller beforehand: images_2, images_4, images_8 beside images.
 READY_MADE = re.compile(r"images(_\d+)?$")

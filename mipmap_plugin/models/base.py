@@ -25,7 +25,7 @@ CARRIED = "carried"
 class TrainedScale:
     """The screen filter that a checkpoint was trained with, and how its cameras were sampled."""
 
-    screen_filter: str = "classic"  # a name of backends/filters.py
+    screen_filter: str = "classic"  # a name of splatting/filters.py
     eps2d: float = DILATION  # px² of a training pixel
     resolution: float = -1  # INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px
     background: tuple[float, float, float] | None = None  # linear RGB; None: the checkpoint does not say

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError
-
-# The constant basis function of real spherical harmonics, 1 / (2·sqrt(pi)): a color is C0·f_dc + 0.5.
-C0 = 0.28209479177387814
+from mipmap_plugin.splatting.harmonics import C0
 
 # Columns of f_rest, and the SH degree that they make.
 SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
@@ -108,16 +106,3 @@ def stacked(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> Tensor
             for i, name in enumerate(names):
                 block[start : start + CHUNK, i] = columns[name][start : start + CHUNK]
     return torch.from_numpy(block)
-
-
-def unit_quaternions(quats: Tensor) -> Tensor:
-    """[N, 4] -> [N, 4] of length 1, with a finite gradient everywhere; a zero quaternion becomes the identity.
-
-    Dividing by the largest component first keeps the squares in range. It is taken as a constant, which is exact: the
-    result does not depend on it.
-    """
-    largest = quats.detach().abs().amax(dim=1, keepdim=True)
-    is_zero = largest < torch.finfo(quats.dtype).tiny
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-    scaled = torch.where(is_zero, identity, quats / torch.where(is_zero, 1.0, largest))
-    return scaled / scaled.norm(dim=1, keepdim=True)

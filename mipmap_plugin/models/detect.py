@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mipmap_plugin.errors import CheckpointError, PluginError
-from mipmap_plugin.files import settled
+from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.models.families import FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import Family, Files, Match
 

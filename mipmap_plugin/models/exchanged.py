@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.splat_transform import EXCHANGE, as_ply
 from mipmap_plugin.models.detect import detect
-from mipmap_plugin.models.exchange import EXCHANGE, as_ply
 from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.family import Files
 from mipmap_plugin.models.vanilla import OPACITY_MARGIN, VanillaModel, read_vanilla

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from functools import partial
 
 from mipmap_plugin.errors import PluginError
-from mipmap_plugin.models.anchor_networks import missing_networks
-from mipmap_plugin.models.exchange import EXCHANGE
+from mipmap_plugin.formats.splat_transform import EXCHANGE
+from mipmap_plugin.formats.tags import render_mode
+from mipmap_plugin.models.anchors.networks import missing_networks
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
 from mipmap_plugin.models.places import GSPLAT, NETWORKS, SPLATFACTO, is_coarse, network_of
-from mipmap_plugin.models.tags import render_mode
 from mipmap_plugin.registry import Registry
 
 Recognize = Callable[[Files], Match | None]
@@ -134,11 +134,11 @@ BUILT_IN = (
         for name, title in {"mip": "Mip-Splatting", "gof": "Gaussian Opacity Fields", "analytic": "Analytic-Splatting"}.items()
     ),
     family("2dgs", "2D Gaussian splatting", certain(_is_flat, "two scales"), load=f"{LOADERS}.surfels:load_surfels"),
-    family("scaffold", "Scaffold-GS", anchors("scaffold"), load=f"{LOADERS}.scaffold:load_scaffold", before=FLAT_OR_FILTERED),
-    family("octree", "Octree-GS", anchors("octree"), load=f"{LOADERS}.octree:load_octree", before=FLAT_OR_FILTERED),
-    family("deformable", "Deformable 3D Gaussians", deformable, load=f"{LOADERS}.deformable:load_deformable"),
-    family("4dgs", "4D Gaussians", hexplane, load=f"{LOADERS}.hexplane:load_hexplane", before=("deformable", "sc-gs")),
-    family("gsplat", "gsplat", torch_file("splats"), load=f"{LOADERS}.gsplat:load_gsplat", before=("splatfacto",), place=GSPLAT),
+    family("scaffold", "Scaffold-GS", anchors("scaffold"), load=f"{LOADERS}.anchors.scaffold:load_scaffold", before=FLAT_OR_FILTERED),
+    family("octree", "Octree-GS", anchors("octree"), load=f"{LOADERS}.anchors.octree:load_octree", before=FLAT_OR_FILTERED),
+    family("deformable", "Deformable 3D Gaussians", deformable, load=f"{LOADERS}.moving.deformable:load_deformable"),
+    family("4dgs", "4D Gaussians", hexplane, load=f"{LOADERS}.moving.hexplane:load_hexplane", before=("deformable", "sc-gs")),
+    family("gsplat", "gsplat", torch_file("splats"), load=f"{LOADERS}.gsplat.model:load_gsplat", before=("splatfacto",), place=GSPLAT),
     family(
         "splatfacto", "splatfacto (nerfstudio)", torch_file("pipeline", "gauss_params"),
         load=f"{LOADERS}.splatfacto:load_splatfacto", place=SPLATFACTO,

@@ -8,11 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.models.cfg_args import read_cfg_args
-from mipmap_plugin.models.magic import kind_of, pickle_of
+from mipmap_plugin.formats.cfg_args import read_cfg_args
+from mipmap_plugin.formats.magic import kind_of, pickle_of
+from mipmap_plugin.formats.ply import Header, read_header
+from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.places import around
-from mipmap_plugin.models.ply import Header, read_header
-from mipmap_plugin.models.tags import provenance_of
 
 # Raised by one when a family that was written for the old contract no longer works.
 API_VERSION = 1

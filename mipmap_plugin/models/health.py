@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol, TypeVar
 
 from torch import Tensor
 
 from mipmap_plugin.models.base import SplatModel
 
-if TYPE_CHECKING:
-    from mipmap_plugin.models.vanilla import Splats
+Splats = TypeVar("Splats", bound="HasRows")
+
+
+class HasRows(Protocol):
+    """A model that can be made smaller."""
+
+    notes: list[str]
+
+    def keep_rows(self: Splats, keep: Tensor) -> Splats:
+        """A new model of the rows where `keep` [N] is True."""
+
 
 # Below one 8-bit step no rasterizer of the field draws a splat (diff-gaussian-rasterization, forward.cu).
 MIN_VISIBLE = 1 / 255

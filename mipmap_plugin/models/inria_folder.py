@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.files import new_folder
+from mipmap_plugin.formats.atomic import new_folder
+from mipmap_plugin.formats.cfg_args import format_cfg_args, read_cfg_args_and_rest
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.cfg_args import format_cfg_args, read_cfg_args_and_rest
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 
 # Copied byte for byte: the cameras, and what SIBR's viewer and `load_ply` of 3DGS look for.

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import SettingsError, ShapeError
-from mipmap_plugin.models import gsplat, splatfacto
-from mipmap_plugin.models.anchor_networks import NEEDED, Weights
+from mipmap_plugin.models import splatfacto
+from mipmap_plugin.models.anchors.networks import NEEDED, Weights
+from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
 from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, lacking
-from mipmap_plugin.models.scaffold import scaffold_in_memory
+from mipmap_plugin.models.gsplat import model as gsplat
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
 

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.files import refuse_output, refuse_to_lose
-from mipmap_plugin.models.exchange import refuse_as_folder
+from mipmap_plugin.formats.atomic import refuse_output, refuse_to_lose
+from mipmap_plugin.formats.splat_transform import refuse_as_folder
+from mipmap_plugin.models.base import TrainedScale
 
 # Where the projects that are read keep the parts of a checkpoint, in their folders.
 PARTS = ("point_cloud", "deform", "ckpts", "nerfstudio_models")
@@ -42,6 +43,13 @@ def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path 
     if holds is not None:
         refuse_as_folder(path)
         refuse_to_lose(path, source if folder is None else folder, holds)
+
+
+def refuse_own_filter(path: Path, trained: TrainedScale) -> None:
+    """Raise SettingsError where an exchange format is asked for, at `path`, and splats need the filter of their training."""
+    if trained.keeps_filter:
+        own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
+        raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
 
 
 def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:

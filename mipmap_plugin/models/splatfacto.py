@@ -14,16 +14,16 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import CheckpointError, OutputError, SceneError, ShapeError
-from mipmap_plugin.files import new_folder, sha256
+from mipmap_plugin.formats.atomic import new_folder, sha256
+from mipmap_plugin.formats.tags import render_mode
+from mipmap_plugin.formats.torch_file import load_torch, save_torch, step_and_comments
+from mipmap_plugin.formats.yaml_scalars import read_scalars, with_scalar
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.columns import C0
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.hosts import Taken
 from mipmap_plugin.models.places import SPLATFACTO
-from mipmap_plugin.models.tags import render_mode
-from mipmap_plugin.models.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.models.vanilla import OPACITY_MARGIN, Origin, VanillaModel, without_poison
-from mipmap_plugin.models.yaml_scalars import read_scalars, with_scalar
+from mipmap_plugin.splatting.harmonics import C0
 
 PLACE, FILE = SPLATFACTO
 

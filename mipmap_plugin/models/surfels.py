@@ -1,4 +1,4 @@
-"""2D Gaussian Splatting (Huang et al. 2024) and its descendants: splats without thickness, which rays meet (`backends.surfels`).
+"""2D Gaussian Splatting (Huang et al. 2024) and its descendants: splats without thickness, which rays meet (`splatting.surfels`).
 
 Everything but the third scale is stored as 3DGS does. An adapted file is for the project that it came from, and keeps its filter.
 """
@@ -20,8 +20,8 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SCALE, to_parameters
 from mipmap_plugin.models.detect import detect_as
-from mipmap_plugin.models.hexplane import quaternion_product
 from mipmap_plugin.models.vanilla import MIN_SCALE, VanillaModel, read_splats
+from mipmap_plugin.splatting.rotations import quaternion_product
 
 # The log scale that stands for no thickness, which no file holds.
 FLAT = float(torch.tensor(MIN_SCALE).log())

@@ -14,19 +14,20 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import CheckpointError, SettingsError, ShapeError
-from mipmap_plugin.files import sha256
+from mipmap_plugin.formats.atomic import sha256
+from mipmap_plugin.formats.ply import read_ply, write_ply
+from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, write_exchange
+from mipmap_plugin.formats.tags import render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters, unit_quaternions
+from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect_as
-from mipmap_plugin.models.exchange import is_written, refuse_exchange, write_exchange
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Host, Taken
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
-from mipmap_plugin.models.outputs import finite, refuse_parts
-from mipmap_plugin.models.ply import read_ply, write_ply
-from mipmap_plugin.models.tags import render_mode, with_tags
+from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts
+from mipmap_plugin.splatting.rotations import unit_quaternions
 
 Splats = TypeVar("Splats", bound="VanillaModel")
 
@@ -173,7 +174,8 @@ class VanillaModel:
         parameters = finite(self._parameters, LARGEST)
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
         if is_written(path):
-            return write_exchange(path, lambda ply: write_ply(ply, self._columns(parameters), comments), self.trained, overwrite=overwrite)
+            refuse_own_filter(path, self.trained)
+            return write_exchange(path, lambda ply: write_ply(ply, self._columns(parameters), comments), overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
         columns = {**self._columns(parameters), **self._origin.extras}
@@ -190,7 +192,8 @@ class VanillaModel:
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """What `save` would refuse about `path`, before anything is done for it. Raises OutputExists, OutputError, SettingsError."""
         if is_written(path):
-            refuse_exchange(path, self.trained)
+            refuse_own_filter(path, self.trained)
+            refuse_exchange(path)
         a_file = path.suffix.lower() == ".ply" or is_written(path)
         host = None if a_file else self._origin.host
         holds = host.holds(path) if host else None if a_file else "point_cloud"

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, SettingsError
-from mipmap_plugin.scenes.images import image_size, is_file, read_image
+from mipmap_plugin.formats.images import image_size, is_file, read_image
 from mipmap_plugin.scenes.lenses import Lens
 
 

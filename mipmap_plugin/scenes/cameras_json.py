@@ -13,8 +13,8 @@ import torch
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
-from mipmap_plugin.files import write_json
-from mipmap_plugin.scenes.json_file import MAX_SIDE, numbers, pixels, positive, present, read_json, rotation
+from mipmap_plugin.formats.atomic import write_json
+from mipmap_plugin.formats.json_file import MAX_SIDE, numbers, pixels, positive, present, read_json, rotation
 
 # INRIA's reader holds out every eighth photograph of a COLMAP scene.
 TEST_EVERY = 8

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.formats.images import image_size, is_file
+from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, photographs_folder, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
-from mipmap_plugin.scenes.images import image_size, is_file
-from mipmap_plugin.scenes.json_file import pixels
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
 
 if TYPE_CHECKING:

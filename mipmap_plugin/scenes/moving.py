@@ -13,9 +13,9 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.formats.images import image_size, is_file, read_array
+from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.images import image_size, is_file, read_array
-from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.transforms import viewmat_from_opengl
 
 # DyNeRF: px of the video's width, which its focal lengths are stated at, and of what is trained on; and the frames of a video.

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.formats.images import image_size, is_file
+from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import Scene
-from mipmap_plugin.scenes.images import image_size, is_file
-from mipmap_plugin.scenes.json_file import numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")

@@ -13,7 +13,7 @@ from browser import VIEWERS, Browser, BrowserError, missing
 
 from mipmap_plugin import Camera, wrap_model
 from mipmap_plugin.demo.run import embedded
-from mipmap_plugin.models.ply import read_ply, write_ply
+from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.wrap import Wrapped
 
 pytestmark = pytest.mark.browser

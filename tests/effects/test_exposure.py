@@ -13,7 +13,7 @@ from mipmap_plugin.adaptation import session
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import MipModel
-from mipmap_plugin.models.moving import MovingModel
+from mipmap_plugin.models.moving.model import MovingModel
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import wrap_model
 

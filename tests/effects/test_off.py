@@ -11,15 +11,16 @@ import torch
 from tiny import with_bands
 
 from mipmap_plugin import register_upsampler
-from mipmap_plugin.adaptation import density
-from mipmap_plugin.backends import filters, harmonics, reference, supersample
+from mipmap_plugin.adaptation.optimization import density
+from mipmap_plugin.backends import reference, supersample
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import PluginError
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.deformable import DeformNetwork
-from mipmap_plugin.models.hexplane import HexPlane
+from mipmap_plugin.models.moving.deformable import DeformNetwork
+from mipmap_plugin.models.moving.hexplane import HexPlane
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting import filters, harmonics
 from mipmap_plugin.wrap import wrap_model
 
 BRIEF = dict(steps=2, extra_views=0)

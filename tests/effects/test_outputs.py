@@ -14,13 +14,13 @@ from mipmap_plugin import cli
 from mipmap_plugin.backends import geometry, get_backend
 from mipmap_plugin.backends.conformance.cases import CASES
 from mipmap_plugin.backends.geometry import facing
-from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.wrap import wrap_model
 
 BOTH = ("depth", "normals")

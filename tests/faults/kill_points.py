@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from mipmap_plugin import staging
+from mipmap_plugin.formats import staging
 
 # What Python calls in C, by the names there; torch and NumPy write through files of Python.
 CALLS = {"open", "write", "flush", "close", "__exit__", "fsync", "truncate", "mkdir", "rmdir", "rename", "replace", "unlink", "remove", "flock"}

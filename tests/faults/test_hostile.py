@@ -23,12 +23,12 @@ from corpus import SAMPLES
 from PIL import Image
 
 from mipmap_plugin.errors import CheckpointError, MipmapPluginError, SceneError, SettingsError
+from mipmap_plugin.formats.images import composite, read_image
+from mipmap_plugin.formats.state_dict import read_state_dict
+from mipmap_plugin.formats.torch_file import load_torch
+from mipmap_plugin.formats.torchscript import read_torchscript
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.state_dict import read_state_dict
-from mipmap_plugin.models.torch_file import load_torch
-from mipmap_plugin.models.torchscript import read_torchscript
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.scenes.images import composite, read_image
 
 MIB = 2**20
 
@@ -53,9 +53,9 @@ MEASURED = """
 import json, resource, sys
 from pathlib import Path
 from mipmap_plugin.errors import MipmapPluginError
-from mipmap_plugin.models.torch_file import load_torch
-from mipmap_plugin.models.torchscript import read_torchscript
-from mipmap_plugin.scenes.images import read_image
+from mipmap_plugin.formats.torch_file import load_torch
+from mipmap_plugin.formats.torchscript import read_torchscript
+from mipmap_plugin.formats.images import read_image
 readers = {"torch": load_torch, "script": read_torchscript, "image": lambda path: read_image(path, (0, 0, 0))}
 most = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 for kind, path in json.loads(sys.argv[1]):
@@ -234,7 +234,7 @@ def test_compositing_in_parts_is_compositing(monkeypatch):
     whole = composite(rgba, (0.2, 0.5, 1.0))
     color, alpha = rgba[..., :3] / 255.0, rgba[..., 3:] / 255.0
     assert np.array_equal(whole, ((color * alpha + np.array([0.2, 0.5, 1.0]) * (1 - alpha)) * 255.0).astype(np.uint8))
-    monkeypatch.setattr("mipmap_plugin.scenes.images.TOGETHER", 50)
+    monkeypatch.setattr("mipmap_plugin.formats.images.TOGETHER", 50)
     assert np.array_equal(composite(rgba, (0.2, 0.5, 1.0)), whole)
 
 

@@ -18,9 +18,9 @@ import tiny
 import torch
 from corpus import SAMPLES
 
-from mipmap_plugin import staging
-from mipmap_plugin.adaptation import resume
+from mipmap_plugin.adaptation.optimization import resume
 from mipmap_plugin.errors import OutputError, SettingsError
+from mipmap_plugin.formats import staging
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
 

@@ -17,8 +17,8 @@ import tiny
 from corpus import SAMPLES
 from test_interruptions import WRITERS, adapted, contents
 
-from mipmap_plugin import staging
-from mipmap_plugin.adaptation import resume
+from mipmap_plugin.adaptation.optimization import resume
+from mipmap_plugin.formats import staging
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
 

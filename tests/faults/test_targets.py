@@ -12,11 +12,13 @@ import torch
 from corpus import SAMPLES
 from test_interruptions import WRITERS, adapted, contents
 
-from mipmap_plugin import files, staging
-from mipmap_plugin.adaptation import disk_cache, resume
-from mipmap_plugin.adaptation.state_file import own_state_file
+from mipmap_plugin.adaptation.optimization import resume
+from mipmap_plugin.adaptation.optimization.state_file import own_state_file
+from mipmap_plugin.adaptation.target import disk_cache
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
+from mipmap_plugin.formats import atomic as files
+from mipmap_plugin.formats import staging
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
 
@@ -178,7 +180,7 @@ def test_an_output_error_names_the_output(tmp_path, monkeypatch, name):
 def test_no_model_appears_without_its_report(tmp_path, monkeypatch):
     for name in ("new.ply", "new"):
         new = adapted(tiny.ply(tmp_path / f"base of {name}.ply"), 1 / 2)
-        monkeypatch.setattr("mipmap_plugin.files.json_text", lambda _: 1 / 0)
+        monkeypatch.setattr("mipmap_plugin.formats.atomic.json_text", lambda _: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             new.save(tmp_path / "out" / name)
         monkeypatch.undo()
@@ -223,7 +225,7 @@ def test_a_state_that_cannot_be_kept_costs_a_warning(tmp_path, monkeypatch):
     def refused(*_):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("mipmap_plugin.adaptation.resume.own_state_file", refused)
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.own_state_file", refused)
     model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
     with pytest.warns(UserWarning, match=r"state cannot be written \(Read-only file system\), so that this run could not be resumed"):
         assert model.adapt(1 / 4, steps=1, resume=tmp_path / "state").report.ended_by == "1 steps"

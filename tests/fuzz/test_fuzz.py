@@ -16,8 +16,8 @@ import torch
 from corpus import SAMPLES
 
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.torch_file import load_torch
 
 COLMAP = importlib.util.find_spec("pycolmap") is not None
 NAMES = [*(name for name in SAMPLES if COLMAP or not name.startswith("COLMAP")), "command line"]

@@ -24,8 +24,8 @@ from test_any_checkpoint import known, numbers
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.ply import read_ply
 
 Change = tuple[str, int, float]  # a column, a row, and what stands there
 COUNT = 12

@@ -2,8 +2,8 @@
 
 import pytest
 
-from mipmap_plugin.evaluation.tradeoff import Point, Spread
-from mipmap_plugin.evaluation.tradeoff_front import Tradeoff, files, frames, front, knee, milliseconds, seconds
+from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, files, frames, front, knee, milliseconds, seconds
+from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
 
 
 def point(db, s=0.0, ms=None, kind="adapted", name="default"):

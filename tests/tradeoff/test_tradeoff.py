@@ -11,17 +11,17 @@ import tiny
 import torch
 
 from mipmap_plugin import cli
-from mipmap_plugin.backends.filters import SCREEN_FILTERS
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, SettingsError
-from mipmap_plugin.evaluation import tradeoff as measuring
 from mipmap_plugin.evaluation.measure import rivals
-from mipmap_plugin.evaluation.tradeoff import LOOKS, RENDERERS, Plan, measure
-from mipmap_plugin.evaluation.tradeoff_files import facts, table
-from mipmap_plugin.evaluation.tradeoff_front import Tradeoff
-from mipmap_plugin.evaluation.tradeoff_run import run
-from mipmap_plugin.evaluation.tradeoff_truth import base_itself, photographs
+from mipmap_plugin.evaluation.tradeoff import points as measuring
+from mipmap_plugin.evaluation.tradeoff.files import Folder, facts, table
+from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
+from mipmap_plugin.evaluation.tradeoff.points import LOOKS, RENDERERS, Plan, measure
+from mipmap_plugin.evaluation.tradeoff.run import run
+from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
 from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.splatting.filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 PLAN = Plan(recipes=("default",), steps=(6,), backends=("reference",), supersampling=(2,), renderers=False, repeats=2)
@@ -198,7 +198,7 @@ def test_the_first_use_of_a_backend_is_not_billed(monkeypatch):
 def test_scale_one_has_nothing_to_trade(tmp_path, monkeypatch):
     monkeypatch.setattr(measuring, "_judged", lambda *_: pytest.fail("it is refused before anything is measured"))
     with pytest.raises(SettingsError, match="give another scale"):
-        run(wrapped(), None, [1 / 4, 1], PLAN, 1, tmp_path, picture=False, overwrite=False)
+        run(wrapped(), None, [1 / 4, 1], PLAN, 1, Folder(tmp_path, picture=False, overwrite=False))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -212,7 +212,7 @@ def test_a_plan_that_cannot_be_is_refused(wrong):
 
 
 def test_json_csv_and_table_hold_every_point(tmp_path):
-    found = run(wrapped(), None, [1 / 4, 2], replace(PLAN, repeats=1), 1, tmp_path / "new", picture=False, overwrite=False)
+    found = run(wrapped(), None, [1 / 4, 2], replace(PLAN, repeats=1), 1, Folder(tmp_path / "new", picture=False, overwrite=False))
     told = json.loads((tmp_path / "new/tradeoff.json").read_text())
     assert told == json.loads(json.dumps(facts(found, complete=True)))
     assert [each["scale"] for each in told["scales"]] == [0.25, 2] and told["complete"]
@@ -235,7 +235,7 @@ def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch):
 
     monkeypatch.setattr(measuring, "_judged", tired)
     with pytest.raises(Interrupted, match=f"the 4 points that were measured until then are in {tmp_path}"):
-        run(wrapped(), None, [1 / 4, 4], PLAN, 1, tmp_path, picture=False, overwrite=False)
+        run(wrapped(), None, [1 / 4, 4], PLAN, 1, Folder(tmp_path, picture=False, overwrite=False))
     told = json.loads((tmp_path / "tradeoff.json").read_text())
     assert not told["complete"] and [len(each["points"]) for each in told["scales"]] == [4]
 
@@ -246,13 +246,13 @@ def test_ctrl_c_before_the_first_point_writes_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr(measuring, "_judged", stop)
     with pytest.raises(Interrupted, match="nothing was measured yet"):
-        run(wrapped(), None, [1 / 4], PLAN, 1, tmp_path / "new", picture=False, overwrite=False)
+        run(wrapped(), None, [1 / 4], PLAN, 1, Folder(tmp_path / "new", picture=False, overwrite=False))
     assert not (tmp_path / "new").exists()
 
 
 def test_a_picture_is_drawn(tmp_path):
     pytest.importorskip("matplotlib")
-    run(wrapped(), None, [1 / 4], replace(PLAN, repeats=1), 1, tmp_path, picture=True, overwrite=False)
+    run(wrapped(), None, [1 / 4], replace(PLAN, repeats=1), 1, Folder(tmp_path, picture=True, overwrite=False))
     assert (tmp_path / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tradeoff.csv", "tradeoff.json", "tradeoff.png"]
 
@@ -289,4 +289,4 @@ def test_pictures_without_matplotlib_are_refused_before_anything_is_measured(tmp
 def test_an_existing_result_is_refused_by_the_library_too(tmp_path):
     (tmp_path / "tradeoff.json").write_text("{}")
     with pytest.raises(OutputExists):
-        run(wrapped(), None, [1 / 4], replace(PLAN, recipes=()), 1, tmp_path, picture=False, overwrite=False)
+        run(wrapped(), None, [1 / 4], replace(PLAN, recipes=()), 1, Folder(tmp_path, picture=False, overwrite=False))

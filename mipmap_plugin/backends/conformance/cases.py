@@ -12,12 +12,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.filters import USUAL_EPS2D
-from mipmap_plugin.backends.projection import rotations
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, USUAL, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.viewers import BUILT_IN, Viewer
+from mipmap_plugin.splatting.filters import USUAL_EPS2D
+from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.splatting.viewers import BUILT_IN, Viewer
 
 NEAR = 0.25  # world units; unlike 0.2 the same number in float32, so that "on the near plane" means one thing
 

@@ -1,4 +1,4 @@
-"""Culls and stretches of 16 splats on the image, and the way back for gradients (`backends.culls` has the formulas).
+"""Culls and stretches of 16 splats on the image, and the way back for gradients (`splatting.culls` has the formulas).
 
 All numbers are lanes of float64. Shapes are (xx, xy, yy, det) as in `ellipses`, after dilation.
 """
@@ -11,7 +11,7 @@ import math
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import both, maximum, minimum, narrow, select, sqrt, wide
 from mipmap_plugin.backends.cpu_kernels.powers import exp2, log2
-from mipmap_plugin.backends.culls import STEEPNESS
+from mipmap_plugin.splatting.culls import STEEPNESS
 
 LOG2E = 1 / math.log(2)
 

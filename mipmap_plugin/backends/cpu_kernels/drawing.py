@@ -12,9 +12,9 @@ from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import compositing, projection, pulling, rounding, sorting, window_tiles
 from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW, Frame, Limits, Lists, Splats, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
-from mipmap_plugin.backends.filters import LEAST_LIGHT, w_end
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.splatting.filters import LEAST_LIGHT, w_end
 
 SEEN = {"analytic": SEEN_IN_PIXEL, "window": SEEN_IN_WINDOW}
 

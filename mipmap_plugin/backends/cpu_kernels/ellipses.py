@@ -12,7 +12,7 @@ xx·yy - xy² cancels for needles.
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import both, maximum, minimum, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, apply_transposed, blend, cross, dot, plus, times
-from mipmap_plugin.backends.projection import LEAST_QUATERNION
+from mipmap_plugin.splatting.rotations import LEAST_QUATERNION
 
 
 @inner

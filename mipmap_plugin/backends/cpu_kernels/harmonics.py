@@ -6,7 +6,7 @@
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.blocks import get, put
 from mipmap_plugin.backends.cpu_kernels.lanes import spread
-from mipmap_plugin.backends.harmonics import C0, C1, C2, C3, C4
+from mipmap_plugin.splatting.harmonics import C0, C1, C2, C3, C4
 
 MAX_BANDS = 25
 

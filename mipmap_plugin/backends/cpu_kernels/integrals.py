@@ -1,4 +1,4 @@
-"""A splat's integral over each pixel's square (`backends.pixel_integral` has the formulas), 16 pixels at a time, and its gradients.
+"""A splat's integral over each pixel's square (`splatting.pixel_integral` has the formulas), 16 pixels at a time, and its gradients.
 
 A splat is binned by an ellipse around all that it can touch: that of its Gaussian, widened by half a pixel's diagonal.
 """
@@ -13,8 +13,8 @@ from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.blocks import put
 from mipmap_plugin.backends.cpu_kernels.lanes import fma, maximum, minimum, narrow, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.powers import exp2, log2, tanh
-from mipmap_plugin.backends.pixel_integral import BOUND, CUBIC, LINEAR, MAX_POWER, ROUND
 from mipmap_plugin.effects import MIN_ALPHA
+from mipmap_plugin.splatting.pixel_integral import BOUND, CUBIC, LINEAR, MAX_POWER, ROUND
 
 LOG2E = 1 / math.log(2)
 

@@ -1,4 +1,4 @@
-"""What a splat shows through the windows of 16 pixels, the windows behind it, and gradients (`backends.window` has the formulas)."""
+"""What a splat shows through the windows of 16 pixels, the windows behind it, and gradients (`splatting.window` has the formulas)."""
 
 # numba gives calls and operators a meaning of its own.
 # mypy: ignore-errors
@@ -9,8 +9,8 @@ from mipmap_plugin.backends.cpu_kernels import columns as col
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, maximum, minimum, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
-from mipmap_plugin.backends.window import FARTHEST, LEAST_VARIANCE, POINTS, WEIGHTS, WIDE
 from mipmap_plugin.effects import MAX_ALPHA
+from mipmap_plugin.splatting.window import FARTHEST, LEAST_VARIANCE, POINTS, WEIGHTS, WIDE
 
 HALF_LOG2E = 0.5 / math.log(2)
 ALL = (1 << WIDTH) - 1

@@ -8,7 +8,6 @@ import torch
 import triton
 from torch import Tensor
 
-from mipmap_plugin.backends.filters import keeps_light
 from mipmap_plugin.backends.triton_kernels import BACKWARD_BATCH, FORWARD_BATCH, MANY_TILES, RECORD, SPLATS, TILE, WARPS_OF_FEW, WARPS_OF_MANY
 from mipmap_plugin.backends.triton_kernels.binning import Bins, bins
 from mipmap_plugin.backends.triton_kernels.compositing import composite_kernel
@@ -18,6 +17,7 @@ from mipmap_plugin.backends.triton_kernels.projection_back import project_back_k
 from mipmap_plugin.backends.triton_kernels.views import row_of
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.splatting.filters import keeps_light
 
 # Rows of one splat that are added up at a time, a warp's worth.
 ROWS = 32

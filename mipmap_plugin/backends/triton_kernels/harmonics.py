@@ -1,11 +1,11 @@
-"""Real spherical harmonics of one direction a lane, as `backends/harmonics.py` has them, and their gradients."""
+"""Real spherical harmonics of one direction a lane, as `splatting/harmonics.py` has them, and their gradients."""
 
 from __future__ import annotations
 
 import triton
 import triton.language as tl
 
-from mipmap_plugin.backends import harmonics
+from mipmap_plugin.splatting import harmonics
 
 C0 = tl.constexpr(harmonics.C0)
 C1 = tl.constexpr(harmonics.C1)

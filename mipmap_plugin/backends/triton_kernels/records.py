@@ -29,13 +29,6 @@ def falloff(records, at, mask):
 
 
 @triton.jit
-def paint(records, at, mask):
-    """Red, green, blue of the splats `at` [B]."""
-    row = records + at * RECORD + 6
-    return tl.load(row, mask, 0.0), tl.load(row + 1, mask, 0.0), tl.load(row + 2, mask, 0.0)
-
-
-@triton.jit
 def store_nine(rows, a, b, c, d, e, f, g, h, i, mask):
     """Nine numbers [B] side by side at the pointers `rows` [B]."""
     tl.store(rows, a, mask)

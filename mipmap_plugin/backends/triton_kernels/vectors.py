@@ -5,10 +5,10 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from mipmap_plugin.backends import projection
+from mipmap_plugin.splatting import rotations
 
 LARGEST = tl.constexpr(3.4e38)
-LEAST_QUATERNION = tl.constexpr(projection.LEAST_QUATERNION)
+LEAST_QUATERNION = tl.constexpr(rotations.LEAST_QUATERNION)
 
 
 @triton.jit

@@ -9,10 +9,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mipmap_plugin.backends.filters import LEAST_LIGHT
-from mipmap_plugin.backends.projection import FRUSTUM_MARGIN
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import FRUSTUM_MARGIN, Effects
+from mipmap_plugin.splatting.filters import LEAST_LIGHT
 
 # Where the numbers lie in the row; before them the rotation, row by row, and the eye.
 EYE, FX, FY, CX, CY = tl.constexpr(9), tl.constexpr(12), tl.constexpr(13), tl.constexpr(14), tl.constexpr(15)

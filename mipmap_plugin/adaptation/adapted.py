@@ -1,0 +1,67 @@
+"""What an adaptation returns: the model, its report, and how it is shown and saved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+
+from mipmap_plugin.adaptation.optimization.state_file import StateFile
+from mipmap_plugin.adaptation.report import Report
+from mipmap_plugin.backends import supersample
+from mipmap_plugin.backends.base import Backend, Rendered
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects, explain
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.atomic import together, write_json
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import SplatModel, effects_of
+from mipmap_plugin.models.exposure import exposed
+from mipmap_plugin.models.outputs import REPORT
+
+
+@dataclass(frozen=True, eq=False)
+class Adapted:
+    """A model that looks right at its scale, and the report of how it came to."""
+
+    model: SplatModel
+    report: Report
+    backend: Backend
+    effects: Effects
+    viewers: Mapping[str, Effects] = field(default_factory=dict)  # how each viewer that the file is for renders it
+    state: StateFile | None = None  # of the run, which is of use until the model is saved
+    views: Sequence[Camera] = ()  # of the base scale, that were adapted to or selected on
+
+    def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
+        """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`. `viewer`: one of `viewers`."""
+        if viewer is not None and viewer not in self.viewers:
+            made_for = ", ".join(filter(None, self.viewers)) or "none by name"
+            raise SettingsError(f"this model is not made for the viewer {viewer!r}, but for {made_for}")
+        effects = self.effects if viewer is None else self.viewers[viewer]
+        return shown(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
+        with together(Path(path)):  # no new model without its report
+            saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
+            write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=True)
+        if self.state is not None:
+            self.state.remove()
+        return saved
+
+
+@torch.no_grad()
+def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None) -> Rendered:
+    """What the model, its splats changed by `form`, shows to a camera, and the effects that it called for. Raises SettingsError."""
+    matrix = model.traits.exposures.of(camera) if effects.exposure else None
+    gaussians = model.gaussians(camera) if form is None else form(model.gaussians(camera))
+    rendered = supersample.render(backend, gaussians, camera, effects)
+    if effects.outputs:
+        from mipmap_plugin.backends import geometry  # an effect that is off is not imported
+
+        rendered = geometry.beside(rendered, backend, gaussians, camera, effects)
+    if matrix is not None:
+        rendered = rendered.but(image=exposed(rendered.image, matrix))
+    return rendered.but(effects=tuple(explain(effects, gaussians, effects_of(model))))

@@ -1,0 +1,1 @@
+"""What a run begins with: the closed form, merged splats and matched opacities."""

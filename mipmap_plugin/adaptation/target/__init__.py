@@ -1,0 +1,1 @@
+"""What is optimized towards: pseudo ground truth, resized or enlarged, and photographs."""

@@ -1,0 +1,99 @@
+"""A tradeoff as files, and as a table."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mipmap_plugin.adaptation.report import versions
+from mipmap_plugin.evaluation.report import markdown
+from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, files, frames, front, milliseconds, seconds
+from mipmap_plugin.evaluation.tradeoff.plot import draw, figure_class
+from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
+from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, write_json
+
+NAMES = ("tradeoff.json", "tradeoff.csv", "tradeoff.png")
+
+
+def refuse(folder: Path, picture: bool, overwrite: bool) -> None:
+    """What would be refused at the end is refused at the beginning. Raises OutputExists, and SettingsError without matplotlib."""
+    if picture:
+        figure_class()
+    for name in NAMES:
+        refuse_output(folder / name, overwrite, is_file=True)
+    refuse_unwritable(folder / NAMES[0])
+
+
+def facts(tradeoffs: Sequence[Tradeoff], complete: bool) -> dict[str, Any]:
+    machine = {"threads": torch.get_num_threads(), "cores": os.cpu_count(), "processor": platform.machine(), **versions()}
+    return {"complete": complete, "machine": machine, "scales": [_facts_of(each) for each in tradeoffs]}
+
+
+def _facts_of(each: Tradeoff) -> dict[str, Any]:
+    fronts = (front(files(each.points), seconds), front(frames(each.points), milliseconds))
+    told = dict(zip(("seconds", "frames"), each.sentences(), strict=True))
+    marks = [{"on_front_of_seconds": point in fronts[0], "on_front_of_frames": point in fronts[1]} for point in each.points]
+    points = [asdict(point) | mark for point, mark in zip(each.points, marks, strict=True)]
+    return {"scale": each.scale, "truth": each.truth, "sentences": told, "notes": each.notes, "points": points}
+
+
+@dataclass(frozen=True)
+class Folder:
+    """Where a tradeoff is written to."""
+
+    path: Path
+    picture: bool  # whether one is drawn
+    overwrite: bool
+
+
+def write(folder: Folder, tradeoffs: Sequence[Tradeoff], *, complete: bool) -> None:
+    """The JSON, the CSV and the picture, each whole or not at all. Raises OutputExists, OutputError, and SettingsError without matplotlib."""
+    write_json(folder.path / NAMES[0], facts(tradeoffs, complete), folder.overwrite)
+    text = io.StringIO(newline="")
+    rows = [{"truth": each.truth, **_flat(point)} for each in tradeoffs for point in each.points]
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]) if rows else ["truth"])
+    writer.writeheader()
+    writer.writerows(rows)
+    with new_file(folder.path / NAMES[1], folder.overwrite) as temporary:
+        temporary.write_text(text.getvalue(), encoding="utf-8", newline="")
+    if folder.picture:
+        draw(folder.path / NAMES[2], tradeoffs, folder.overwrite)
+
+
+def _flat(point: Point) -> dict[str, Any]:
+    """Spreads become three columns each; what was not measured is left empty."""
+    row: dict[str, Any] = {}
+    for name, value in vars(point).items():
+        if isinstance(value, Spread) or name == "ms_per_frame":
+            row |= {f"{name}_{part}": None if value is None else getattr(value, part) for part in ("median", "low", "high")}
+        else:
+            row[name] = value
+    return row
+
+
+def table(each: Tradeoff) -> str:
+    """The ends of all runs and everything beside them, best first, with what the dB are of, both sentences and what is missing."""
+    best = front(files(each.points), seconds), front(frames(each.points), milliseconds)
+    body = [
+        [point.name, point.backend, _text(point.psnr_db, 2), _text(point.adapt_seconds, 2), _text(point.ms_per_frame, 1), f"{point.gaussians:,}",
+         " ".join(mark for mark, points in zip(("s", "ms"), best, strict=True) if point in points), point.ended_by]
+        for point in sorted(frames(each.points), key=lambda point: -point.psnr_db.median)
+    ]  # fmt: skip
+    head = ["what", "backend", "dB", "adapt s", "ms/frame", "splats", "front", "ended by"]
+    return "\n".join([f"x{each.scale:g}, {each.truth}", markdown(head, body), *each.sentences(), *each.notes])
+
+
+def _text(spread: Spread | None, digits: int) -> str:
+    """The median, and the whole range where there is one."""
+    if spread is None:
+        return "-"
+    low, middle, high = (f"{value:.{digits}f}" for value in (spread.low, spread.median, spread.high))
+    return middle if low == high else f"{middle} ({low}-{high})"

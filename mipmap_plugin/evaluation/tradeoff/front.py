@@ -1,0 +1,100 @@
+"""The Pareto front of cost and quality, and its knee, said in a sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from mipmap_plugin.evaluation.tradeoff.points import Point
+
+Cost = Callable[[Point], float]
+
+
+@dataclass(frozen=True)
+class Tradeoff:
+    """All points of one scale, and what their dB are of."""
+
+    scale: float
+    truth: str
+    points: list[Point]
+    notes: Sequence[str] = ()  # what is not among them
+
+    def sentences(self) -> tuple[str, str]:
+        """What was found: of adapting, and of frames."""
+        return said_of_seconds(self.points), said_of_frames(self.points)
+
+
+def seconds(point: Point) -> float:
+    """Of adapting."""
+    return point.adapt_seconds.median
+
+
+def milliseconds(point: Point) -> float:
+    """Of one frame."""
+    return math.inf if point.ms_per_frame is None else point.ms_per_frame.median
+
+
+def files(points: Sequence[Point]) -> list[Point]:
+    """What a renderer without other filters shows: the base as it is, and what adapting made of it."""
+    return [point for point in points if point.kind in ("base", "adapted")]
+
+
+def frames(points: Sequence[Point]) -> list[Point]:
+    """Everything whose frames were timed."""
+    return [point for point in points if point.ms_per_frame is not None]
+
+
+def front(points: Sequence[Point], cost: Cost) -> list[Point]:
+    """The points that nothing cheaper equals, from the cheapest on."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda point: (cost(point), -point.psnr_db.median)):
+        if not best or point.psnr_db.median > best[-1].psnr_db.median:
+            best.append(point)
+    return best
+
+
+@dataclass(frozen=True)
+class Knee:
+    """Where a front bends: until here dB are cheap, from here on dear."""
+
+    point: Point
+    cost: float
+    gain_db: float  # over the cheapest
+    per_doubling_db: float | None  # of the cost, from the knee to the end; None: the knee is the end
+
+
+def knee(best: Sequence[Point], cost: Cost) -> Knee | None:
+    """The point of a front that lies furthest above the line from its first to its last (Satopää et al. 2011); None for a single point."""
+    if len(best) < 2:
+        return None
+    start, end = best[0], best[-1]
+    rise, run = end.psnr_db.median - start.psnr_db.median, cost(end) - cost(start)
+
+    def above(point: Point) -> float:
+        return (point.psnr_db.median - start.psnr_db.median) / rise - ((cost(point) - cost(start)) / run if run else 0.0)
+
+    at = max(best[1:], key=above)
+    doublings = math.log2(cost(end) / cost(at)) if cost(at) > 0 else 0.0
+    rest = (end.psnr_db.median - at.psnr_db.median) / doublings if doublings > 0 else None
+    return Knee(at, cost(at), at.psnr_db.median - start.psnr_db.median, rest)
+
+
+def said_of_seconds(points: Sequence[Point]) -> str:
+    """What adapting buys."""
+    found = knee(front(files(points), seconds), seconds)
+    if found is None:
+        return "adapting buys nothing here: no file is better than the base as it is"
+    rest = "more were not spent" if found.per_doubling_db is None else f"each doubling after that {found.per_doubling_db:.1f} dB"
+    return f"the first {found.cost:.2g} s buy {found.gain_db:.1f} dB ({found.point.name}); {rest}"
+
+
+def said_of_frames(points: Sequence[Point]) -> str:
+    """What a slower frame buys."""
+    best = front(frames(points), milliseconds)
+    found = knee(best, milliseconds)
+    quickest = f"the quickest frame, {milliseconds(best[0]):.2g} ms, has {best[0].psnr_db.median:.1f} dB ({best[0].name})"
+    if found is None:
+        return f"{quickest}, and no slower one is better"
+    rest = "" if found.per_doubling_db is None else f"; each doubling after that {found.per_doubling_db:.1f} dB"
+    return f"{quickest}; {found.cost:.2g} ms buy {found.gain_db:.1f} dB more ({found.point.name}){rest}"

@@ -1,0 +1,221 @@
+"""Outputs appear whole or not at all, and never in the place of what is not theirs to replace."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import math
+import os
+import shutil
+import stat
+from collections.abc import Iterable, Iterator
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.errors import MipmapPluginError, OutputError, OutputExists
+from mipmap_plugin.formats.staging import Staging, settle
+
+# What is being made at the moment, where something is.
+_open: ContextVar[Staging | None] = ContextVar("_open", default=None)
+
+
+@contextlib.contextmanager
+def together(path: Path) -> Iterator[None]:
+    """What is written inside, to `path`, into it or beside it, takes its place when the block ends well: all of it or nothing.
+
+    A process that is killed while several files take their places leaves a record, by which the next run that writes to `path`, or
+    loads it, finishes them (`staging`). Raises OutputError.
+    """
+    with _telling(path):
+        place, holding = absolute(path), _open.get()
+        if holding is not None and holding.inside(place) is not None:
+            yield
+            return
+        place.parent.mkdir(parents=True, exist_ok=True)
+        staging = Staging(place)
+        token = _open.set(staging)
+        try:
+            yield
+            staging.commit()
+        except MipmapPluginError as error:  # which may name the hidden place
+            error.args = tuple(str(each).replace(str(staging.new), str(staging.place)) for each in error.args)
+            raise
+        finally:
+            _open.reset(token)
+            staging.close()
+
+
+@contextlib.contextmanager
+def new_file(path: Path, overwrite: bool) -> Iterator[Path]:
+    """A temporary path to write to, which becomes `path` if the block ends well. Raises OutputExists, OutputError."""
+    refuse_output(path, overwrite, is_file=True)
+    with _made(path) as temporary:
+        yield temporary
+
+
+@contextlib.contextmanager
+def new_folder(path: Path, overwrite: bool) -> Iterator[Path]:
+    """A temporary folder to fill, which becomes `path` if the block ends well; an old folder is taken away only then."""
+    refuse_output(path, overwrite)
+    with _made(path) as temporary:
+        temporary.mkdir()
+        yield temporary
+
+
+@contextlib.contextmanager
+def _made(path: Path) -> Iterator[Path]:
+    staging = _open.get()
+    if staging is None or (temporary := staging.inside(absolute(path))) is None:
+        with together(path), _made(path) as temporary:
+            yield temporary
+        return
+    with _telling(path):
+        temporary.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+
+
+@contextlib.contextmanager
+def _telling(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except MipmapPluginError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def absolute(path: Path) -> Path:
+    """`path` from the root, without links but in its last part, which is the one that is replaced. Raises OutputError for a root."""
+    last = path.name not in ("", "..")
+    real = Path(os.path.realpath(path.parent), path.name) if last else Path(os.path.realpath(path))
+    if not real.name:
+        raise OutputError(f"{path} is the root of a disk; choose a path below it")
+    return real
+
+
+def named(path: Path) -> Path:
+    """`path` with a last part of its own, which others can be put beside: of "." the folder's name. Raises OutputError for a root."""
+    return path if path.name not in ("", "..") else absolute(path)
+
+
+def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_file: bool = False) -> None:
+    """Raise OutputExists for what may not be written to, or not without `overwrite`; OutputError for what no system takes.
+
+    An output is a new name, or that of a regular file or a folder (`is_file`: of a file alone), and by no name (a link, a hard link,
+    another case) one of the files `base`, nor a folder around one. What dead runs left at `path` is put right first.
+    """
+    with _telling(path):
+        settle(absolute(path))
+        found = _stat(path)
+    if found is None:
+        return
+    if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
+        raise OutputExists(f"{path} is {kind_of_node(found)}, which is never replaced; choose another path")
+    if any(os.path.samestat(found, each) for file in base for each in _around(file, stat.S_ISDIR(found.st_mode))):
+        told = "holds the base checkpoint itself" if stat.S_ISDIR(found.st_mode) else "is the base checkpoint itself, or a part of it"
+        raise OutputExists(f"{path} {told}, which is never replaced; choose another path")
+    if is_file and stat.S_ISDIR(found.st_mode):
+        raise OutputExists(f"{path} is a folder, which no file replaces; choose the path of a file")
+    if not overwrite:
+        raise OutputExists(f"{path} exists already; pass --overwrite (overwrite=True) to replace it, or choose another path")
+
+
+def refuse_unwritable(path: Path, room: int = 0) -> None:
+    """Raise OutputError where the system would refuse `path` at the end: no permission, a read-only disk, fewer than `room` bytes free."""
+    with _telling(path):
+        place = absolute(path)
+        if place.parent.is_dir():
+            Staging(place).close()
+        there = next(folder for folder in place.parents if os.path.lexists(folder))
+        if not there.is_dir():
+            raise OSError(errno.ENOTDIR, f"{there} is not a folder")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise OSError(errno.EACCES, f"no permission to write to {there}")
+        free = shutil.disk_usage(there).free
+    if free < room:
+        told = f"its disk has {free:,} bytes free, and the base takes {room:,}"
+        raise OutputError(f"{path} cannot be written: {told}; free some, or choose another disk")
+
+
+def settled(path: Path) -> Path:
+    """`path`, after what a dead run left there was put right, where that can be done."""
+    with contextlib.suppress(OSError, ValueError):
+        settle(absolute(path))
+    return path
+
+
+def kind_of_node(found: os.stat_result) -> str:
+    """What a path leads to that is neither a regular file nor a folder."""
+    kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
+    return next((name for test, name in kinds.items() if test(found.st_mode)), "no regular file")
+
+
+def no_file(path: Path) -> str:
+    """Why `path` is not read, "" if it is: a pipe or a device has no end, and may wait for ever."""
+    found = os.stat(path)
+    return "" if stat.S_ISREG(found.st_mode) else f"is {'a folder' if stat.S_ISDIR(found.st_mode) else kind_of_node(found)}, not a file"
+
+
+def _stat(path: Path) -> os.stat_result | None:
+    """What is at `path`, None for nothing. Raises OutputExists for a link that leads to nothing, OSError."""
+    try:
+        return os.stat(path)
+    except FileNotFoundError:
+        if path.is_symlink():
+            raise OutputExists(f"{path} is a link to something that is not there; remove it, or choose another path") from None
+        return None
+    except ValueError as error:  # a zero byte
+        raise OutputError(f"{str(path)!r} is no path: {error}") from None
+
+
+def _around(file: Path, folders: bool) -> Iterator[os.stat_result]:
+    """The file itself, or the folders around it."""
+    real = Path(os.path.realpath(file))
+    for each in real.parents if folders else [real]:
+        with contextlib.suppress(OSError):
+            yield os.stat(each)
+
+
+def write_json(path: Path, facts: Any, overwrite: bool) -> None:
+    """Write `facts` as an indented JSON file (`json_text`). Raises OutputExists, OutputError."""
+    with new_file(path, overwrite) as temporary:
+        temporary.write_text(json_text(facts) + "\n", encoding="utf-8")
+
+
+def json_text(facts: Any) -> str:
+    """`facts` as indented JSON that every parser takes: what JSON has no number for, such as the PSNR of equal images, is null."""
+    return json.dumps(_without_infinities(facts), indent=2, allow_nan=False, default=str)
+
+
+def _without_infinities(facts: Any) -> Any:
+    if isinstance(facts, dict):
+        return {name: _without_infinities(value) for name, value in facts.items()}
+    if isinstance(facts, (list, tuple)):
+        return [_without_infinities(value) for value in facts]
+    return None if isinstance(facts, float) and not math.isfinite(facts) else facts
+
+
+def sha256(*paths: Path) -> str:
+    """The sha256 of the files' bytes, one after the other, hexadecimal."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while chunk := file.read(1 << 20):
+                digest.update(chunk)
+    return digest.hexdigest()
+
+
+def refuse_to_lose(target: Path, source: Path | None, holds: str) -> None:
+    """Raise OutputExists when the folder `target` is the base checkpoint's, or no model: one has a folder named `holds`.
+
+    Replacing a folder deletes what is in it.
+    """
+    if source is not None and target.is_dir() and any(os.path.samestat(target.stat(), each) for each in _around(source / "x", folders=True)):
+        raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
+    if target.is_dir() and any(target.iterdir()) and not (target / holds).is_dir():
+        raise OutputExists(f"{target} is a folder with other things in it, which --overwrite would delete; choose another folder")
+    if target.is_file():
+        raise OutputExists(f"{target} is a file; choose another folder, or the path of a file")

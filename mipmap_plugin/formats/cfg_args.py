@@ -1,0 +1,58 @@
+"""`cfg_args`: the training options in an INRIA model folder, read as data. The original `eval`s them; this never does."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.magic import read_head
+
+# Bytes; real files have 200 to 2,000. Parsing time and depth grow with the text.
+MAX_SIZE = 64 * 1024
+
+
+def read_cfg_args(path: str | Path) -> dict[str, Any]:
+    """The options of `Namespace(key=literal, ...)`, without those whose values are none. Raises CheckpointError for any other text."""
+    return read_cfg_args_and_rest(path)[0]
+
+
+def read_cfg_args_and_rest(path: str | Path) -> tuple[dict[str, Any], list[str]]:
+    """The options, and the names of those that are left out since their values are no literals. Raises CheckpointError."""
+    path = Path(path)
+    text = read_head(path, MAX_SIZE + 1)
+    if len(text) > MAX_SIZE:
+        raise CheckpointError(f"{path} has more than {MAX_SIZE // 1024} kB, which no cfg_args has; it is not read")
+    try:
+        call = ast.parse(text.decode("utf-8").strip(), mode="eval").body
+        return _keywords(call)
+    except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
+        raise CheckpointError(f"{path} is not a plain `Namespace(name=literal, ...)`, and is not executed: {_brief(error)}") from error
+
+
+def format_cfg_args(options: dict[str, Any]) -> str:
+    """The text that 3DGS writes for these options."""
+    return f"Namespace({', '.join(f'{key}={value!r}' for key, value in options.items())})"
+
+
+def _keywords(call: ast.expr) -> tuple[dict[str, Any], list[str]]:
+    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
+        raise ValueError("it is no call of Namespace")
+    if call.args or any(keyword.arg is None for keyword in call.keywords):
+        raise ValueError("it has arguments without a name")
+    options: dict[str, Any] = {}
+    rest: list[str] = []
+    for keyword in call.keywords:
+        name = str(keyword.arg)
+        if name in options or name in rest:
+            raise ValueError("it names an argument twice")
+        try:
+            options[name] = ast.literal_eval(keyword.value)
+        except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
+            rest.append(name)
+    return options, rest
+
+
+def _brief(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]

@@ -1,0 +1,156 @@
+"""Image files: read, put on a background, write; and arrays beside them. Pillow (which scikit-image brings along) is used nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from mipmap_plugin.errors import SceneError, SettingsError, ShapeError
+from mipmap_plugin.formats.atomic import new_file, no_file
+from mipmap_plugin.limits import check_image
+
+# What Pillow calls 16-bit gray; 16-bit color it reads to 8 bits by itself, keeping the high byte.
+GRAY_16_BIT = ("I;16", "I;16B", "I;16L", "I;16N", "I")
+
+# What is read; Pillow knows formats whose pictures are programs (EPS), too.
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
+
+# Pixels that every machine holds, and how many of them a byte of a file with more may stand for: in a photograph it is fewer than 20.
+FEW_PIXELS = 2**24
+PIXELS_PER_BYTE = 50
+
+# Bytes of a pixel while it is read: 8 bits of four channels, and 32 of three.
+BYTES_PER_PIXEL = 4 + 12
+
+# Pixels that are put on a background together, in 64 bits each.
+TOGETHER = 2**18
+
+# What Pillow raises for a file that is no image, a broken one, a broken PNG chunk and an absurd size.
+UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+
+
+def read_image(path: str | Path, background: Sequence[float]) -> Tensor:
+    """A PNG or JPEG file as [H, W, 3] float32 in 0..1; transparency shows `background` (RGB in 0..1).
+
+    EXIF rotation is not applied: cameras are calibrated on the pixels as they are stored. Raises SceneError, also for more pixels
+    than the memory holds, or than a file of that size can have.
+    """
+    with _opened(path) as image:
+        _refuse_bomb(Path(path), *image.size)
+        try:
+            if image.mode in GRAY_16_BIT:
+                gray = torch.from_numpy(np.asarray(image).astype(np.float32)) / 65535
+                return gray[..., None].expand(-1, -1, 3).contiguous()
+            pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+        except Exception as error:  # a damaged file fails in as many ways as Pillow has decoders
+            raise SceneError(f"{path}: the image is damaged ({str(error) or type(error).__name__}); download or export it again") from error
+    if pixels.shape[2] == 4:
+        pixels = composite(pixels, background)
+    return torch.from_numpy(pixels.astype(np.float32)).div_(255)
+
+
+def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
+    """8-bit straight-alpha RGBA [H, W, 4] over `background` (RGB in 0..1), as 8-bit RGB [H, W, 3].
+
+    Fractions are cut off, not rounded, as graphdeco-inria's Blender reader does (scene/dataset_readers.py casts
+    0..255 floats to bytes): half-transparent pixels are up to one step darker, opaque ones and black or white background exact.
+    The published protocols composite before any resizing, on these 8 bits.
+    """
+    rgb = np.empty((*rgba.shape[:2], 3), np.uint8)
+    rows = max(1, TOGETHER // max(1, rgba.shape[1]))
+    for top in range(0, len(rgba), rows):
+        part = rgba[top : top + rows] / 255.0
+        color, alpha = part[..., :3], part[..., 3:]
+        blended = color * alpha + np.asarray(background, dtype=np.float64) * (1 - alpha)
+        rgb[top : top + rows] = (blended * 255.0).astype(np.uint8)
+    return rgb
+
+
+def pillow_bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """`image` [H, W, 3] in 0..1, rounded to 8 bits, as Pillow's bicubic makes it on bytes: [*size, 3] in 0..1, multiples of 1/255.
+
+    Not what the same filter makes of floats: Pillow rounds and clamps to 8 bits between its two passes and after them.
+    """
+    height, width = size
+    small = Image.fromarray(_bytes(image)).resize((width, height), Image.Resampling.BICUBIC)
+    return torch.from_numpy(np.asarray(small).astype(np.float32)) / 255
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; False also for a name that the system does not take, which files that list images may hold."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """(width, height) in px of an image file, from its header alone. Raises SceneError."""
+    with _opened(path) as image:
+        return image.size
+
+
+def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> Path:
+    """Write `image` [H, W, 3], clamped to 0..1 and rounded to 8 bits, as a PNG file; return its path.
+
+    Atomic: an interrupted write leaves the old file. Raises OutputExists, ShapeError, and SceneError for NaN.
+    """
+    path = Path(path)
+    if image.dim() != 3 or image.shape[2] != 3:
+        raise ShapeError(f"image for {path}: expected shape [H, W, 3], got {list(image.shape)}")
+    if not image.isfinite().all():
+        raise SceneError(f"{path}: the image holds NaN or infinity and is not written; check the render that it came from")
+    with new_file(path, overwrite) as temporary:
+        Image.fromarray(_bytes(image)).save(temporary, format="PNG")
+    return path
+
+
+def write_array(path: str | Path, values: Tensor, *, overwrite: bool = False) -> Path:
+    """Write `values` as 32-bit floats of NumPy's .npy; return the path. Atomic; raises OutputExists, and SceneError for NaN and infinity."""
+    path = Path(path)
+    if not values.isfinite().all():
+        raise SceneError(f"{path}: the values hold NaN or infinity and are not written; check the render that they came from")
+    with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
+        np.save(file, values.detach().to("cpu", torch.float32).numpy())
+    return path
+
+
+def _bytes(image: Tensor) -> np.ndarray:
+    return (image.detach().to("cpu", torch.float32).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def read_array(path: str | Path) -> Tensor:
+    """The numbers of a NumPy file, float64. It is not unpickled, and as long as it says. Raises SceneError."""
+    try:
+        return torch.from_numpy(np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64))
+    except (OSError, ValueError, TypeError, SyntaxError, OverflowError, RecursionError) as error:  # what NumPy raises for other files
+        raise SceneError(f"{path}: is no array that NumPy reads ({(str(error).splitlines() or [''])[0][:120]}); copy it again") from error
+
+
+def _refuse_bomb(path: Path, width: int, height: int) -> None:
+    pixels, size = width * height, path.stat().st_size
+    if pixels > FEW_PIXELS and pixels > PIXELS_PER_BYTE * size:
+        raise SceneError(f"{path}: {width:,} x {height:,} px in {size:,} bytes are no photograph; give the image that the camera took")
+    try:
+        check_image(width, height, bytes_per_pixel=BYTES_PER_PIXEL)
+    except SettingsError as error:
+        raise SceneError(f"{path}: {error}") from error
+
+
+def _opened(path: str | Path) -> Image.Image:
+    try:
+        if trouble := no_file(Path(path)):
+            raise SceneError(f"{path}: {trouble}; give a PNG or JPEG file")
+        return Image.open(path, formats=FORMATS)
+    except SceneError:
+        raise
+    except FileNotFoundError as error:
+        raise SceneError(f"{path}: there is no such image; check the path") from error
+    except UNREADABLE as error:
+        advice = "give a PNG or JPEG file (or, if it is a Git LFS pointer, run `git lfs pull` where it came from)"
+        raise SceneError(f"{path}: is not an image that Pillow reads; {advice}") from error

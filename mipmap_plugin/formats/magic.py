@@ -1,0 +1,133 @@
+"""What a file is by its first bytes, whatever its name says; nothing in it is ever executed."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.atomic import no_file
+
+# How a file begins that stands for one that Git LFS has not fetched.
+LFS_POINTER = b"version https://git-lfs"
+
+# Bytes that tell every format here apart; a .splat file has no magic and is judged by its first records.
+HEAD = 64 * 1024
+
+# Bytes of a pickle that are looked at for names; the pickle of a gsplat or splatfacto checkpoint has a few kB.
+MAX_PICKLE = 16 * 1024 * 1024
+
+# A splat in a .splat file (antimatter15/splat); its quaternion is wxyz around 128.
+SPLAT_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
+
+
+def read_head(path: Path, size: int = HEAD) -> bytes:
+    """The first `size` bytes. Raises CheckpointError when there are none, or when a placeholder stands for the data."""
+    try:
+        if trouble := no_file(path):
+            raise CheckpointError(f"{path} {trouble}; give a file or a model folder")
+        with path.open("rb") as file:
+            head = file.read(size)
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}") from error
+    _refuse_placeholder(path, head)
+    return head
+
+
+def _refuse_placeholder(path: Path, head: bytes) -> None:
+    start = head[:512].lstrip().lower()
+    if not head:
+        raise CheckpointError(f"{path} is empty; download or export it again")
+    if start.startswith(LFS_POINTER):
+        size = re.search(rb"size (\d{1,20})\b", head)
+        told = f" of a file of {int(size[1]):,} bytes" if size else ""
+        raise CheckpointError(f"{path} is only the Git-LFS pointer{told}; run `git lfs pull` in its repository")
+    if start.startswith((b"<!doctype", b"<html", b"<?xml")):
+        raise CheckpointError(f"{path} is a web page, so the download went wrong; download it again")
+    if start.startswith((b'{"error', b'{"message', b'{"status')):
+        raise CheckpointError(f"{path} is a server's error message, so the download went wrong; download it again")
+
+
+def kind_of(path: Path) -> str:
+    """One of: ply, spz, sog, gsplat-png, zip, gzip, torch, torchscript, glb, ksplat, splat, unknown. Raises CheckpointError (`read_head`)."""
+    head = read_head(path)
+    if re.match(rb"ply\s", head):
+        return "ply"
+    if head.startswith(b"\x1f\x8b"):
+        return "spz" if _inflated(head) == b"NGSP" else "gzip"
+    for magic, kind in {b"NGSP": "spz", b"glTF": "glb", b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19": "torch"}.items():
+        if head.startswith(magic):
+            return kind
+    if head.startswith(b"PK\x03\x04"):
+        return _kind_of_zip(path)
+    if head.lstrip().startswith(b"{"):
+        return _kind_of_json(head)
+    size = path.stat().st_size
+    if head.startswith(b"\x00\x01\x00\x00") and size >= 5120 and int.from_bytes(head[20:22], "little") <= 2:
+        return "ksplat"
+    return "splat" if _plausible_splat(head, size) else "unknown"
+
+
+def pickle_of(path: Path) -> bytes:
+    """The first bytes of a torch file's pickle, to be searched and never unpickled; none where there is none. Raises CheckpointError."""
+    if not zipfile.is_zipfile(path):
+        return read_head(path, MAX_PICKLE)
+    with _archive(path) as archive:
+        pickles = [name for name in archive.namelist() if name.endswith("data.pkl")]
+        if not pickles:
+            return b""
+        with archive.open(pickles[0]) as file:
+            return file.read(MAX_PICKLE)
+
+
+def _inflated(head: bytes) -> bytes:
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, 4)
+    except zlib.error:
+        return b""
+
+
+def _kind_of_json(head: bytes) -> str:
+    """The meta.json of an unpacked SOG names its pictures, the lod-meta.json of a streamed one its parts; that of gsplat's pictures has shapes."""
+    if b"KHR_gaussian_splatting" in head:
+        return "glb"
+    if b".webp" in head or b"meta.json" in head:
+        return "sog"
+    return "gsplat-png" if all(name in head for name in (b'"means"', b'"shape"', b'"mins"', b'"quats"')) else "unknown"
+
+
+@contextmanager
+def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """An open zip archive. Raises CheckpointError for whatever zipfile raises on a damaged one, also inside the block."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except Exception as error:  # bad offsets, names, versions, sums and streams each fail in their own way
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise CheckpointError(f"{path} is a damaged zip archive ({reason}); download or copy it again") from error
+
+
+def _kind_of_zip(path: Path) -> str:
+    with _archive(path) as archive:
+        names = archive.namelist()
+    leaves = {name.rpartition("/")[2] for name in names}
+    if "data.pkl" in leaves:
+        compiled = any("/code/" in name for name in names) or "constants.pkl" in leaves
+        return "torchscript" if compiled else "torch"
+    return "sog" if "meta.json" in leaves and any(leaf.endswith(".webp") for leaf in leaves) else "zip"
+
+
+def _plausible_splat(head: bytes, size: int) -> bool:
+    """Whether the file is whole records of numbers that a splat can have."""
+    if size % SPLAT_RECORD.itemsize:
+        return False
+    rows = np.frombuffer(head[: len(head) // SPLAT_RECORD.itemsize * SPLAT_RECORD.itemsize], SPLAT_RECORD)
+    length = np.linalg.norm(rows["quat"].astype(np.float32) / 128 - 1, axis=1)
+    scale = rows["scale"]
+    return bool(np.isfinite(rows["position"]).all() and (scale > 0).all() and (scale < 1e6).all() and ((length > 0.5) & (length < 1.8)).all())

@@ -1,0 +1,235 @@
+"""PLY files: refused with a sentence before anything is allocated, read into columns, written atomically."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.formats.atomic import new_file
+from mipmap_plugin.formats.magic import read_head
+
+# Bytes. The header of a degree-3 splat has 1.5 kB; without a cap, a file without `end_header` would be searched to its end.
+MAX_HEADER = 128 * 1024
+
+BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+}
+
+
+@dataclass(frozen=True)
+class Element:
+    """One `element` of a header. The type of a list is `list <length type> <value type>`."""
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, str], ...]  # (name, type)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for name, _ in self.properties)
+
+    @property
+    def has_lists(self) -> bool:
+        return any(kind.startswith("list") for _, kind in self.properties)
+
+    @property
+    def stride(self) -> int:
+        """Bytes of a binary row; a list counts as empty, which is the least that it can be."""
+        return sum(np.dtype(TYPES[kind.removeprefix("list ").split()[0]]).itemsize for _, kind in self.properties)
+
+    def dtype(self, byte_order: str) -> np.dtype:
+        return np.dtype([(name, byte_order + TYPES[kind]) for name, kind in self.properties])
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a PLY declares, already compared with the size of the file."""
+
+    format: str
+    elements: tuple[Element, ...]
+    comments: tuple[str, ...]
+    body: int  # bytes from the start of the file to the first row
+    notes: tuple[str, ...] = ()
+
+    @property
+    def vertex(self) -> Element:
+        return next(element for element in self.elements if element.name == "vertex")
+
+    @property
+    def before_vertex(self) -> tuple[Element, ...]:
+        return self.elements[: self.elements.index(self.vertex)]
+
+    def least_bytes(self, element: Element) -> int:
+        """What a row takes at least; in ascii, a digit and a blank per value."""
+        return 2 * len(element.properties) if self.format == "ascii" else element.stride
+
+
+@dataclass(frozen=True, eq=False)
+class PlyFile:
+    """The `vertex` element of a PLY."""
+
+    columns: dict[str, np.ndarray]  # in file order, each [N], in the type and byte order of the file
+    comments: tuple[str, ...]  # texts of `comment` and `obj_info` lines
+    format: str  # a key of BYTE_ORDER
+    notes: tuple[str, ...] = ()  # what was tolerated, in sentences
+
+
+def read_header(path: str | Path) -> Header:
+    """The header of a PLY whose rows are all there. Raises CheckpointError saying what is wrong and what to do."""
+    path = Path(path)
+    head = read_head(path, MAX_HEADER)
+    first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", head)
+    if first is None:
+        raise CheckpointError(f"{path} is not a PLY file: it does not start with the line `ply`")
+    # The first line's ending holds for the whole header (plyfile): a body may well begin with a byte that looks like one.
+    newline, blank = first[1], rb"[ \t\r]*" if first[1] == b"\n" else rb"[ \t]*"
+    end = re.search(newline + rb"end_header" + blank + newline, head)
+    if end is None:
+        raise CheckpointError(f"{path} has no end_header in its first {MAX_HEADER // 1024} kB: it is cut off or not a PLY; download it again")
+    header = _parsed(path, head[first.end() : end.start()].split(newline), end.end())
+    return _sized(path, header, path.stat().st_size - end.end())
+
+
+def read_ply(path: str | Path) -> PlyFile:
+    """The rows of a PLY. Takes ascii and both byte orders, extra elements and any column order. Raises CheckpointError."""
+    path = Path(path)
+    header = read_header(path)
+    vertex = header.vertex
+    if header.format == "ascii" or any(element.has_lists for element in header.before_vertex):
+        rows = _read_through_plyfile(path, header)
+    else:
+        start = header.body + sum(element.count * element.stride for element in header.before_vertex)
+        rows = np.fromfile(path, vertex.dtype(BYTE_ORDER[header.format]), vertex.count, offset=start)
+    return PlyFile({name: rows[name] for name in vertex.names}, header.comments, header.format, header.notes)
+
+
+def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Iterable[str] = (), *, overwrite: bool = False) -> Path:
+    """Write columns [N] as the `vertex` element, binary little endian, each in its own type. Atomic.
+
+    Raises OutputExists; OutputError when the disk refuses; SettingsError when the comments do not fit a header.
+    """
+    path = Path(path)
+    dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    rows = np.empty(len(next(iter(columns.values()))), dtype)
+    for name, column in columns.items():
+        rows[name] = column
+    data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=[_one_ascii_line(text) for text in comments])
+    if len(data.header) >= MAX_HEADER:
+        raise SettingsError(f"{path}: comments and provenance take {len(data.header):,} bytes, but a PLY header holds {MAX_HEADER:,}; shorten them")
+    with new_file(path, overwrite) as temporary, temporary.open("xb") as file:
+        data.write(file)
+        file.flush()
+        os.fsync(file.fileno())
+    return path
+
+
+def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
+    form, elements, comments = "", [], []
+    for number, line in enumerate(lines, start=2):
+        try:
+            keyword, rest = [*line.decode("utf-8", "replace").strip().split(maxsplit=1), "", ""][:2]
+            if keyword == "format":
+                form = _known(rest.split()[0], BYTE_ORDER)
+            elif keyword == "element":
+                elements.append(Element(rest.split()[0], _count(rest.split()[1]), ()))
+            elif keyword == "property":
+                elements[-1] = _with_property(elements[-1], rest.split())
+            elif keyword in ("comment", "obj_info"):
+                comments.append(rest)
+            elif keyword:
+                raise ValueError(keyword)
+        except (ValueError, IndexError) as error:
+            raise CheckpointError(f"{path}: line {number} of the PLY header cannot be read: {line[:80].decode('ascii', 'replace')!r}") from error
+    if not form:
+        raise CheckpointError(f"{path}: the PLY header has no `format` line; export the file again")
+    # Rows of nothing may be of any number, and plyfile would count to it.
+    return Header(form, tuple(element for element in elements if element.properties), tuple(comments), body)
+
+
+def _with_property(element: Element, words: list[str]) -> Element:
+    *kind, name = words
+    types = kind[1:] if kind[0] == "list" and len(kind) == 3 else kind
+    for word in types:
+        _known(word, TYPES)
+    if not types or (len(types) > 1 and kind[0] != "list") or name in element.names:
+        raise ValueError(name)
+    return replace(element, properties=(*element.properties, (name, " ".join(kind))))
+
+
+def _known(word: str, table: Mapping[str, str]) -> str:
+    if word not in table:
+        raise ValueError(word)
+    return word
+
+
+def _count(word: str) -> int:
+    count = int(word)
+    if count < 0:
+        raise ValueError(word)
+    return count
+
+
+def _sized(path: Path, header: Header, size: int) -> Header:
+    """Compare the `size` bytes after the header with what it declares."""
+    vertices = [element for element in header.elements if element.name == "vertex"]
+    if not vertices:
+        raise CheckpointError(f"{path} has no vertex element, so it holds no splats; its elements are {[e.name for e in header.elements]}")
+    vertex = vertices[0]
+    if vertex.has_lists:
+        raise CheckpointError(f"{path} has list properties in its vertex element: this is a mesh or another format, not splats")
+    available = size + (header.format == "ascii")  # the last value needs no blank behind it
+    taken = sum(element.count * header.least_bytes(element) for element in header.before_vertex)
+    held = max(0, available - taken) // header.least_bytes(vertex)
+    if held < vertex.count:
+        raise CheckpointError(
+            f"{path} is truncated: its header declares {vertex.count:,} splats, but at least {vertex.count - held:,} of them are missing;"
+            " download or copy it again"
+        )
+    if header.format == "ascii" or any(element.has_lists for element in header.elements):
+        return header
+    surplus = size - sum(element.count * element.stride for element in header.elements)
+    return _with_surplus(path, header, surplus) if surplus > 0 else header
+
+
+def _with_surplus(path: Path, header: Header, surplus: int) -> Header:
+    vertex = header.vertex
+    if surplus == 2 * vertex.count and ("colors", "uchar") in vertex.properties:
+        # nerfstudio 1.0.3 to 1.1.x declares one byte of `colors` and writes three (nerfstudio #3377).
+        at = vertex.names.index("colors")
+        rgb = tuple((name, "uchar") for name in ("red", "green", "blue"))
+        fixed = replace(vertex, properties=vertex.properties[:at] + rgb + vertex.properties[at + 1 :])
+        elements = tuple(fixed if element is vertex else element for element in header.elements)
+        return replace(header, elements=elements, notes=(f"{path.name} declares one byte of `colors` but holds three; they are read as RGB",))
+    return replace(header, notes=(f"{path.name} has {surplus:,} bytes more than its header declares; they are ignored",))
+
+
+def _read_through_plyfile(path: Path, header: Header) -> np.ndarray:
+    """Rows of varying length, parsed by plyfile under a header that it is sure to accept."""
+    declared = [f"ply\nformat {header.format} 1.0\n"]
+    for element in header.elements:
+        declared += [f"element {element.name} {element.count}\n", *(f"property {kind} {name}\n" for name, kind in element.properties)]
+        if element is header.vertex:
+            break
+    with path.open("rb") as file:
+        file.seek(header.body)
+        content = "".join([*declared, "end_header\n"]).encode() + file.read()
+    try:
+        return PlyData.read(io.BytesIO(content))["vertex"].data
+    except (PlyParseError, ValueError, OverflowError) as error:
+        raise CheckpointError(f"{path} is damaged or truncated ({error}); download or export it again") from error
+
+
+def _one_ascii_line(text: str) -> str:
+    return " ".join(text.splitlines()).encode("ascii", "backslashreplace").decode()

@@ -1,0 +1,117 @@
+"""Files of torch.save, read and written as data: of what a pickle may name, only tensors, plain values and NumPy scalars are made."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.atomic import new_file
+from mipmap_plugin.formats.magic import read_head
+from mipmap_plugin.formats.pickles import MOST_PACKED, refuse_hostile
+
+_SCALAR: Any = np.float64(0).__reduce__()[0]
+_KINDS = [np.dtype(kind) for kind in (np.float64, np.float32, np.int64, np.int32, np.bool_)]
+
+
+def _named(module: str, name: str, made: Callable[..., Any]) -> Any:
+    """`made` under a name of NumPy's; torch takes the names of what is safe from the functions themselves."""
+
+    def stand_in(*values: Any) -> Any:
+        return made(*values)
+
+    stand_in.__module__, stand_in.__qualname__ = module, name
+    return stand_in
+
+
+def _number_type(name: str, *_: bool) -> np.dtype:
+    """Only numbers: other types of NumPy's are as large as their name says."""
+    return next(kind for kind in _KINDS if kind.str[1:] == name)
+
+
+# What a NumPy scalar is pickled as, by NumPy 2 and by NumPy 1; learning-rate schedulers leave such scalars in checkpoints.
+_SAFE: list[Any] = [
+    *(_named(module, "scalar", _SCALAR) for module in ("numpy._core.multiarray", "numpy.core.multiarray")),
+    _named("numpy", "dtype", _number_type),
+    *map(type, _KINDS),
+]
+
+
+def load_torch(path: Path) -> Any:
+    """The content of a torch file, on the CPU. Raises CheckpointError for a damaged one, or one that would run code or fill the memory."""
+    read_head(path, 512)
+    try:
+        refuse_hostile(path)
+        with _allowing_scalars():
+            content = torch.load(path, map_location="cpu", weights_only=True)
+        storages: dict[int, int] = {}
+        for tensor in _tensors(content):
+            _refuse_unusual(tensor)
+            storages[tensor.untyped_storage().data_ptr()] = tensor.untyped_storage().nbytes()
+        if sum(storages.values()) > MOST_PACKED * path.stat().st_size:
+            raise ValueError("its tensors claim more numbers than the file holds")
+        return content
+    except Exception as error:  # a damaged or hostile pickle may fail in any way
+        raise CheckpointError(f"{path} is damaged, or holds more than plain tensors and is not executed; save it again ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    """The first line of what went wrong, without torch's advice to its users, which comes before and behind."""
+    text = str(error).rpartition("WeightsUnpickler error:")[2].strip()
+    return (text.splitlines() or [type(error).__name__])[0].partition(". Please use")[0][:160]
+
+
+def _allowing_scalars() -> AbstractContextManager[None]:
+    """NumPy's scalars may be read inside; older torch can be told of no exceptions and refuses a file with some, by their name."""
+    return torch.serialization.safe_globals(_SAFE) if hasattr(torch.serialization, "safe_globals") else nullcontext()
+
+
+def _tensors(content: Any) -> Iterator[Tensor]:
+    """Every tensor in nested containers; of containers that hold themselves, each once."""
+    ahead, entered = [content], set()
+    while ahead:
+        value = ahead.pop()
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, (dict, list, tuple, set)) and id(value) not in entered:
+            entered.add(id(value))
+            if set(getattr(value, "__dict__", ())) - {"_metadata"}:  # torch's own; any other could stand for a method
+                raise ValueError("its dictionaries have attributes")
+            ahead += value.values() if isinstance(value, dict) else value
+
+
+def _refuse_unusual(tensor: Tensor) -> None:
+    """Only numbers that lie in the file, one after the other, are known to compute as others do and to take no more room than the file."""
+    if tensor.layout != torch.strided or tensor.device.type != "cpu" or tensor.is_quantized or tensor.is_complex() or tensor.is_nested:
+        raise ValueError("it holds a sparse, quantized, complex, nested or empty-shelled tensor")
+    if vars(tensor):
+        raise ValueError("a tensor has attributes")
+    if tensor.numel() * tensor.element_size() > tensor.untyped_storage().nbytes():
+        raise ValueError(f"a tensor of shape {list(tensor.shape)} claims more numbers than the file holds")
+
+
+def step_and_comments(content: Mapping[str, Any], path: Path) -> tuple[int, tuple[str, ...]]:
+    """What a trainer, and this package, write beside the splats; a new file is named by the step. Raises CheckpointError for other things."""
+    step, comments = content.get("step", 0), content.get("comments", ())
+    if not isinstance(step, int) or step < 0:
+        raise CheckpointError(f"{path} is damaged: its step is no whole number; copy it again")
+    if not isinstance(comments, (list, tuple)) or not all(isinstance(text, str) for text in comments):
+        raise CheckpointError(f"{path} is damaged: its comments are no texts; copy it again")
+    return step, tuple(comments)
+
+
+def save_torch(path: Path, content: Any, *, overwrite: bool) -> Path:
+    """Write a torch file atomically; return its path. Raises OutputExists, OutputError."""
+    with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:  # how torch reports a disk that refuses, whose own reason it does not tell
+            raise OSError(errno.EIO, "the disk refuses; it may be full") from error
+    return path

@@ -1,0 +1,1 @@
+"""Models of anchors: Scaffold-GS and Octree-GS."""

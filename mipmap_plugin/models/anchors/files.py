@@ -1,0 +1,157 @@
+"""The file of an anchor model: the columns of its PLY, as raw parameters and back, and what lies around it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
+from mipmap_plugin.formats.atomic import new_file, sha256
+from mipmap_plugin.formats.cfg_args import format_cfg_args
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.models.anchors.networks import Weights, check_networks, read_networks
+from mipmap_plugin.models.base import CARRIED, TrainedScale
+from mipmap_plugin.models.columns import NORMAL, POSITION, QUATERNION, numbered, stacked
+from mipmap_plugin.models.detect import Checkpoint, detect_as
+from mipmap_plugin.models.health import LARGEST
+from mipmap_plugin.models.inria_folder import read_options, trained_scale
+from mipmap_plugin.models.vanilla import Origin
+
+OFFSET, FEATURE = "f_offset_", "f_anchor_feat_"
+
+# The first three stretch an anchor's offsets, the others its splats.
+SCALES = tuple(f"scale_{i}" for i in range(6))
+
+
+@dataclass(frozen=True, eq=False)
+class AnchorFile:
+    """What was read: of the PLY, its companions and its folder, or of a live object."""
+
+    parameters: dict[str, Tensor]  # of the finite anchors
+    carried: tuple[str, ...]  # the names of the columns in `parameters[CARRIED]`
+    weights: Weights
+    companions: dict[str, bytes]  # the files that the weights were read from
+    options: dict[str, Any]  # of cfg_args
+    trained: TrainedScale
+    origin: Origin
+    first: dict[str, np.ndarray] = field(default_factory=dict)  # by column, the first two values; where Octree-GS keeps its constants
+    notes: tuple[str, ...] = ()
+
+
+def read_anchors(path: str | Path, family: str, iteration: int | None) -> AnchorFile:
+    """Read the anchors at `path`, a PLY or model folder of `family`. Anchors that are not finite are dropped, with a note.
+
+    Raises CheckpointError for what is damaged, incomplete, or of another family.
+    """
+    found = detect_as(path, (family,), iteration=iteration)
+    ply = read_ply(found.path)
+    parameters, carried = to_parameters(ply.columns, found.path)
+    weights, companions = read_networks(found.path.parent)
+    parameters, dropped = _sound(parameters, weights, found.path)
+    first = {name: column[:2].copy() for name, column in ply.columns.items()}
+    options, notes = read_options(found.folder)
+    origin = _origin(found, ply.comments)
+    every_note = (*found.notes, *ply.notes, *notes, *dropped)
+    return AnchorFile(parameters, carried, weights, companions, options, trained_scale(options, None), origin, first, every_note)
+
+
+def anchors_in_memory(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, name: str) -> AnchorFile:
+    """As `read_anchors`, of tensors that came from no file; `name` tells whose they are. Raises CheckpointError."""
+    parameters, dropped = _sound(parameters, weights, name)
+    return AnchorFile(parameters, carried, weights, {}, {}, trained_scale({}, None), Origin(), notes=(f"copied from a live {name}", *dropped))
+
+
+def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
+    """Raw float32 parameters, and the names of the carried columns.
+
+    means [N, 3], offsets [N, k, 3], features [N, F], scales [N, 6] log, carried [N, C]. Raises CheckpointError for missing columns.
+    """
+    offsets, features = numbered(columns, OFFSET), numbered(columns, FEATURE)
+    missing = [name for name in (*POSITION, "opacity", *SCALES, *QUATERNION) if name not in columns]
+    if missing or not features or not offsets or len(offsets) % 3:
+        lacking = ", ".join(missing) or f"{len(offsets)} offsets and {len(features)} features do not make anchors"
+        raise CheckpointError(f"{path} is no whole anchor model, for its columns are not all there: {lacking}; export it again")
+    known = {*POSITION, *NORMAL, *offsets, *features, *SCALES, "info"}
+    carried = tuple(name for name in columns if name not in known)
+    return {
+        "means": stacked(columns, POSITION),
+        "offsets": stacked(columns, offsets).unflatten(1, (3, -1)).transpose(1, 2).contiguous(),  # the file is channel-major
+        "features": stacked(columns, features),
+        "scales": stacked(columns, SCALES),
+        CARRIED: stacked(columns, carried),
+    }, carried
+
+
+def to_columns(parameters: Mapping[str, Tensor], carried: tuple[str, ...], second: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns as the originals order them, all f4; those of `second` follow the position."""
+    raw = {name: tensor.detach().to("cpu", torch.float32) for name, tensor in parameters.items()}
+    blocks = {OFFSET: raw["offsets"].transpose(1, 2).flatten(1), FEATURE: raw["features"]}
+    held = {f"{prefix}{i}": block[:, i].numpy() for prefix, block in blocks.items() for i in range(block.shape[1])}
+    middle = tuple(held)
+    for names, block in ((POSITION, raw["means"]), (SCALES, raw["scales"]), (carried, raw[CARRIED])):
+        held |= {name: block[:, i].numpy() for i, name in enumerate(names)}
+    held |= second
+    order = dict.fromkeys((*POSITION, *second, *middle, "opacity", *SCALES, *QUATERNION, *carried))
+    return {name: held[name] for name in order}
+
+
+def write_beside(ply: Path, companions: Mapping[str, bytes], source: Path | None, overwrite: bool) -> None:
+    """Put the networks' files, whose names are fixed, beside a PLY. Raises OutputExists rather than spoil other anchors' networks."""
+    differ = refuse_others(ply, companions, source, overwrite)
+    for name, content in companions.items():
+        if name in differ or not (ply.parent / name).exists():
+            with new_file(ply.parent / name, overwrite) as temporary:
+                temporary.write_bytes(content)
+
+
+def refuse_others(ply: Path, companions: Mapping[str, bytes], source: Path | None, overwrite: bool) -> list[str]:
+    """The files beside `ply` that differ from `companions`. Raises OutputExists where they may not be replaced."""
+    differ = [name for name, content in companions.items() if (ply.parent / name).exists() and (ply.parent / name).read_bytes() != content]
+    if differ and (not overwrite or (source is not None and os.path.realpath(source.parent) == os.path.realpath(ply.parent))):
+        raise OutputExists(f"{ply.parent} holds other networks ({', '.join(differ)}) that would be replaced; choose an empty folder")
+    return differ
+
+
+def cfg_text(source: Path | None, target: Path, trained: TrainedScale, options: dict[str, Any]) -> str:
+    """The source's own cfg_args; where there is none, the original's usual options and those that the files tell."""
+    if source is not None and (source / "cfg_args").is_file():
+        return (source / "cfg_args").read_bytes().decode("utf-8")
+    usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": False}
+    sampling = {"ds": 1, "ratio": 1, "undistorted": False, "white_background": trained.background == (1.0, 1.0, 1.0)}
+    return format_cfg_args({**usual, **sampling, **options})
+
+
+def needs_views(views: Any) -> None:
+    """Raise SettingsError without views: anchors show nothing by themselves."""
+    if not views:
+        raise SettingsError("the splats of anchors exist only for a camera; give at least one view")
+
+
+def _origin(found: Checkpoint, comments: tuple[str, ...]) -> Origin:
+    return Origin(found.path, sha256(found.path), found.folder, found.iteration, comments)
+
+
+def _sound(parameters: dict[str, Tensor], weights: Weights, where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
+    """The finite anchors, whose networks fit them, and a note when these are not all."""
+    folder = where.parent if isinstance(where, Path) else where
+    check_networks(weights, parameters["features"].shape[1], parameters["offsets"].shape[1], folder)
+    return _finite(parameters, where)
+
+
+def _finite(parameters: dict[str, Tensor], where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
+    """The anchors that are finite once activated, and of a size that float32 can reckon with; a note when these are not all."""
+    values = [*parameters.values(), parameters["scales"].exp()]
+    sound = torch.stack([(value.flatten(1).abs() <= LARGEST).all(1) for value in values]).all(0)  # not so for NaN
+    if sound.all():
+        return parameters, []
+    if not sound.any():
+        raise CheckpointError(f"{where}: none of its {len(sound):,} anchors is finite; the training or the export failed")
+    lost = f"{int((~sound).sum()):,} of {len(sound):,} anchors are not finite and were dropped"
+    return {name: tensor[sound] for name, tensor in parameters.items()}, [lost]

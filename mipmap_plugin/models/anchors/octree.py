@@ -1,0 +1,145 @@
+"""Octree-GS (Ren et al. 2024): anchors in levels of detail, of which a camera sees those as coarse as its distance asks for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effect
+from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.models.anchors.decoding import Anchors
+from mipmap_plugin.models.anchors.files import AnchorFile, read_anchors
+from mipmap_plugin.models.anchors.model import AnchorModel
+from mipmap_plugin.models.anchors.networks import NEEDED, surplus
+
+# How a distance becomes a level: `dist2level` of cfg_args. Progressive levels fade in.
+TO_LEVEL = {"floor": torch.floor, "round": torch.round, "ceil": torch.ceil}
+PROGRESSIVE = "progressive"
+MAX_LEVELS, MAX_FORK = 100, 1000  # published models have 5 to 20 levels, each 2 times finer
+ALMOST_ONE = 0.9999  # the original's: progressive levels are clamped just short of the next one
+
+
+class OctreeModel(AnchorModel):
+    """Anchors of level 0 are the coarsest. `Camera.zoom` is 1 / the original's `resolution_scale`."""
+
+    family = "octree"
+
+    def __init__(self, read: AnchorFile, inputs: dict[str, tuple[str, ...]], fork: float, to_level: str) -> None:
+        """`fork`: how many times finer each level is; `to_level`: a key of TO_LEVEL or PROGRESSIVE."""
+        self._fork, self._to_level = fork, to_level
+        # The original keeps two constants in the first rows of a column (scene/gaussian_model.py, save_ply).
+        self._voxel_size, self._standard_distance = (float(each) for each in read.first["info"])
+        super().__init__(read, inputs)
+        levels = self._column("level")
+        self._levels = int(levels.max() - levels.min()) + 1
+        if self._levels > MAX_LEVELS:
+            raise CheckpointError(f"{self.source}: its anchors lie in {self._levels:,} levels of detail; the file is damaged, so export it again")
+        self.notes.append(f"{self._levels} levels of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
+
+    def _effects(self) -> tuple[Effect, ...]:
+        told = f"{self._levels} of them, chosen by distance and zoom ({self._to_level})"
+        return (*super()._effects(), Effect("levels of detail", self._levels > 1, told, f"a distance and a logarithm an anchor, of {len(self):,}"))
+
+    def wanted_levels(self, camera: Camera) -> Tensor:
+        """[N] the level that `camera` asks for at each anchor, with a fraction where levels fade."""
+        level, extra = self._column("level", "extra_level").unbind(1)
+        corner = self._parameters["means"].detach() + (self._voxel_size / 2) / self._fork ** level[:, None]
+        distance = (corner - camera.center.to(corner)).norm(dim=1) / camera.zoom
+        wanted = torch.log2(self._standard_distance / distance) / math.log2(self._fork) + extra
+        if self._to_level == PROGRESSIVE:
+            return (wanted + 1).clamp(ALMOST_ONE, self._levels - 1 + ALMOST_ONE)
+        return TO_LEVEL[self._to_level](wanted).clamp(0, self._levels - 1)
+
+    def row_opacities(self, views: Sequence[Camera]) -> Tensor:
+        """[N] as for any anchors, but that of one anchor of the coarsest level is 1, and that of two in all, so that they are never pruned.
+
+        The original counts its levels from the coarsest that a file has (scene/gaussian_model.py, load_ply_sparse_gaussian), and shows
+        none that is finer than their number: without the coarsest it would lose the finest. Its constants need two rows.
+        """
+        opacities, levels = super().row_opacities(views), self._column("level")[:, 0]
+        opacities[opacities.where(levels == levels.min(), -1.0).argmax()] = 1.0
+        opacities[opacities.topk(min(2, len(opacities))).indices] = 1.0
+        return opacities
+
+    def _chosen(self, camera: Camera) -> Tensor:
+        return self._column("level")[:, 0] <= self.wanted_levels(camera).floor()
+
+    def _anchors(self, rows: Tensor | slice, camera: Camera | None) -> Anchors:
+        levels = self._column("level")[rows]
+        anchors = replace(super()._anchors(rows, camera), levels=levels)
+        if camera is None or self._to_level != PROGRESSIVE:
+            return anchors
+        wanted = self.wanted_levels(camera)[rows, None]
+        return replace(anchors, fading=torch.where(levels == wanted.floor(), wanted.frac(), 1.0))
+
+    def _second_columns(self) -> dict[str, np.ndarray]:
+        if len(self) < 2:
+            raise SettingsError("a file of Octree-GS needs two anchors to hold its constants, but only one is left; prune less")
+        info = np.zeros(len(self), np.float32)
+        info[:2] = self._voxel_size, self._standard_distance
+        levels = self._column("level", "extra_level").cpu().numpy()
+        return {"level": levels[:, 0], "extra_level": levels[:, 1], "info": info}
+
+    def _cfg_options(self) -> dict[str, Any]:
+        level = any("level" in taken for taken in self._inputs.values())
+        grid = {"fork": self._fork, "extend": 1.1, "dist2level": self._to_level, "base_layer": -1, "levels": self._levels, "extra_ratio": 0.25}
+        return {**super()._cfg_options(), "add_level": level, **grid, "resolution_scales": [1.0], "random_background": False}
+
+
+def load_octree(path: str | Path, *, iteration: int | None = None) -> OctreeModel:
+    """Load an Octree-GS model folder, or its PLY with the networks beside it.
+
+    Which networks take a distance or a level follows from their shapes and, where these leave a doubt, from cfg_args.
+    Raises CheckpointError.
+    """
+    read = read_anchors(path, "octree", iteration)
+    if len(read.first["info"]) < 2 or not all(math.isfinite(each) and each > 0 for each in read.first["info"]):
+        raise CheckpointError(f"{read.origin.source}: the first two values of `info` are no voxel size and standard distance; export it again")
+    fork, to_level = read.options.get("fork", 2), read.options.get("dist2level", "round")
+    if not isinstance(fork, (int, float)) or not 1 < fork <= MAX_FORK or to_level not in (*TO_LEVEL, PROGRESSIVE):
+        raise CheckpointError(f"{read.origin.source}: cfg_args has fork={fork!r} and dist2level={to_level!r}, which make no levels")
+    model = OctreeModel(read, _inputs(read), fork, to_level)
+    if "dist2level" not in read.options:
+        model.notes.append("no cfg_args tells how levels are chosen; the original's defaults are taken: fork 2, round")
+    return model
+
+
+def _inputs(read: AnchorFile) -> dict[str, tuple[str, ...]]:
+    """What each network takes: features, direction, and as widths and options tell, distance, level and appearance."""
+    features = read.parameters["features"].shape[1]
+    extras = {name: surplus(read.weights, name, features) for name in NEEDED}
+    level = _takes_level(read, extras)
+    inputs: dict[str, tuple[str, ...]] = {}
+    for name, extra in extras.items():
+        if extra - level not in (0, 1):
+            reason = "embedding_appearance.pt is missing" if name == "color_mlp" and extra > 2 else "the files or cfg_args do not match"
+            raise CheckpointError(f"{read.origin.source}: {name} takes {extra} numbers more than features and direction; {reason}")
+        inputs[name] = ("features", "direction", *("distance",) * (extra - level), *("level",) * level)
+    if "feature_bank_mlp" in read.weights:
+        inputs["feature_bank_mlp"] = ("direction", *("level",) * level)
+    if "appearance" in read.weights:
+        inputs["color_mlp"] += ("appearance",)
+    return inputs
+
+
+def _takes_level(read: AnchorFile, extras: dict[str, int]) -> bool:
+    """Whether levels go into the networks, into all or none. One number more may be a distance or a level; what can decide, does."""
+    if "feature_bank_mlp" in read.weights:
+        return surplus(read.weights, "feature_bank_mlp", 0) == 1
+    if 0 in extras.values():
+        return False
+    if max(extras.values()) > 1:
+        return True
+    if "add_level" in read.options:
+        return bool(read.options["add_level"])
+    raise CheckpointError(
+        f"{read.origin.source}: its networks take one number more, which may be the distance or the level; put the cfg_args of its training beside it"
+    )

@@ -1,0 +1,63 @@
+"""Scaffold-GS (Lu et al. 2024): anchors on a voxel grid whose splats are decoded for each view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.models.anchors.files import AnchorFile, anchors_in_memory, read_anchors
+from mipmap_plugin.models.anchors.model import AnchorModel
+from mipmap_plugin.models.anchors.networks import NEEDED, Weights, surplus
+from mipmap_plugin.models.columns import NORMAL, QUATERNION
+
+
+class ScaffoldModel(AnchorModel):
+    """Anchors that are all there for every camera."""
+
+    family = "scaffold"
+
+    def _second_columns(self) -> dict[str, np.ndarray]:
+        return {name: np.zeros(len(self), np.float32) for name in NORMAL}
+
+    def _cfg_options(self) -> dict[str, Any]:
+        growth = {"voxel_size": 0.001, "update_depth": 3, "update_init_factor": 16, "update_hierachy_factor": 4}  # the original spells it so
+        return {"sh_degree": 3, **growth, "lod": 0, "lowpoly": False, **super()._cfg_options()}
+
+
+def load_scaffold(path: str | Path, *, iteration: int | None = None) -> ScaffoldModel:
+    """Load a Scaffold-GS model folder, or its PLY with the networks beside it.
+
+    Which networks take the distance of the camera follows from their shapes. Raises CheckpointError.
+    """
+    read = read_anchors(path, "scaffold", iteration)
+    model = ScaffoldModel(read, _inputs(read, read.origin.source))
+    if read.options.get("lod"):
+        model.notes.append(f"cfg_args says lod={read.options['lod']}: the original's test views are not every eighth, so name the views you want")
+    return model
+
+
+def scaffold_in_memory(parameters: dict[str, Tensor], weights: Weights, name: str) -> ScaffoldModel:
+    """The model of raw tensors, whose `carried` are the opacity and the quaternion; `name` tells whose they are. Raises CheckpointError."""
+    read = anchors_in_memory(parameters, ("opacity", *QUATERNION), weights, name)
+    return ScaffoldModel(read, _inputs(read, name))
+
+
+def _inputs(read: AnchorFile, where: Path | str | None) -> dict[str, tuple[str, ...]]:
+    """What each network takes: features, direction, and as the widths tell, distance and appearance."""
+    features = read.parameters["features"].shape[1]
+    inputs: dict[str, tuple[str, ...]] = {}
+    for name in NEEDED:
+        extra = surplus(read.weights, name, features)
+        if extra not in (0, 1):
+            reason = "embedding_appearance.pt is missing" if name == "color_mlp" and extra > 1 else "the files do not match"
+            raise CheckpointError(f"{where}: {name} takes {extra} numbers more than features and direction; {reason}")
+        inputs[name] = ("features", "direction", *("distance",) * extra)
+    if "feature_bank_mlp" in read.weights:
+        inputs["feature_bank_mlp"] = ("direction", "distance")
+    if "appearance" in read.weights:
+        inputs["color_mlp"] += ("appearance",)
+    return inputs

@@ -1,0 +1,1 @@
+"""Moving scenes: Deformable-3D-Gaussians and 4DGaussians."""

@@ -1,0 +1,164 @@
+"""Deformable 3D Gaussians (Yang et al. 2024): canonical splats, and a network that shifts, turns and scales them at a time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import linear, relu
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.state_dict import read_state_dict, require
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.moving.model import MovingModel, read_canonical
+from mipmap_plugin.models.vanilla import VanillaModel
+
+# Frequencies of the embeddings (utils/time_utils.py): 3 + 2·3·10 = 63 numbers for a position, 1 + 2·10 = 21 for a time.
+POSITION_FREQUENCIES, TIME_FREQUENCIES = 10, 10
+POSITION_INPUTS, TIME_INPUTS = 3 + 6 * POSITION_FREQUENCIES, 1 + 2 * TIME_FREQUENCIES
+
+# The published code adds it to each component of the screw axis, to no end of its own; the network was trained with it.
+SCREW_OFFSET = 1e-5
+
+# Radians: below it (angle - sin(angle)) / angle**3 is taken from its series, which is exact there to 1e-9.
+SMALL_ANGLE = 0.5
+
+# Splats that go through the network together: a few hundred numbers for each are held at a time.
+CHUNK = 65_536
+
+
+class DeformNetwork:
+    """A multilayer perceptron of position and time. Its variants are told from its weights: `timenet` (for synthetic scenes), 6-DoF."""
+
+    changes_opacities = False
+
+    def __init__(self, weights: Mapping[str, Tensor], where: str = "the network") -> None:
+        """Take the tensors of a `deform.pth` by name. Raises CheckpointError, with `where` as its subject."""
+        self._weights = {name: tensor.detach().float() for name, tensor in weights.items()}
+        self.depth = sum(bool(re.fullmatch(r"linear\.\d+\.weight", name)) for name in weights)
+        self.has_timenet = "timenet.0.weight" in weights
+        self.is_6dof = "branch_w.weight" in weights
+        if self.depth == 0:
+            held = ", ".join(sorted({name.partition(".")[0] for name in weights})[:4]) or "nothing"
+            raise CheckpointError(f"{where}: it has no layers linear.0, linear.1, ..., but {held}, so a changed copy of the project trained it")
+        told_by = ["linear.0.weight", *(["timenet.0.weight", "timenet.2.weight"] if self.has_timenet else [])]
+        require(self._weights, dict.fromkeys(told_by, (-1, -1)), where)
+        self._refuse_other_inputs(where)
+        require(self._weights, self._shapes(), where)
+        self.is_still = not any(self._weights[f"{head}.{part}"].any() for head in self._heads for part in ("weight", "bias"))
+        self.cost = f"{sum(w.numel() for name, w in self._weights.items() if name.endswith('weight')):,} multiplications a splat and moment"
+
+    def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
+        """The splats as the original's kernel sees them: scales grow linearly and may turn negative, quaternions do not stay of length 1."""
+        still = canonical.gaussians()
+        # Detached: the original's means have no gradient through the network either, and no graph is kept for it.
+        motion, turn, growth = self.motion(still.means.detach(), time)
+        means = move_along_screw(still.means, *motion.split(3, dim=1)) if self.is_6dof else still.means + motion
+        quats, scales = still.quats + turn, still.scales + growth
+        return Gaussians(means, quats, scales.abs(), still.opacities, still.sh, kernel_covariances(quats, scales))
+
+    @torch.no_grad()
+    def motion(self, means: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Shifts [N, 3], or screws [N, 6] with 6-DoF; changes of quaternions [N, 4] and of scales [N, 3]."""
+        moment = embed(means.new_tensor([[time]]), self._frequencies_of_time)
+        if self.has_timenet:
+            moment = self._layer("timenet.2", relu(self._layer("timenet.0", moment)))
+        hidden = [self._hidden(part, moment) for part in means.split(CHUNK)]
+        each = [[self._layer(head, h) for head in self._heads] for h in hidden]
+        *motion, turn, growth = (torch.cat(parts) for parts in zip(*each, strict=True))
+        return torch.cat(motion, dim=1), turn, growth
+
+    def to(self, device: torch.device | str) -> DeformNetwork:
+        return DeformNetwork({name: tensor.to(device) for name, tensor in self._weights.items()})
+
+    @property
+    def _frequencies_of_time(self) -> int:
+        return (self._weights["timenet.0.weight"].shape[1] - 1) // 2 if self.has_timenet else TIME_FREQUENCIES
+
+    def _hidden(self, means: Tensor, moment: Tensor) -> Tensor:
+        inputs = torch.cat([embed(means, POSITION_FREQUENCIES), moment.expand(len(means), -1)], dim=1)
+        hidden = inputs
+        for number in range(self.depth):
+            hidden = relu(self._layer(f"linear.{number}", hidden))
+            if number == self.depth // 2:
+                hidden = torch.cat([inputs, hidden], dim=1)
+        return hidden
+
+    def _layer(self, name: str, inputs: Tensor) -> Tensor:
+        return linear(inputs, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
+
+    @property
+    def _heads(self) -> dict[str, int]:
+        """The last layers by name, and how many numbers each gives."""
+        motion = {"branch_w": 3, "branch_v": 3} if self.is_6dof else {"gaussian_warp": 3}
+        return {**motion, "gaussian_rotation": 4, "gaussian_scaling": 3}
+
+    def _refuse_other_inputs(self, where: str) -> None:
+        inputs = self._weights["linear.0.weight"].shape[-1]
+        moment = len(self._weights["timenet.2.weight"]) if self.has_timenet else TIME_INPUTS
+        if inputs != POSITION_INPUTS + moment:
+            told = f"its first layer takes {inputs} numbers, not {POSITION_INPUTS} of the position and {moment} of the time"
+            raise CheckpointError(f"{where}: {told}, so a changed copy of the project trained it, with frequencies that the file does not tell")
+
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        """What each layer must be like, from the first one."""
+        width, inputs = self._weights["linear.0.weight"].shape
+        layers: dict[str, tuple[int, ...]] = {f"linear.{i}": (width, width) for i in range(1, self.depth)}
+        layers[f"linear.{self.depth // 2 + 1}"] = (width, width + inputs)
+        layers |= {head: (size, width) for head, size in self._heads.items()}
+        if self.has_timenet:
+            hidden = len(self._weights["timenet.0.weight"])
+            layers |= {"timenet.0": (hidden, 1 + 2 * self._frequencies_of_time), "timenet.2": (inputs - POSITION_INPUTS, hidden)}
+        biases = {f"{name}.bias": shape[:1] for name, shape in layers.items()}
+        return {f"{name}.weight": shape for name, shape in layers.items()} | biases | {"linear.0.bias": (width,)}
+
+
+def load_deformable(path: str | Path, *, iteration: int | None = None) -> MovingModel:
+    """Load a model folder of Deformable 3D Gaussians. Raises CheckpointError for what is damaged, incomplete, or of another family."""
+    canonical, network = read_canonical(path, iteration, "deformable")
+    return MovingModel("deformable", canonical, DeformNetwork(read_state_dict(network), f"{network} is not a network as the project publishes it"))
+
+
+def embed(values: Tensor, frequencies: int) -> Tensor:
+    """[N, D] -> [N, D·(1 + 2·frequencies)]: the values, then sine and cosine of them times 1, 2, 4, ..."""
+    waves = [wave(values * 2**octave) for octave in range(frequencies) for wave in (torch.sin, torch.cos)]
+    return torch.cat([values, *waves], dim=1)
+
+
+def move_along_screw(points: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
+    """Points [N, 3] after a rigid motion by the exponential of the screws (turns [N, 3], shifts [N, 3]), finite without any turn.
+
+    The original divides both by the angle and multiplies them with it again (utils/rigid_utils.py; Lynch and Park, Modern
+    Robotics, 3.88), which is 0/0 where the angle is 0. Here the powers of the angle are in the coefficients, which are finite.
+    """
+    angles = turns.norm(dim=1, keepdim=True)
+    turns, shifts = turns + SCREW_OFFSET * angles, shifts + SCREW_OFFSET * angles
+    sine = torch.sinc(angles / torch.pi)  # sin(angle) / angle
+    versine = torch.sinc(angles / (2 * torch.pi)).square() / 2  # (1 - cos(angle)) / angle**2
+    turned = points + sine * torch.cross(turns, points, dim=1) + versine * _cross_twice(turns, points)
+    return turned + shifts + versine * torch.cross(turns, shifts, dim=1) + _sine_rest(angles) * _cross_twice(turns, shifts)
+
+
+def kernel_covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    """[N, 3, 3] world units², as the kernel of 3DGS makes them from quaternions wxyz [N, 4] that it never normalizes, and scales [N, 3]."""
+    w, x, y, z = quats.unbind(-1)
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    factors = torch.stack(rows, -1).unflatten(-1, (3, 3)) * scales[:, None, :]
+    return factors @ factors.mT
+
+
+def _cross_twice(axes: Tensor, vectors: Tensor) -> Tensor:
+    return torch.cross(axes, torch.cross(axes, vectors, dim=1), dim=1)
+
+
+def _sine_rest(angles: Tensor) -> Tensor:
+    """(angle - sin(angle)) / angle**3, which is 1/6 at 0."""
+    squares = angles.square()
+    series = 1 / 6 - squares / 120 + squares.square() / 5040 - squares**3 / 362_880
+    large = angles.clamp_min(SMALL_ANGLE)
+    return torch.where(angles < SMALL_ANGLE, series, (large - large.sin()) / large**3)

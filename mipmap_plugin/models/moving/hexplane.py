@@ -1,0 +1,151 @@
+"""4D Gaussians (Wu et al. 2024): canonical splats, and planes of features over space and time that change their parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations, count, takewhile
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, linear, relu
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.state_dict import read_state_dict, require
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.detect import detect
+from mipmap_plugin.models.inria_folder import read_options
+from mipmap_plugin.models.moving.model import MovingModel, read_canonical
+from mipmap_plugin.models.places import is_coarse
+from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+from mipmap_plugin.splatting.rotations import quaternion_product
+
+NET = "deformation_net."  # what the names of all weights in use begin with
+
+# The heads by name: how many numbers each gives, the option that switches it off, and the option's default (arguments/__init__.py).
+HEADS = {
+    "pos_deform": (3, "no_dx", False),
+    "scales_deform": (3, "no_ds", False),
+    "rotations_deform": (4, "no_dr", False),
+    "opacity_deform": (1, "no_do", True),
+    "shs_deform": (48, "no_dshs", True),
+}
+
+# The two coordinates of each plane of a scale: xy, xz, xt, yz, yt, zt.
+PLANES = list(combinations(range(4), 2))
+
+# Options that the published code calls useless, and that nothing published was trained with.
+UNREAD = ("empty_voxel", "grid_pe")
+
+
+class HexPlane:
+    """Features of a position and a time, looked up in planes at several scales, and what small networks make of them."""
+
+    def __init__(self, weights: Mapping[str, Tensor], options: Mapping[str, Any], where: str = "the network") -> None:
+        """Take the tensors of a `deformation.pth` by name, and the `options` of cfg_args. Raises CheckpointError, with `where` as its subject."""
+        for name in UNREAD:
+            if options.get(name):
+                raise CheckpointError(f"{where}: it was trained with {name}, which is not read by this version")
+        self._weights = {name.removeprefix(NET): tensor.detach().float() for name, tensor in weights.items() if name.startswith(NET)}
+        self._options = dict(options)
+        self.heads = {name: size for name, (size, off, default) in HEADS.items() if not options.get(off, default)}
+        self.changes_opacities = "opacity_deform" in self.heads or bool(options.get("static_mlp"))
+        self.scales = len(list(takewhile(lambda scale: f"grid.grids.{scale}.0" in self._weights, count())))
+        self.depth = len(list(takewhile(lambda layer: f"feature_out.{2 * layer}.weight" in self._weights, count())))
+        self._check(where)
+        self.is_still = self._is_still()
+        self.cost = self._cost()
+
+    def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
+        """The splats at `time`. Every change is made to the raw parameters, before they are activated."""
+        raw = canonical.parameters()
+        hidden = self.features(raw["means"], time)
+        mask = self._head("static_mlp", hidden) if self._options.get("static_mlp") else torch.ones_like(hidden[:, :1])
+        changes = {name: self._head(name, hidden) for name in self.heads}
+        moved = dict(raw)
+        if (shift := changes.get("pos_deform")) is not None:
+            moved["means"] = raw["means"] * mask + shift
+        if (growth := changes.get("scales_deform")) is not None:
+            moved["scales"] = raw["scales"] * mask + growth
+        if (turn := changes.get("rotations_deform")) is not None:
+            moved["quats"] = quaternion_product(raw["quats"], turn) if self._options.get("apply_rotation") else raw["quats"] + turn
+        if (fade := changes.get("opacity_deform")) is not None:
+            moved["opacities"] = raw["opacities"] * mask[:, 0] + fade[:, 0]
+        if (tint := changes.get("shs_deform")) is not None:
+            sh = torch.cat([raw["sh0"], raw["shN"]], dim=1) * mask[:, None] + tint.unflatten(1, (-1, 3))
+            moved |= {"sh0": sh[:, :1], "shN": sh[:, 1:]}
+        return VanillaModel(moved).gaussians()
+
+    def features(self, means: Tensor, time: float) -> Tensor:
+        """[N, width]: what the heads read, at positions [N, 3] and one time."""
+        moment = torch.full_like(means[:, :1], time)
+        if self._options.get("no_grid"):
+            hidden = torch.cat([means, moment], dim=1)
+        else:
+            high, low = self._weights["grid.aabb"]  # in this order
+            place = torch.cat([(means - high) * (2 / (low - high)) - 1, moment], dim=1)
+            hidden = torch.cat([self._look_up(scale, place) for scale in range(self.scales)], dim=1)
+        for layer in range(self.depth):
+            hidden = self._layer(f"feature_out.{2 * layer}", relu(hidden) if layer else hidden)
+        return hidden
+
+    def to(self, device: torch.device | str) -> HexPlane:
+        return HexPlane({NET + name: tensor.to(device) for name, tensor in self._weights.items()}, self._options)
+
+    def _look_up(self, scale: int, place: Tensor) -> Tensor:
+        """[N, channels]: the product over the planes of a scale. Outside of the box their edge goes on."""
+        product = torch.ones_like(place[:, :1])
+        for number, axes in enumerate(PLANES):
+            plane = self._weights[f"grid.grids.{scale}.{number}"]
+            found = grid_sample(plane, place[None, None, :, axes], mode="bilinear", padding_mode="border", align_corners=True)
+            product = product * found[0, :, 0].T
+        return product
+
+    def _head(self, name: str, hidden: Tensor) -> Tensor:
+        return self._layer(f"{name}.3", relu(self._layer(f"{name}.1", relu(hidden))))
+
+    def _layer(self, name: str, inputs: Tensor) -> Tensor:
+        return linear(inputs, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
+
+    def _is_still(self) -> bool:
+        """Whether every change is a sum with 0; products with what the network makes never are."""
+        multiplies = self.heads and (self._options.get("static_mlp") or ("rotations_deform" in self.heads and self._options.get("apply_rotation")))
+        return not multiplies and not any(self._weights[f"{head}.3.{part}"].any() for head in self.heads for part in ("weight", "bias"))
+
+    def _cost(self) -> str:
+        parts = ("feature_out", *self.heads)
+        products = sum(held.numel() for name, held in self._weights.items() if name.split(".")[0] in parts and name.endswith("weight"))
+        return f"{len(PLANES) * self.scales} look-ups and {products:,} multiplications a splat and moment"
+
+    def _check(self, where: str) -> None:
+        told_by = {f"grid.grids.{scale}.0": (1, -1, -1, -1) for scale in range(max(1, self.scales))}
+        require(self._weights, {"grid.aabb": (2, 3), "feature_out.0.weight": (-1, -1), **told_by}, where)
+        width = len(self._weights["feature_out.0.weight"])
+        channels = {scale: self._weights[f"grid.grids.{scale}.0"].shape[1] for scale in range(self.scales)}
+        layers = {f"feature_out.{2 * layer}": (width, width) for layer in range(1, self.depth)}
+        layers["feature_out.0"] = (width, 4 if self._options.get("no_grid") else sum(channels.values()))
+        for name, size in {**self.heads, **({"static_mlp": 1} if self._options.get("static_mlp") else {})}.items():
+            layers |= {f"{name}.1": (width, width), f"{name}.3": (size, width)}
+        shapes: dict[str, tuple[int, ...]] = {f"{name}.weight": shape for name, shape in layers.items()}
+        shapes |= {f"{name}.bias": shape[:1] for name, shape in layers.items()}
+        shapes |= {f"grid.grids.{scale}.{number}": (1, channels[scale], -1, -1) for scale in channels for number in range(len(PLANES))}
+        require(self._weights, shapes, where)
+
+
+def load_hexplane(path: str | Path, *, iteration: int | None = None) -> MovingModel | VanillaModel:
+    """Load a model folder of 4D Gaussians; a PLY of its coarse stage, in which nothing moves, is plain 3DGS. Raises CheckpointError."""
+    found = detect(path, iteration=iteration)
+    if found.family == "4dgs" and is_coarse(found.path):
+        model = read_vanilla(found)
+        model.notes.append("it is of the coarse stage of 4D Gaussians, in which nothing moves yet")
+        return model
+    canonical, network = read_canonical(path, iteration, "4dgs")
+    options, _ = read_options(canonical.folder)
+    if not options:
+        canonical.notes.append("no cfg_args tells which of the network's changes are in use: opacities and colors are taken to stay, as published")
+    field = HexPlane(read_state_dict(network), options, f"{network} is not a network as the project publishes it")
+    if "shs_deform" in field.heads and canonical.sh_degree != 3:
+        told = f"{network} changes colors of SH degree 3, but its PLY has {canonical.sh_degree}"
+        raise CheckpointError(f"{told}; give the two that were saved together")
+    return MovingModel("4dgs", canonical, field)

@@ -1,0 +1,140 @@
+"""A moving scene: canonical splats, which adapt, and a frozen field that takes them to a moment of time."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera, every_nth
+from mipmap_plugin.effects import Effect
+from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.formats.splat_transform import is_written
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import TrainedScale, Traits
+from mipmap_plugin.models.detect import detect_as
+from mipmap_plugin.models.families import find_family
+from mipmap_plugin.models.places import network_of
+from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+
+# Views whose moments tell how opaque a splat ever gets; each costs one pass through the field.
+ENOUGH_MOMENTS = 8
+
+TIMELESS = "a camera without a time shows the moment 0; a cameras.json holds no times, so adaptation then spreads them over its views"
+
+
+class Field(Protocol):
+    """What takes canonical splats to a moment. Its weights require no gradient and never change."""
+
+    changes_opacities: bool
+    is_still: bool  # no splat ever changes: the field need not be asked
+    cost: str  # of one moment, counted
+
+    def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
+        """The splats at `time` (0..1), differentiable in the canonical parameters."""
+
+    def to(self, device: torch.device | str) -> Field:
+        """The same field on another device."""
+
+
+class MovingModel:
+    """Canonical splats, stored and named as 3DGS does, seen through a frozen field at the time of each camera."""
+
+    def __init__(self, family: str, canonical: VanillaModel, field: Field) -> None:
+        self.family, self.canonical, self.field = family, canonical, field
+        self.source, self.folder, self.digest, self.notes = canonical.source, canonical.folder, canonical.digest, canonical.notes
+
+    @property
+    def trained(self) -> TrainedScale:
+        return self.canonical.trained
+
+    @trained.setter
+    def trained(self, trained: TrainedScale) -> None:
+        self.canonical.trained = trained
+
+    def __len__(self) -> int:
+        return len(self.canonical)
+
+    @property
+    def moves(self) -> bool:
+        """Whether time changes anything; `adaptation.views` then spreads times over cameras that have none."""
+        return not self.field.is_still
+
+    @property
+    def traits(self) -> Traits:
+        effect = Effect("time", self.moves, "a field moves the splats" if self.moves else "the field changes no splat", self.field.cost)
+        why = "a network moves its splats, which no viewer of the list does"
+        return Traits(moves=self.moves, no_viewer=why, exposures=self.canonical.traits.exposures, effects=(effect,))
+
+    def gaussians(self, camera: Camera) -> Gaussians:
+        """All splats at the time of `camera`, 0 if it has none."""
+        if not self.moves:
+            return self.canonical.gaussians()
+        return self.field(self.canonical, camera.time or 0.0)
+
+    def parameters(self) -> dict[str, Tensor]:
+        """Those of the canonical splats, named as `VanillaModel` does."""
+        return self.canonical.parameters()
+
+    def copy(self) -> MovingModel:
+        """An independent model whose canonical leaves require gradients; the field, which never changes, is shared."""
+        return MovingModel(self.family, self.canonical.copy(), self.field)
+
+    def to(self, device: torch.device | str) -> MovingModel:
+        return MovingModel(self.family, self.canonical.to(device), self.field.to(device))
+
+    def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
+        self.canonical.replace_parameters(parameters)
+
+    def shared_parameters(self) -> dict[str, Tensor]:
+        """None: the field stays as it was trained."""
+        return {}
+
+    def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
+        """Reshape the canonical splats, in place; the field's changes are added to them as before."""
+        self.canonical.reshape(form, views)
+
+    @torch.no_grad()
+    def row_opacities(self, views: Sequence[Camera]) -> Tensor:
+        """[N], 0..1: how opaque each splat gets at the times of some of `views`, of which there must be one."""
+        if not (self.moves and self.field.changes_opacities):
+            return self.canonical.row_opacities()
+        some = every_nth(views, ENOUGH_MOMENTS)
+        return torch.stack([self.gaussians(view).opacities for view in some]).amax(0)
+
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
+        """What `save` would refuse about `path`, before anything is done for it. Raises SettingsError, OutputExists, OutputError."""
+        if path.suffix.lower() == ".ply" or is_written(path):
+            told = f"has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}"
+            raise SettingsError(f"{path}: {'a PLY' if path.suffix.lower() == '.ply' else 'this format'} {told}")
+        self.canonical.refuse_output(path, overwrite=overwrite)
+
+    def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
+        """Write a model folder, the network copied byte for byte to the iteration of the splats; return the PLY written.
+
+        Raises SettingsError for a path that ends in .ply, OutputExists, and OutputError when the disk refuses.
+        """
+        self.refuse_output(Path(path), overwrite=overwrite)
+        return self.canonical.save(path, provenance=provenance, overwrite=overwrite, companions=self._copy_network)
+
+    def _copy_network(self, ply: Path) -> None:
+        if self.source is None:
+            raise SettingsError("a moving scene that was made in memory has no network file to save; load it from a model folder")
+        network = network_of(ply, self.family)
+        network.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(network_of(self.source, self.family), network)
+
+
+def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:
+    """The splats of a moving scene before anything moves them, and the file of their network. Raises CheckpointError."""
+    found = detect_as(path, (family,), iteration=iteration)
+    if Path(path).is_file():
+        raise CheckpointError(f"{path} is one part of a moving scene, whose network lies beside it; give the model folder that holds both")
+    canonical = read_vanilla(found)
+    title = find_family(family).title
+    canonical.notes += [f"the network that moves the splats ({title}) is frozen: they adapt as they are before they move", TIMELESS]
+    return canonical, network_of(found.path, family)

@@ -1,0 +1,116 @@
+"""Packing: splats as a viewer keeps them in memory, rounded. Gradients go through as if nothing were rounded (straight-through)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Packing
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.harmonics import C0
+
+# The sine of half an angle below which a rotation has no axis.
+LEAST_TURN = 1e-6
+
+
+def packed(gaussians: Gaussians, camera: Camera, packing: Packing) -> Gaussians:
+    """`gaussians` as `camera` sees them after `packing`. Covariances that a model gives are left as they are.
+
+    Computed in float64, so that every backend rounds the same way.
+    """
+    with torch.no_grad():
+        exact = gaussians.to(dtype=torch.float64)
+        opacities = exact.opacities
+        for step in packing.opacity:
+            opacities = _stepped(opacities, step, packing.downwards)
+        rounded = {"opacities": opacities, "sh": _harmonics(exact.sh, packing)}
+        if packing.log_scales is not None:
+            rounded["scales"] = _scales(exact.scales, *packing.log_scales)
+        if packing.quats is not None:
+            rounded["quats"] = _quaternions(exact.quats, _octahedral if packing.quats == "octahedral" else _stereographic)
+        if packing.half_means:
+            eye = camera.center.to(exact.means)
+            rounded["means"] = (exact.means.half().double() - eye).half().double() + eye
+    return replace(gaussians, **{name: _through(getattr(gaussians, name), value) for name, value in rounded.items()})
+
+
+def in_steps(given: Tensor, steps: Tensor) -> Tensor:
+    """The nearest multiples of `steps`, with the gradient of `given`."""
+    return _through(given, (given.detach() / steps).round() * steps)
+
+
+def _through(given: Tensor, rounded: Tensor) -> Tensor:
+    """`rounded` with the gradient of `given`; what is not finite stays as it is."""
+    rounded = torch.where(given.isfinite(), rounded.to(given), given).detach()
+    return rounded if not given.requires_grad else _StraightThrough.apply(given, rounded)  # type: ignore[no-any-return]
+
+
+class _StraightThrough(torch.autograd.Function):
+    @staticmethod
+    def forward(_ctx, given, rounded):
+        return rounded
+
+    @staticmethod
+    def backward(_ctx, gradient):
+        return gradient, None
+
+
+def _stepped(values: Tensor, step: float, downwards: bool = False) -> Tensor:
+    return ((values / step).floor() if downwards else (values / step).round()) * step
+
+
+def _harmonics(sh: Tensor, packing: Packing) -> Tensor:
+    """[N, K, 3]. The color of degree 0 within 0..1 and the coefficients above it within -1..1, each a multiple of its step."""
+    parts = [sh[:, :1]]
+    if packing.color is not None:
+        parts = [(_stepped((C0 * sh[:, :1] + 0.5).clamp(0, 1), packing.color, packing.downwards) - 0.5) / C0]
+    for degree in range(1, math.isqrt(sh.shape[1])):
+        band = sh[:, degree**2 : (degree + 1) ** 2]
+        parts.append(_stepped(band.clamp(-1, 1), packing.bands[degree - 1]) if degree <= len(packing.bands) else band)
+    return torch.cat(parts, 1)
+
+
+def _scales(scales: Tensor, least: float, most: float, step: float) -> Tensor:
+    """[N, 3]. Logarithms in steps; 0 stays 0."""
+    logarithms = scales.abs().clamp_min(torch.finfo(scales.dtype).tiny).log()
+    stepped = (_stepped(logarithms - least, step) + least).clamp(least, most)
+    return torch.where(scales == 0, 0.0, stepped.exp() * scales.sign())
+
+
+def _quaternions(quats: Tensor, rounded: Callable[[Tensor], Tensor]) -> Tensor:
+    """[N, 4] wxyz. A quaternion keeps its norm, for its gradient is of that size; one of norm 0 stays."""
+    length = quats.norm(dim=1, keepdim=True)
+    unit = torch.where(length > 0, quats / torch.where(length > 0, length, 1.0), quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
+    return rounded(torch.where(unit[:, :1] < 0, -unit, unit)) * length
+
+
+def _octahedral(unit: Tensor) -> Tensor:
+    """The axis of rotation on an unfolded octahedron (u, v), and the angle of 0..π, in 255 steps each."""
+    angle = 2 * unit[:, :1].clamp(-1, 1).acos()
+    axis = torch.where(unit[:, 1:].norm(dim=1, keepdim=True) > LEAST_TURN, unit[:, 1:], unit.new_tensor([1.0, 0.0, 0.0]))
+    axis = axis / axis.abs().sum(1, keepdim=True)
+    u_v = torch.where(axis[:, 2:] < 0, _folded(axis[:, :2]), axis[:, :2])
+    u_v = _stepped(u_v * 0.5 + 0.5, 1 / 255) * 2 - 1
+    z = 1 - u_v.abs().sum(1, keepdim=True)
+    axis = torch.cat([torch.where(z < 0, _folded(u_v), u_v), z], 1)
+    half = _stepped(angle / math.pi, 1 / 255) * math.pi / 2
+    return torch.cat([half.cos(), axis / axis.norm(dim=1, keepdim=True) * half.sin()], 1)
+
+
+def _folded(u_v: Tensor) -> Tensor:
+    """The lower half of the octahedron folded out, and back in: (1 - |v|, 1 - |u|) with the signs of (u, v)."""
+    return (1 - u_v.flip(1).abs()) * torch.where(u_v >= 0, 1.0, -1.0)
+
+
+def _stereographic(unit: Tensor) -> Tensor:
+    """p = (x, y, z) / sqrt(1 + w) in 11, 11 and 10 bits."""
+    steps = 1 / unit.new_tensor([2047.0, 2047.0, 1023.0])
+    p = unit[:, 1:] / (1 + unit[:, :1]).sqrt()
+    p = ((p * 0.5 + 0.5) / steps).round() * steps * 2 - 1
+    squared = p.square().sum(1, keepdim=True)
+    return torch.cat([1 - squared, (2 - squared).sqrt() * p], 1)

@@ -1,0 +1,69 @@
+"""EWA projection: Gaussians in the world -> Gaussians on the image plane (Zwicker et al. 2001, as 3DGS uses it)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import FRUSTUM_MARGIN
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.rotations import rotations
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    """N splats on the image plane, without any screen filter."""
+
+    means2d: Tensor  # [N, 2] px
+    depths: Tensor  # [N] world units along the optical axis
+    xx: Tensor  # [N] px², the covariance's entries
+    xy: Tensor  # [N] px²
+    yy: Tensor  # [N] px²
+    det: Tensor  # [N] px⁴, never negative
+
+
+def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: float = FRUSTUM_MARGIN) -> Projected:
+    """Means, depths and covariances on the image plane. Splats nearer than `near` get finite values of no meaning."""
+    viewmat = camera.viewmat.to(gaussians.means)
+    in_camera = camera.to_camera(gaussians.means)
+    depths = in_camera[:, 2]
+    safe = depths.clamp_min(near)
+    slopes = in_camera[:, :2] / safe[:, None]
+    focal = slopes.new_tensor([camera.fx, camera.fy])
+    means2d = slopes * focal + slopes.new_tensor([camera.cx, camera.cy])
+    to_image = _jacobian(slopes, safe, camera, frozen_beyond) @ viewmat[:3, :3]
+    if gaussians.covariances is not None:
+        xx, xy, yy, det = _from_covariances(to_image, gaussians.covariances)
+    else:
+        xx, xy, yy, det = _from_factors(to_image @ (rotations(gaussians.quats) * gaussians.scales[:, None, :]))
+    return Projected(means2d, depths, xx, xy, yy, det)
+
+
+def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: float) -> Tensor:
+    """The projection's derivative at each center [N, 2, 3]; slopes are frozen outside the widened frustum."""
+    half = slopes.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2
+    left = slopes.new_tensor([camera.cx / camera.fx, camera.cy / camera.fy])
+    margin = frozen_beyond * half
+    u, v = torch.minimum(torch.maximum(slopes, -left - margin), 2 * half - left + margin).unbind(-1)
+    per_x, per_y, zero = camera.fx / depths, camera.fy / depths, torch.zeros_like(depths)
+    return torch.stack([per_x, zero, -per_x * u, zero, per_y, -per_y * v], -1).unflatten(-1, (2, 3))
+
+
+def _from_factors(factor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Covariance entries and determinant of F Fᵀ for F [N, 2, 3].
+
+    The determinant is the sum of F's squared minors (Cauchy-Binet): unlike xx·yy - xy² it cannot turn negative when a
+    needle's axes differ by many orders of magnitude.
+    """
+    first, second = factor.unbind(1)
+    det = torch.linalg.cross(first, second).square().sum(-1)
+    return first.square().sum(-1), (first * second).sum(-1), second.square().sum(-1), det
+
+
+def _from_covariances(to_image: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    flat = to_image @ covariances @ to_image.mT
+    xx, xy, yy = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1]
+    return xx, xy, yy, (xx * yy - xy * xy).clamp_min(0)
