@@ -9,7 +9,8 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization import growing
+from mipmap_plugin.adaptation.optimization.growing import still as frozen
+from mipmap_plugin.adaptation.optimization.run import Task, Trial
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
@@ -33,7 +34,7 @@ def judged(monkeypatch):
 
     def by(*agreements):
         left = list(agreements)
-        monkeypatch.setattr(growing, "_agreement", lambda *_: left.pop(0) if len(left) > 1 else left[0])
+        monkeypatch.setattr(Task, "agreement", lambda *_: left.pop(0) if len(left) > 1 else left[0])
 
     return by
 
@@ -77,7 +78,7 @@ def test_centers_move_once_something_has_grown(judged):
 
 def test_centers_go_on_moving_when_a_growth_has_passed_and_stand_when_the_first_was_undone():
     def still(**trial):
-        return growing.still(SimpleNamespace(trial=growing.Trial(30.0, **trial)))
+        return frozen(SimpleNamespace(trial=Trial(30.0, **trial)))
 
     assert still() == still(undone_at=4) == ("means",)
     assert still(before={}) == still(passed=True) == still(passed=True, undone_at=6) == ()
@@ -102,13 +103,13 @@ def test_a_growth_that_has_passed_is_not_judged_again(judged):
 
 
 def test_without_growing_nothing_is_on_trial(monkeypatch):
-    monkeypatch.setattr(growing, "_agreement", lambda *_: pytest.fail("asked"))
+    monkeypatch.setattr(Task, "agreement", lambda *_: pytest.fail("asked"))
     start, end = (adapted(densify_gradient=None, steps=steps).model.parameters()["means"] for steps in (0, 2))
     assert not torch.equal(start, end)
 
 
 def test_published_growing_is_not_on_trial(monkeypatch):
-    monkeypatch.setattr(growing, "_agreement", lambda *_: pytest.fail("asked"))
+    monkeypatch.setattr(Task, "agreement", lambda *_: pytest.fail("asked"))
     model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
     run = model.adapt(2, recipe="paper", steps=3, prune_every=2, densify_gradient=1e-12)
     assert run.report.gaussians_after > len(tiny.model())
@@ -116,8 +117,8 @@ def test_published_growing_is_not_on_trial(monkeypatch):
 
 def test_agreement_at_the_start_is_that_of_the_closed_form(monkeypatch):
     found = []
-    agreement = growing._agreement
-    monkeypatch.setattr(growing, "_agreement", lambda *given: found.append(agreement(*given)) or found[-1])
+    agreement = Task.agreement
+    monkeypatch.setattr(Task, "agreement", lambda *given: found.append(agreement(*given)) or found[-1])
     adapted(steps=1)
     base = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
     closed = base.adapt(2, recipe="instant", views="train")

@@ -9,7 +9,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli
-from mipmap_plugin.adaptation import session
+from mipmap_plugin.adaptation import adapted
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import MipModel
@@ -66,7 +66,7 @@ def test_a_view_of_another_name_is_refused(tmp_path):
 @pytest.mark.parametrize("exposures", [None, IDENTITY, WARM])
 def test_off_it_is_not_computed_and_forced_on_an_identity_changes_nothing(tmp_path, monkeypatch, exposures):
     model, calls = base(tmp_path / "a", exposures and {"view_0": exposures}), []
-    monkeypatch.setattr(session, "exposed", lambda *given: calls.append(given) or exposed(*given))
+    monkeypatch.setattr(adapted, "exposed", lambda *given: calls.append(given) or exposed(*given))
     image = model.render(model.cameras[0]).image
     model.adapt(1 / 4, steps=1, extra_views=0).render(model.cameras[0].zoomed(1 / 4))
     assert calls == []
