@@ -156,7 +156,7 @@ RUN = """
 import os, signal, sys
 sys.path.insert(0, {tests!r})
 import tiny, torch
-from mipmap_plugin.adaptation import resume
+from mipmap_plugin.adaptation.optimization import resume
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.wrap import wrap_model
 torch.set_num_threads(1)
