@@ -170,7 +170,7 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
 
 
 def test_ctrl_c_anywhere_else_says_interrupted(run, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.commands.inspect.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("mipmap_plugin.models.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     code, _, err = run("inspect", "a.ply")
     assert code == 130 and err.strip() == "mipmap-plugin: interrupted"
 
