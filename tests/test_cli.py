@@ -104,7 +104,7 @@ def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
         assert provenance_of(read_ply(ply).comments)["scale"] == scale
         assert json.loads(ply.with_name("point_cloud.ply.adaptation.json").read_text())["scale"] == scale
         assert f"x{scale:g}: {ply}" in out
-    assert "ended by 2 steps" in out and "backend reference: asked for" in out and "the 4 given views" in out
+    assert "ended by 2 steps" in out and "backend reference: requested" in out and "the 4 given views" in out
     assert not list(tmp_path.rglob("*.resume"))
 
 
