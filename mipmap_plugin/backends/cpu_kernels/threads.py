@@ -1,18 +1,18 @@
-"""Threads for kernels: as many as torch uses, and without torch's own in their way."""
+"""Threads for kernels, without torch's own in their way."""
 
 from __future__ import annotations
 
 import ctypes
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
 import torch
+
+from mipmap_plugin import threads
 
 # Crowded tiles take longer than others. So a thread's part is cut finer and finer, each time by this share of what is left, for others
 # take from its end; but not finer than this share of all, or handing it out would take time.
@@ -46,11 +46,7 @@ class Team:
                         break
                     kernel(start, stop, *arguments)
 
-        others = [_pool(self.threads - 1, os.getpid()).submit(work, thread) for thread in range(1, self.threads)]
-        work(0)
-        for other in others:
-            if not other.cancel():  # nothing is left for one that has not begun
-                other.result()
+        threads.team(work, self.threads)
 
 
 def cut(first: int, last: int, least: int) -> Iterator[tuple[int, int]]:
@@ -62,17 +58,11 @@ def cut(first: int, last: int, least: int) -> Iterator[tuple[int, int]]:
 
 
 def team(work: int) -> Team:
-    """As many threads as torch uses, if there is enough work, in splats and pixels."""
-    threads = torch.get_num_threads() if work >= LEAST_WORK else 1
-    if threads > 1:
+    """As many threads as there are for kernels, if there is enough work, in splats and pixels."""
+    most = threads.count() if work >= LEAST_WORK else 1
+    if most > 1 and torch.get_num_threads() > 1:
         _dismiss_idle_threads()
-    return Team(threads)
-
-
-@cache
-def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Threads that wait for work. Each process has its own, for they do not survive a fork."""
-    return ThreadPoolExecutor(threads, f"mipmap_plugin-{process}")
+    return Team(most)
 
 
 def _dismiss_idle_threads() -> None:
