@@ -156,6 +156,19 @@ def test_importing_the_package_loads_nothing_optional():
     assert done.stdout.strip() == "[]"
 
 
+def test_options_are_read_and_explained_without_torch():
+    code = """
+import contextlib, io, sys
+from mipmap_plugin.cli import main
+for options in (["--help"], ["adapt", "--help"], ["--version"]):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main(options)
+print([name for name in ("torch", "numpy", "numba") if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
 def test_files_and_functions_stay_small(path):
     text = path.read_text(encoding="utf-8")

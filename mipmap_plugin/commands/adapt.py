@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mipmap_plugin.commands.common import tell, wrap
+from mipmap_plugin.commands.common import scene, tell, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
-from mipmap_plugin.models.base import SplatModel, why_no_viewer
 from mipmap_plugin.recipes import recipe as make_config
-from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import Adapted, state_path
+
+if TYPE_CHECKING:
+    from mipmap_plugin.models.base import SplatModel
+    from mipmap_plugin.wrap import Adapted, Wrapped
 
 
 def adapt(
@@ -69,14 +71,20 @@ def adapt(
         config = make_config(recipe, each, seed=seed, **settings)
         wrapped.targets(name)
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
-    real = None if images is None else load_scene(images)
-    settings |= dict(recipe=recipe, seed=seed, images=real)
-    reports = []
-    for (each, name), target in zip(wanted, targets, strict=True):
-        adapted = wrapped.adapt(each, viewer=name, resume=state_path(target), **settings)
-        reports.append(_saved(adapted, target, overwrite, quiet=json))
+    settings |= dict(recipe=recipe, seed=seed, images=images and scene(images))
+    reports = [_saved(adapted, target, overwrite, quiet=json) for adapted, target in _adapted(wrapped, wanted, targets, settings)]
     if json:
         tell(reports, json)
+
+
+def _adapted(
+    wrapped: Wrapped, wanted: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any]
+) -> Iterator[tuple[Adapted, Path]]:
+    """Each model as soon as it is adapted, and where it is to be saved."""
+    from mipmap_plugin.wrap import state_path
+
+    for (scale, viewer), target in zip(wanted, targets, strict=True):
+        yield wrapped.adapt(scale, viewer=viewer, resume=state_path(target), **settings), target
 
 
 def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:
@@ -99,6 +107,8 @@ def _wanted(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, 
 
 def _made_for(model: SplatModel) -> str:
     """Whom a file is for that no viewer was asked for."""
+    from mipmap_plugin.models.base import why_no_viewer
+
     made, others = "made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio)", "; for others give --viewer spark, supersplat, ..."
     if why_no_viewer(model):
         return "made for its own project"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -12,8 +12,9 @@ from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, each_once
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
-from mipmap_plugin.models.outputs import parts_of
-from mipmap_plugin.scenes import Scene, load_scene
+
+if TYPE_CHECKING:
+    from mipmap_plugin.scenes import Scene
 
 
 def evaluate(
@@ -85,6 +86,8 @@ def _facts(rows: Sequence[Any], notes: Sequence[str]) -> dict[str, Any]:
 
 
 def _scene(folder: Path, appearance: str) -> Scene:
+    from mipmap_plugin.scenes import load_scene
+
     scene = load_scene(folder)
     return scene.numbered_as_upstream() if appearance == "upstream" else scene
 
@@ -102,6 +105,8 @@ def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str) ->
 
 
 def _parts(checkpoint: Path) -> list[Path]:
+    from mipmap_plugin.models.outputs import parts_of
+
     return parts_of(None, checkpoint) if checkpoint.is_dir() else [checkpoint]
 
 

@@ -10,7 +10,6 @@ import tyro
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
 from mipmap_plugin.recipes import recipe as make_config
-from mipmap_plugin.scenes import load_scene
 
 
 def tradeoff(
@@ -60,6 +59,7 @@ def tradeoff(
     from mipmap_plugin.evaluation.tradeoff.files import Folder, facts, refuse, table
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.evaluation.tradeoff.run import run
+    from mipmap_plugin.scenes import load_scene
 
     refuse(output, picture, overwrite)
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)

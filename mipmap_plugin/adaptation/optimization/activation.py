@@ -45,8 +45,10 @@ class Activation:
             return
         leaves, splats = _tensors(self._leaves), _tensors(self._splats)
         self._leaves = self._splats = None  # the optimizer and density control need the room
-        moved = [name for name, leaf in leaves.items() if leaf.grad is not None]
-        torch.autograd.backward([splats[name] for name in moved], [leaves[name].grad for name in moved])
+        # Their product with what they are multiplied by has these very gradients. torch.autograd.backward, which takes gradients, loads sympy.
+        products = [(splats[name] * leaf.grad).sum() for name, leaf in leaves.items() if leaf.grad is not None]
+        if products:
+            torch.stack(products).sum().backward()
 
 
 def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:

@@ -14,7 +14,7 @@ from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_P
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.splatting.filters import LEAST_LIGHT, w_end
+from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, w_end
 
 SEEN = {"analytic": SEEN_IN_PIXEL, "window": SEEN_IN_WINDOW}
 
@@ -101,7 +101,7 @@ def view_of(camera: Camera, effects: Effects, splats: Splats, gradients: bool) -
         height=camera.height,
         near=float(effects.near_plane),
         eps2d=float(effects.eps2d),
-        least_light=LEAST_LIGHT.get(effects.screen_filter, 1.0),
+        least_light=LEAST_COMPENSATION.get(effects.screen_filter, 1.0),
         seen=SEEN.get(effects.screen_filter, SEEN_AT_CENTER),
         sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
         max_color=math.inf if settings.max_color is None else settings.max_color,
