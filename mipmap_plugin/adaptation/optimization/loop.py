@@ -63,6 +63,10 @@ def is_checked(step: int, config: AdaptConfig) -> bool:
     return step % (config.check_every if step >= rising else max(1, min(config.check_every, rising // CHECKS_RISING))) == 0 or step == config.steps
 
 
+# Shown in docs/how_it_works.md, up to the next such line.
+# --8<-- [start:step]
+
+
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
@@ -94,6 +98,9 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     run.step += 1
     if run.step % config.prune_every == 0 and run.step < config.steps:
         control_density(run, task, config)
+
+
+# --8<-- [end:step]
 
 
 def _loss(difference: Tensor, name: str) -> Tensor:
