@@ -14,7 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 STOREYS = [
     {"errors"},
     {"limits"},
-    {"registry", "config", "torchvision_absent"},
+    {"registry", "config", "torchvision_absent", "threads", "progress"},
     {"gaussians", "camera"},
     {"formats"},
     {"effects"},
@@ -45,7 +45,7 @@ CONFINED = {
     "safetensors": ["adaptation/target/super_resolution.py"],
     "skimage": ["evaluation/metrics.py"],
     "spandrel": ["adaptation/target/super_resolution.py"],
-    "tqdm": ["adaptation/", "evaluation/"],
+    "tqdm": ["adaptation/", "evaluation/", "progress.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
     "typing_extensions": ["wrap.py"],

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mipmap_plugin.commands.common import scene, tell, wrap
+from mipmap_plugin.commands.common import given, scene, tell, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
@@ -36,6 +36,7 @@ def adapt(
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
     backend: str = "auto",
+    threads: int | None = None,
     seed: int = 0,
     overwrite: bool = False,
     json: bool = False,
@@ -59,12 +60,13 @@ def adapt(
         background: Of the scene; by default what the checkpoint says, else black.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
+        threads: Processor threads at most; by default as many as torch finds. The result does not depend on it.
         seed: Everything random follows from it.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
-    settings = _given(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
+    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    settings = given(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     wanted = _wanted(scale, viewer)
     targets = [adapted_path(checkpoint, output, *each, several=len(wanted) > 1) for each in wanted]
     for (each, name), target in zip(wanted, targets, strict=True):
@@ -93,10 +95,6 @@ def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> d
     if not quiet:
         _print(saved, adapted)
     return {"file": str(saved), **adapted.report.model_dump()}
-
-
-def _given(**chosen: Any) -> dict[str, Any]:
-    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def _wanted(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:

@@ -27,6 +27,7 @@ def tradeoff(
     views: int | None = None,
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
+    threads: int | None = None,
     seed: int = 0,
     picture: bool = True,
     overwrite: bool = False,
@@ -51,6 +52,7 @@ def tradeoff(
         views: Views to judge on, at most.
         background: Of the scene; by default what the checkpoint says, else black.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
+        threads: Processor threads at most; by default as many as torch finds. The result does not depend on it.
         seed: Of the first repeat.
         picture: Draw tradeoff.png, which needs the extra `plot`.
         overwrite: Replace results that exist.
@@ -63,7 +65,7 @@ def tradeoff(
 
     refuse(output, picture, overwrite)
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
-    model, scene = wrap(checkpoint, None, background, "auto", screen_filter), None if images is None else load_scene(images)
+    model, scene = wrap(checkpoint, None, background, "auto", screen_filter, threads), None if images is None else load_scene(images)
     model.target(viewer)
     for name, each in product(plan.recipes, scale):
         make_config(name, each)
