@@ -75,10 +75,9 @@ def evaluate(
         rows += evaluation.evaluate(wrapped, scene, each_once(scale), recipe, protocol, perceptual, **settings)
         notes |= dict.fromkeys(evaluation.notes(wrapped, scale, appearance))
     rows += evaluation.means(rows) if len(checkpoint) > 1 else []
-    facts = _facts(rows, [*notes])
     if output:
-        write_json(output, facts, overwrite)
-    tell(facts, json) if json else _print_tables(_title(checkpoint, images, protocol), rows, [*notes], published, each_once(scale))
+        write_json(output, _facts(rows, [*notes]), overwrite)
+    tell(_facts(rows, [*notes]), json) if json else _print_tables(_title(checkpoint, images, protocol), rows, [*notes], published, each_once(scale))
 
 
 def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path | None) -> Perceptual | None:
