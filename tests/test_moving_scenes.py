@@ -110,7 +110,7 @@ def test_broken_ones_are_refused_in_one_sentence(tmp_path):
         load_scene(path)
     path = hypernerf(tmp_path / "h")
     (path / "camera/000004.json").write_text('{"orientation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}')
-    with pytest.raises(SceneError, match="orientation: is no rotation"):
+    with pytest.raises(SceneError, match="orientation: is not a rotation"):
         load_scene(path)
 
 

@@ -497,7 +497,7 @@ def test_a_new_viewer_is_one_record():
     expected = model.render(tiny.cameras(1)[0]).image
     assert not torch.allclose(shown, expected)
     register_viewer("wrong", 3)
-    with pytest.raises(PluginError, match="viewer 'wrong' must be a .*, got int"):
+    with pytest.raises(PluginError, match=r"viewer 'wrong' must be a .*, got int"):
         find_viewer("wrong")
 
 
