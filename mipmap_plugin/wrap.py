@@ -28,7 +28,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_background, check_image, check_scale
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Filtered, Placed, SplatModel, TrainedScale, why_no_viewer
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
@@ -267,8 +267,8 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
     if not model.traits.placed:
         return scene
     scene = scene.original()
-    taken = Taken(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
-    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, taken))
+    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
+    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
 
 
 def state_path(output: Path) -> Path:
