@@ -1,4 +1,4 @@
-"""The compiled backend against a brute-force float64 sum, and what only compiled, threaded code can get wrong."""
+"""The CPU backend against a brute-force float64 sum, and errors that only compiled, threaded code can have."""
 
 from __future__ import annotations
 
@@ -40,20 +40,20 @@ def one_thread():
 
 
 @pytest.fixture
-def threads_for_little(monkeypatch):
-    """As many threads as torch has, even where one is done sooner."""
+def threads_for_any_work(monkeypatch):
+    """Use as many threads as torch, even for little work."""
     from mipmap_plugin.backends.cpu_kernels import threads
 
-    monkeypatch.setattr(threads, "LEAST_WORK", 0)
+    monkeypatch.setattr(threads, "MIN_WORK", 0)
 
 
 def leaf(g: Gaussians) -> Gaussians:
-    given = {f.name: getattr(g, f.name) for f in fields(g)}
-    return Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in given.items()})
+    tensors = {f.name: getattr(g, f.name) for f in fields(g)}
+    return Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in tensors.items()})
 
 
 def gradients(image: torch.Tensor, alpha: torch.Tensor, g: Gaussians) -> dict[str, torch.Tensor]:
-    """Of a fixed weighting of all pixels, by the name of the tensor."""
+    """The gradients of a fixed weighted sum of all pixels, by the name of the tensor."""
     weights = torch.randn(*alpha.shape, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).to(image)
     loss = (image * weights[..., :3]).sum() + (alpha * weights[..., 3]).sum()
     loss.backward()
@@ -61,7 +61,7 @@ def gradients(image: torch.Tensor, alpha: torch.Tensor, g: Gaussians) -> dict[st
 
 
 def draw(g: Gaussians, view, effects: Effects):
-    """Image, alpha and gradients of the compiled backend."""
+    """The image, alpha and gradients of the CPU backend."""
     g = leaf(g.to(dtype=torch.float32))
     rendered = BACKEND.render(g, view, effects)
     return rendered.image.detach(), rendered.alpha.detach(), gradients(rendered.image, rendered.alpha, g)
@@ -69,8 +69,8 @@ def draw(g: Gaussians, view, effects: Effects):
 
 def assert_gradients_close(actual, expected, relative=2e-5):
     assert set(actual) == set(expected)
-    for name, right in expected.items():
-        assert (actual[name] - right).norm() <= relative * right.norm(), name
+    for name, grad in expected.items():
+        assert (actual[name] - grad).norm() <= relative * grad.norm(), name
 
 
 @needs_numba
@@ -79,32 +79,32 @@ def assert_gradients_close(actual, expected, relative=2e-5):
 def test_equals_a_sum_over_every_pixel(view, screen_filter):
     g = leaf(gaussians(80, dtype=torch.float32).to(dtype=torch.float64))  # the same numbers in both precisions
     effects = Effects(1, screen_filter, background=(0.2, 0.5, 0.9))
-    right_image, right_alpha = brute_force(g, view, effects.eps2d, effects.background, screen_filter)
+    expected_image, expected_alpha = brute_force(g, view, effects.eps2d, effects.background, screen_filter)
     image, alpha, grads = draw(g, view, effects)
-    torch.testing.assert_close(image.double(), right_image.detach(), atol=5e-6, rtol=0)
-    torch.testing.assert_close(alpha.double(), right_alpha.detach(), atol=5e-6, rtol=0)
-    assert_gradients_close(grads, gradients(right_image, right_alpha, g))
+    torch.testing.assert_close(image.double(), expected_image.detach(), atol=5e-6, rtol=0)
+    torch.testing.assert_close(alpha.double(), expected_alpha.detach(), atol=5e-6, rtol=0)
+    assert_gradients_close(grads, gradients(expected_image, expected_alpha, g))
 
 
 @needs_numba
-def test_pixels_stop_where_they_should():
+def test_pixels_stop_at_the_least_transmittance():
     g = gaussians(300, dtype=torch.float32)
     g = leaf(replace(g, opacities=0.9 + 0.1 * g.opacities, scales=3 * g.scales).to(dtype=torch.float64))
-    right_image, right_alpha = brute_force(g, camera())
-    assert (right_alpha > 0.999).double().mean() > 0.5
+    expected_image, expected_alpha = brute_force(g, camera())
+    assert (expected_alpha > 0.999).double().mean() > 0.5
     image, _, grads = draw(g, camera(), Effects(1))
-    torch.testing.assert_close(image.double(), right_image.detach(), atol=5e-6, rtol=0)
-    assert_gradients_close(grads, gradients(right_image, right_alpha, g), 1e-4)
+    torch.testing.assert_close(image.double(), expected_image.detach(), atol=5e-6, rtol=0)
+    assert_gradients_close(grads, gradients(expected_image, expected_alpha, g), 1e-4)
 
 
 @needs_numba
 @pytest.mark.parametrize("degree", [2, 3, 4])
 def test_every_harmonic_has_its_gradient(degree):
     g = leaf(gaussians(30, degree, dtype=torch.float32).to(dtype=torch.float64))
-    right = ReferenceBackend().render(g, camera(), Effects(degree))
+    reference = ReferenceBackend().render(g, camera(), Effects(degree))
     image, _, grads = draw(g, camera(), Effects(degree))
-    torch.testing.assert_close(image.double(), right.image.detach(), atol=5e-6, rtol=0)
-    assert_gradients_close(grads, gradients(right.image, right.alpha, g))
+    torch.testing.assert_close(image.double(), reference.image.detach(), atol=5e-6, rtol=0)
+    assert_gradients_close(grads, gradients(reference.image, reference.alpha, g))
 
 
 @needs_numba
@@ -118,16 +118,16 @@ def test_covariances_need_not_be_symmetric_to_have_their_gradient():
     g = gaussians(40, dtype=torch.float32).to(dtype=torch.float64)
     factor = torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64) * g.scales[:, None]
     g = leaf(replace(g, covariances=(factor @ factor.mT).float().double()))
-    right = ReferenceBackend().render(g, camera(), Effects(1))
+    reference = ReferenceBackend().render(g, camera(), Effects(1))
     grads = draw(g, camera(), Effects(1))[2]
-    expected = gradients(right.image, right.alpha, g)
+    expected = gradients(reference.image, reference.alpha, g)
     assert "scales" not in grads
     assert_gradients_close(grads, {name: grad for name, grad in expected.items() if name in grads})
 
 
 @needs_numba
 @pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic", "window"])
-def test_the_number_of_threads_changes_no_bit(screen_filter, threads_for_little):
+def test_the_number_of_threads_changes_no_bit(screen_filter, threads_for_any_work):
     g = gaussians(2000)
     results = []
     for threads in (1, 2, 5):
@@ -140,21 +140,21 @@ def test_the_number_of_threads_changes_no_bit(screen_filter, threads_for_little)
 
 @needs_numba
 @pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh"])
-def test_a_broken_row_touches_no_other(field):
+def test_a_row_with_nan_changes_no_other_row(field):
     g = gaussians(50, dtype=torch.float32)
-    broken = {f.name: getattr(g, f.name).clone() for f in fields(g) if getattr(g, f.name) is not None}
-    broken[field][20] = math.nan
-    rest = torch.arange(50) != 20
-    image, _, grads = draw(Gaussians(**broken), camera(), Effects(1))
-    right_image, _, right_grads = draw(g[rest], camera(), Effects(1))
-    assert torch.equal(image, right_image)
+    tensors = {f.name: getattr(g, f.name).clone() for f in fields(g) if getattr(g, f.name) is not None}
+    tensors[field][20] = math.nan
+    others = torch.arange(50) != 20
+    image, _, grads = draw(Gaussians(**tensors), camera(), Effects(1))
+    expected_image, _, expected_grads = draw(g[others], camera(), Effects(1))
+    assert torch.equal(image, expected_image)
     for name, grad in grads.items():
-        assert torch.equal(grad[rest], right_grads[name]) and not grad[20].any()
+        assert torch.equal(grad[others], expected_grads[name]) and not grad[20].any()
 
 
 @needs_numba
 @pytest.mark.parametrize("size", [1e4, 1e8, 1e20, 1e38])
-def test_splats_larger_than_an_integer_can_count_are_finite(size):
+def test_splats_whose_size_overflows_an_integer_are_finite(size):
     g = gaussians(20, dtype=torch.float32)
     g.scales[:5] = size
     g.means[5:10, :2] = size / 10
@@ -174,7 +174,7 @@ def test_an_input_changed_before_the_backward_pass_is_noticed():
 
 
 @needs_numba
-def test_gradients_reach_only_what_asks_for_them():
+def test_only_tensors_that_require_gradients_get_them():
     g = gaussians(20, dtype=torch.float32)
     g = replace(g, means=g.means.requires_grad_())
     BACKEND.render(g, camera(), Effects(1)).alpha.sum().backward()
@@ -227,15 +227,15 @@ def test_functions_in_lanes_of_float64(name):
 
 
 @needs_numba
-def test_little_work_wakes_no_second_thread():
-    from mipmap_plugin.backends.cpu_kernels.threads import LEAST_WORK, team
+def test_little_work_runs_in_one_thread():
+    from mipmap_plugin.backends.cpu_kernels.threads import MIN_WORK, team
 
     torch.set_num_threads(2)
-    assert (team(LEAST_WORK - 1).threads, team(LEAST_WORK).threads) == (1, 2)
+    assert (team(MIN_WORK - 1).threads, team(MIN_WORK).threads) == (1, 2)
 
 
 @needs_numba
-def test_a_team_does_all_work_once_however_it_is_shared():
+def test_a_team_does_all_work_exactly_once():
     import numpy as np
 
     from mipmap_plugin.backends.cpu_kernels.threads import Team
@@ -244,7 +244,7 @@ def test_a_team_does_all_work_once_however_it_is_shared():
 
     def work(start, stop, first):
         if start == first:
-            time.sleep(0.05)  # so long that the others take the rest of this thread's part
+            time.sleep(0.05)  # long enough for the other threads to empty this thread's queue
         done[start:stop] += 1
 
     for threads in (1, 2, 3):
@@ -254,7 +254,7 @@ def test_a_team_does_all_work_once_however_it_is_shared():
 
 @needs_numba
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-def test_a_forked_process_draws_with_threads_of_its_own(threads_for_little):
+def test_a_forked_process_draws_with_threads_of_its_own(threads_for_any_work):
     torch.set_num_threads(2)
     g = gaussians(200, dtype=torch.float32)
     expected = BACKEND.render(g, WIDE, Effects(1)).image
@@ -278,12 +278,12 @@ def test_depths_sort_as_floats_with_ties_in_order(length):
     entries = depths.view(np.int32).astype(np.int64) << SLOT_BITS | np.arange(length)
     members = np.empty_like(splats)
     sort(0, 1, Lists(np.array([0, length]), members, entries, splats))
-    right = np.argsort(depths, kind="stable")
-    assert np.array_equal(entries, right) and np.array_equal(members, splats[right])
+    order = np.argsort(depths, kind="stable")
+    assert np.array_equal(entries, order) and np.array_equal(members, splats[order])
 
 
 @needs_numba
-def test_torch_works_on_after_its_idle_threads_were_dismissed(threads_for_little):
+def test_torch_still_works_after_its_idle_threads_were_dismissed(threads_for_any_work):
     torch.set_num_threads(2)
     values = torch.rand(100_000)
     expected = values.exp().sum()
@@ -292,7 +292,7 @@ def test_torch_works_on_after_its_idle_threads_were_dismissed(threads_for_little
         assert torch.equal(values.exp().sum(), expected)
 
 
-def test_without_numba_it_says_what_to_install(monkeypatch):
+def test_without_numba_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     g = gaussians(2, dtype=torch.float32)
     needs = Needs.of(g, Effects(1), gradients=True)
@@ -302,7 +302,7 @@ def test_without_numba_it_says_what_to_install(monkeypatch):
     assert choose_backend("auto", needs)[0].name == "reference"
 
 
-def test_the_module_loads_no_numba():
+def test_importing_the_backend_does_not_import_numba():
     code = "import sys; import mipmap_plugin.backends.cpu; sys.exit('numba' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0

@@ -1,8 +1,40 @@
-"""The compiled half of the CPU backend, and the only place that imports numba.
+"""The compiled kernels of the CPU backend; only this package imports numba.
 
-numba counts references of arrays, and of records that hold some; each count is an atomic operation, and a few for every splat cost
-more than all of its geometry. So a kernel takes arrays out of their records where it begins, and what it calls for every splat is
-given pointers, numbers and tuples of them (`memory`). Such functions are always inlined: numba passes lanes through memory otherwise.
+Memory layout. All arrays are contiguous; a pair is a splat and a tile that it touches.
+
+    splat table [N, 16] float32 (`layout`): one row, one cache line, per splat.
+
+        splat 0   | X | Y | SHEAR | FALL_Y | FALL_X | PEAK | ... | RED | GREEN | BLUE | GAIN | OFFSET | GATE | unused |
+        splat 1   | ...
+
+    block (`blocks`), on the stack: the fields of 16 splats, so that one field is one set of lanes (`lanes`).
+
+        | X of 16 splats | Y of 16 splats | SHEAR of 16 splats | ...
+
+    gradient table [pairs, 9] float32 (`layout`): one row per pair, splat after splat; the row is the pair's slot. The backward pass of
+    compositing writes the rows tile by tile; `projection_back` sums the rows of each splat.
+
+                        slots[0]            slots[1]     slots[2]                        slots[N] = pairs
+                        v                   v            v                               v
+        rows            | splat 0: 3 tiles  | 2 tiles    | ...                           |
+
+    lists (`records.Lists`): the pairs by tile, and in each tile front to back. `members` has their splats, `slots` their slots.
+
+                        starts[0]                        starts[1]                       starts[tiles] = pairs
+                        v                                v                               v
+        members, slots  | tile 0, front to back          | tile 1 ...                    |
+
+    tile (`planes`), on the stack: 16 rows of 64 px. Each quantity is a plane with rows of 64 + 16 floats, so that 16 lanes may start at
+    any pixel. Then come the current splat's bounds in each row.
+
+        red, green, blue, TRANSMITTANCE,      | row 0: 64 px     | 16 spare |
+        STOPS, BEHIND_DOT_GRAD: each          | ...                         |
+                                              | row 15: 64 px    | 16 spare |
+        ROW_BEGIN, ROW_END, ROW_CENTER, ROW_PEAK: 16 floats each
+
+numba counts references to arrays, and to records that hold arrays; each count is an atomic operation, and a few per splat cost more
+than all of its geometry. So a kernel takes arrays out of their records once, and passes pointers, numbers and tuples of them to the
+functions that it calls per splat (`memory`). Those are always inlined, because numba passes lanes through memory otherwise.
 """
 
 from contextlib import suppress
@@ -11,19 +43,19 @@ from typing import Any
 
 import numba
 
-# What Python calls: kept compiled on disk, and run side by side in threads. Division by zero gives infinity, as in numpy.
+# For functions that Python calls: cached on disk, and without the GIL. Division by zero gives infinity, as in numpy.
 kernel: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-# What only kernels call: without a way in from Python it compiles faster, and called from there it crashes.
+# For functions that only kernels call. Without a Python wrapper they compile faster; a call from Python crashes.
 inner: Any = numba.njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)  # type: ignore[call-overload]
 
 
 def _forget_stale() -> None:
-    """Drop machine code older than any source here: numba looks only at the file of a kernel itself, not at those that it calls."""
+    """Delete cached machine code older than any source here: numba checks only a kernel's own file, not those of the functions it calls."""
     folder = Path(__file__).parent
     newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
     for compiled in folder.glob("__pycache__/*.nb[ci]"):
-        with suppress(OSError):  # another process may be quicker; in a folder that cannot be written numba keeps none
+        with suppress(OSError):  # another process may delete it first; in a read-only folder numba caches nothing
             if compiled.stat().st_mtime < newest:
                 compiled.unlink()
 

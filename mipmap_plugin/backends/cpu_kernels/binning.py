@@ -1,102 +1,101 @@
-"""Which tiles 16 splats touch: exact at the rows and columns of the ellipse alpha >= 1/255."""
+"""Which tiles 16 splats touch: exact for the pixel rows and the extent in x of the ellipse alpha >= 1/255."""
 
-# numba gives calls and operators a meaning of its own.
+# numba redefines calls and operators.
 # mypy: ignore-errors
 
 import math
 
-from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import inner, kernel
+from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, put
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, floor, lowest, maximum, minimum, narrow, select, sqrt, wide
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, floor, lowest_bit, maximum, minimum, narrow, select, sqrt, wide
 from mipmap_plugin.effects import MIN_ALPHA
 
-# px. A row for each lane, to trace a splat through all of them at once; and wide: a splat is cut into few pieces, and where it
-# crosses a row is exact anyway. A tile's state fits a first-level cache.
-TILE_ROWS = WIDTH
-TILE_COLUMNS = 64
+# px. One row per lane, so that a splat's outline in all rows is computed at once. Tiles are wide so that splats touch few of them; pixels
+# outside the ellipse cost nothing, since each row is visited from edge to edge of the ellipse. A tile's state fits a first-level cache.
+TILE_HEIGHT = WIDTH
+TILE_WIDTH = 64
 
-# Rows and columns this close to a splat's edge are visited too: rounding must not lose a pixel that passes the alpha test.
-SLACK = 0.01  # px
+# px. Pixels this close to the outside of a splat's ellipse are visited too, so that rounding loses no pixel that passes the alpha test.
+SLACK = 0.01
 
 LOG_MIN_ALPHA = math.log2(MIN_ALPHA)
 
 
 @kernel
 def tile_grid(width, height):
-    """Columns and rows of tiles."""
-    return -(-width // TILE_COLUMNS), -(-height // TILE_ROWS)
+    """The number of tiles in x and in y."""
+    return -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
 
 
 @inner
-def rows_of(block, height):
-    """The first and last pixel row that each splat touches; none: the second is the smaller."""
-    y, reach = wide(get(block, col.Y)) - 0.5, wide(get(block, col.REACH_Y)) + SLACK
-    return within(y - reach, y + reach, height - 1)
+def pixel_rows(block, height):
+    """The first and last pixel row that each splat touches; if it touches none, the last is less than the first."""
+    y, reach = wide(get(block, layout.Y)) - 0.5, wide(get(block, layout.REACH_Y)) + SLACK
+    return integers_between(y - reach, y + reach, height - 1)
 
 
 @inner
-def within(low, high, last):
-    """The integers of 0..last that lie between two floats; none: the second is the smaller."""
+def integers_between(low, high, last):
+    """The first and last integer of 0..last between two floats; if there is none, the last is less than the first."""
     return ceil(minimum(maximum(low, 0), last + 1)), floor(maximum(minimum(high, last), -1))
 
 
 @inner
 def half_width(block, dy):
-    """px from the ridge to where alpha falls below 1/255, `dy` px from the center."""
-    room = wide(get(block, col.PEAK)) - LOG_MIN_ALPHA - wide(get(block, col.FALL_Y)) * dy * dy
-    return wide(sqrt(narrow(maximum(room, 0)) * get(block, col.SPREAD))) + SLACK
+    """px from the ellipse's center line to where alpha falls below 1/255, `dy` px from the center."""
+    margin = wide(get(block, layout.PEAK)) - LOG_MIN_ALPHA - wide(get(block, layout.FALL_Y)) * dy * dy
+    return wide(sqrt(narrow(maximum(margin, 0)) * get(block, layout.PER_FALL_X))) + SLACK
 
 
 @inner
-def tile_columns(block, first, last, width):
-    """The columns of tiles that each splat touches between the pixel rows first..last; none: the second is the smaller."""
-    y, tip = wide(get(block, col.Y)), wide(get(block, col.TIP))
-    x, shear = wide(get(block, col.X)) - 0.5, wide(get(block, col.SHEAR))
+def tile_x_range(block, first, last, width):
+    """The first and last tile in x that each splat touches between the pixel rows first..last; none: the last is less than the first."""
+    y, rightmost_dy = wide(get(block, layout.Y)), wide(get(block, layout.RIGHTMOST_DY))
+    x, shear = wide(get(block, layout.X)) - 0.5, wide(get(block, layout.SHEAR))
     above, below = first + 0.5 - y, last + 0.5 - y
-    right_most, left_most = minimum(maximum(tip, above), below), minimum(maximum(-tip, above), below)
-    right = x + shear * right_most + half_width(block, right_most)
-    left = x + shear * left_most - half_width(block, left_most)
-    low, high = within(left, right, width - 1)
+    dy_of_right, dy_of_left = minimum(maximum(rightmost_dy, above), below), minimum(maximum(-rightmost_dy, above), below)
+    right = x + shear * dy_of_right + half_width(block, dy_of_right)
+    left = x + shear * dy_of_left - half_width(block, dy_of_left)
+    low, high = integers_between(left, right, width - 1)
     touched = low <= high
-    return select(touched, floor(low * (1 / TILE_COLUMNS)), 0), select(touched, floor(high * (1 / TILE_COLUMNS)), -1)
+    return select(touched, floor(low * (1 / TILE_WIDTH)), 0), select(touched, floor(high * (1 / TILE_WIDTH)), -1)
 
 
 @inner
-def tile_row(first, last, row, block, width):
-    """Which of 16 splats that touch the pixel rows first..last have tiles in their tile row `row`, and from which column to which."""
-    left, right = tile_columns(block, maximum(first, row * TILE_ROWS), minimum(last, row * TILE_ROWS + (TILE_ROWS - 1)), width)
-    return both(both(row * TILE_ROWS <= last, first <= last), left <= right), left, right
+def tiles_in_row(first, last, tile_y, block, width):
+    """For 16 splats that touch the pixel rows first..last: which of them touch the tile row `tile_y`, and their first and last tile in it."""
+    first_x, last_x = tile_x_range(block, maximum(first, tile_y * TILE_HEIGHT), minimum(last, tile_y * TILE_HEIGHT + (TILE_HEIGHT - 1)), width)
+    return both(both(tile_y * TILE_HEIGHT <= last, first <= last), first_x <= last_x), first_x, last_x
 
 
 @inner
 def count_tiles(block, drawn, width, height):
-    """The number of tiles that each splat touches, those that are drawn."""
-    first, last = rows_of(block, height)
-    row, count = floor(first * (1 / TILE_ROWS)), first * 0
-    while bits(both(drawn, both(row * TILE_ROWS <= last, first <= last))) != 0:
-        touching, left, right = tile_row(first, last, row, block, width)
-        count = count + select(touching, right - left + 1, 0)
-        row = row + 1
+    """The number of tiles that each splat touches; 0 for splats that are not drawn."""
+    first, last = pixel_rows(block, height)
+    tile_y, count = floor(first * (1 / TILE_HEIGHT)), first * 0
+    while bits(both(drawn, both(tile_y * TILE_HEIGHT <= last, first <= last))) != 0:
+        touching, first_x, last_x = tiles_in_row(first, last, tile_y, block, width)
+        count = count + select(touching, last_x - first_x + 1, 0)
+        tile_y = tile_y + 1
     return select(drawn, count, 0)
 
 
 @inner
-def cover(block, spans, drawn, slots, width, height, tiles, counts):
-    """Write the tiles of the splats whose bit is set in `drawn` into their slots, from `slots` [16] on, and count them. spans: [32]."""
-    columns = tile_grid(width, height)[0]
-    first, last = rows_of(block, height)
-    row = floor(first * (1 / TILE_ROWS))
-    while bits(both(row * TILE_ROWS <= last, first <= last)) & drawn != 0:
-        touching, left, right = tile_row(first, last, row, block, width)
-        put(spans, 0, row * columns + left)
-        put(spans, 1, row * columns + right)
-        todo = bits(touching) & drawn
-        while todo != 0:
-            lane = lowest(todo)
-            todo &= todo - 1
+def write_tiles(block, spans, drawn, slots, width, height, tiles, counts):
+    """Write the tiles of the splats whose bit is set in `drawn`, from their next `slots` [16] on, and count them per tile. spans: [32]."""
+    tiles_x = tile_grid(width, height)[0]
+    first, last = pixel_rows(block, height)
+    tile_y = floor(first * (1 / TILE_HEIGHT))
+    while bits(both(tile_y * TILE_HEIGHT <= last, first <= last)) & drawn != 0:
+        touching, first_x, last_x = tiles_in_row(first, last, tile_y, block, width)
+        put(spans, 0, tile_y * tiles_x + first_x)
+        put(spans, 1, tile_y * tiles_x + last_x)
+        remaining = bits(touching) & drawn
+        while remaining != 0:
+            lane = lowest_bit(remaining)
+            remaining &= remaining - 1
             for tile in range(int(spans[lane]), int(spans[WIDTH + lane]) + 1):
                 tiles[slots[lane]] = tile
                 counts[tile] += 1
                 slots[lane] += 1
-        row = row + 1
+        tile_y = tile_y + 1

@@ -1,6 +1,6 @@
-"""Blocks: the numbers of 16 splats, column by column, so that one column is one set of lanes."""
+"""Blocks of 16 splats, field by field: field k of all 16 is one set of lanes, at block[16 * k]."""
 
-# numba gives calls and operators a meaning of its own.
+# numba redefines calls and operators.
 # mypy: ignore-errors
 
 from mipmap_plugin.backends.cpu_kernels import inner
@@ -9,23 +9,23 @@ from mipmap_plugin.backends.cpu_kernels.memory import load, store
 
 
 @inner
-def get(block, column):
-    return load(block, column * WIDTH)
+def get(block, field):
+    return load(block, field * WIDTH)
 
 
 @inner
-def get_vector(block, column):
-    """Three columns."""
-    return get(block, column), get(block, column + 1), get(block, column + 2)
+def get_vector(block, field):
+    """Three consecutive fields."""
+    return get(block, field), get(block, field + 1), get(block, field + 2)
 
 
 @inner
-def put(block, column, values):
-    store(block, column * WIDTH, values)
+def put(block, field, values):
+    store(block, field * WIDTH, values)
 
 
 @inner
-def put_vector(block, column, values):
-    put(block, column, values[0])
-    put(block, column + 1, values[1])
-    put(block, column + 2, values[2])
+def put_vector(block, field, values):
+    put(block, field, values[0])
+    put(block, field + 1, values[1])
+    put(block, field + 2, values[2])

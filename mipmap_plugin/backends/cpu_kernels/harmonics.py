@@ -1,58 +1,58 @@
-"""Real spherical harmonics up to degree 4 and their derivative, 16 directions at a time."""
+"""Real spherical harmonics up to degree 4 and their derivative, for 16 directions at a time."""
 
-# numba gives calls and operators a meaning of its own.
+# numba redefines calls and operators.
 # mypy: ignore-errors
 
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.blocks import get, put
-from mipmap_plugin.backends.cpu_kernels.lanes import spread
+from mipmap_plugin.backends.cpu_kernels.lanes import broadcast
 from mipmap_plugin.splatting.harmonics import C0, C1, C2, C3, C4
 
 MAX_BANDS = 25
 
 
 @inner
-def basis(direction, degree, out):
-    """Write the (degree + 1)² basis functions of unit vectors: band by band, 16 float32 each."""
+def basis(direction, degree, bands):
+    """Write the (degree + 1)² basis functions at unit vectors, 16 float32 per band."""
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
-    put(out, 0, spread(C0))
+    put(bands, 0, broadcast(C0))
     if degree > 0:
-        put(out, 1, -C1 * y)
-        put(out, 2, C1 * z)
-        put(out, 3, -C1 * x)
+        put(bands, 1, -C1 * y)
+        put(bands, 2, C1 * z)
+        put(bands, 3, -C1 * x)
     if degree > 1:
-        put(out, 4, C2[0] * x * y)
-        put(out, 5, C2[1] * y * z)
-        put(out, 6, C2[2] * (2 * zz - xx - yy))
-        put(out, 7, C2[3] * x * z)
-        put(out, 8, C2[4] * (xx - yy))
+        put(bands, 4, C2[0] * x * y)
+        put(bands, 5, C2[1] * y * z)
+        put(bands, 6, C2[2] * (2 * zz - xx - yy))
+        put(bands, 7, C2[3] * x * z)
+        put(bands, 8, C2[4] * (xx - yy))
     if degree > 2:
-        put(out, 9, C3[0] * y * (3 * xx - yy))
-        put(out, 10, C3[1] * x * y * z)
-        put(out, 11, C3[2] * y * (4 * zz - xx - yy))
-        put(out, 12, C3[3] * z * (2 * zz - 3 * xx - 3 * yy))
-        put(out, 13, C3[4] * x * (4 * zz - xx - yy))
-        put(out, 14, C3[5] * z * (xx - yy))
-        put(out, 15, C3[6] * x * (xx - 3 * yy))
+        put(bands, 9, C3[0] * y * (3 * xx - yy))
+        put(bands, 10, C3[1] * x * y * z)
+        put(bands, 11, C3[2] * y * (4 * zz - xx - yy))
+        put(bands, 12, C3[3] * z * (2 * zz - 3 * xx - 3 * yy))
+        put(bands, 13, C3[4] * x * (4 * zz - xx - yy))
+        put(bands, 14, C3[5] * z * (xx - yy))
+        put(bands, 15, C3[6] * x * (xx - 3 * yy))
     if degree > 3:
-        put(out, 16, C4[0] * x * y * (xx - yy))
-        put(out, 17, C4[1] * y * z * (3 * xx - yy))
-        put(out, 18, C4[2] * x * y * (7 * zz - 1))
-        put(out, 19, C4[3] * y * z * (7 * zz - 3))
-        put(out, 20, C4[4] * (zz * (35 * zz - 30) + 3))
-        put(out, 21, C4[5] * x * z * (7 * zz - 3))
-        put(out, 22, C4[6] * (xx - yy) * (7 * zz - 1))
-        put(out, 23, C4[7] * x * z * (xx - 3 * yy))
-        put(out, 24, C4[8] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)))
+        put(bands, 16, C4[0] * x * y * (xx - yy))
+        put(bands, 17, C4[1] * y * z * (3 * xx - yy))
+        put(bands, 18, C4[2] * x * y * (7 * zz - 1))
+        put(bands, 19, C4[3] * y * z * (7 * zz - 3))
+        put(bands, 20, C4[4] * (zz * (35 * zz - 30) + 3))
+        put(bands, 21, C4[5] * x * z * (7 * zz - 3))
+        put(bands, 22, C4[6] * (xx - yy) * (7 * zz - 1))
+        put(bands, 23, C4[7] * x * z * (xx - 3 * yy))
+        put(bands, 24, C4[8] * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)))
 
 
 @inner
-def slope(direction, degree, w):
-    """The gradient of Σ w_j · basis_j with respect to the directions, before they are normalized."""
+def grad_direction(direction, degree, w):
+    """The gradient of Σ w_j · basis_j with respect to the directions, before these are normalized."""
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
-    gx = gy = gz = spread(0)
+    gx = gy = gz = broadcast(0)
     if degree > 0:
         gx, gy, gz = -C1 * get(w, 3), -C1 * get(w, 1), C1 * get(w, 2)
     if degree > 1:

@@ -1,11 +1,11 @@
-"""Lanes: 16 float32 or 16 float64 side by side, as types that numba compiles straight to vector registers.
+"""SIMD vectors: 16 float32 or 16 float64 lanes, as types that numba compiles straight to vector registers.
 
-Plain loops are vectorized only when LLVM sees fit, and a loop that silently is not runs five times slower. With a type of its own
-there is nothing left to see: `a + b` on lanes is one vector addition on every processor. Scalars mix in freely and are spread
-to all lanes; the two types mix only through `wide` and `narrow`. Nothing is reassociated, so that equal inputs give equal bits.
+Plain loops are vectorized only when LLVM decides to, and a loop that silently is not runs five times slower. With types of their own,
+`a + b` on lanes is one vector addition on every processor. Scalars mix in freely and are broadcast to all lanes; the two types mix
+only through `wide` and `narrow`. Nothing is reassociated, so equal inputs give equal bits.
 """
 
-# numba gives calls and operators a meaning of its own.
+# numba redefines calls and operators.
 # mypy: ignore-errors
 
 import operator
@@ -58,12 +58,12 @@ class _MaskModel(models.PrimitiveModel):
 
 
 def _common(kinds):
-    """The lanes that arguments have in common: float64 where one is."""
+    """The type of an operation on `kinds`: float64 lanes if one of them is."""
     return DOUBLES if DOUBLES in kinds else LANES
 
 
-def _spread(context, builder, value, kind, lanes):
-    """`value` as `lanes`; a scalar goes to every lane."""
+def _broadcast(context, builder, value, kind, lanes):
+    """`value` as `lanes`; a scalar is copied to every lane."""
     if kind == lanes:
         return value
     vector, number = (VECTOR64, types.float64) if lanes == DOUBLES else (VECTOR32, types.float32)
@@ -73,13 +73,13 @@ def _spread(context, builder, value, kind, lanes):
 
 
 def lane_wise(emit, result=None):
-    """An intrinsic of `emit(builder, *vectors)` for arguments that are lanes or scalars; `result`: where it is not of their type."""
+    """An intrinsic that calls `emit(builder, *vectors)` on lanes or scalars; `result`: its type if not the arguments'."""
 
     def typed(*kinds):
         lanes = _common(kinds)
 
         def generate(context, builder, signature, values):
-            return emit(builder, *(_spread(context, builder, v, k, lanes) for v, k in zip(values, signature.args, strict=True)))
+            return emit(builder, *(_broadcast(context, builder, v, k, lanes) for v, k in zip(values, signature.args, strict=True)))
 
         return (result or lanes)(*kinds), generate
 
@@ -87,7 +87,7 @@ def lane_wise(emit, result=None):
 
 
 def _call(name, builder, *vectors):
-    """LLVM's own function of that name for vectors."""
+    """Call LLVM's intrinsic `name` on vectors."""
     kind = vectors[0].type
     suffix = "f64" if kind == VECTOR64 else "f32"
     signature = ir.FunctionType(kind, [kind] * len(vectors))
@@ -95,7 +95,7 @@ def _call(name, builder, *vectors):
 
 
 def _operator(symbol, emit, result=None):
-    """Teach numba `symbol` for two operands of which at least one is lanes."""
+    """Define the operator `symbol` for two operands of which at least one is lanes."""
     typed = lane_wise(emit, result)
 
     @intrinsic
@@ -128,7 +128,7 @@ def _negative(lanes):
 
 @intrinsic
 def both(_context, first, second):
-    """first and second, of two masks."""
+    """first and second, for two masks."""
     return MASK(first, second), lambda context, builder, signature, values: builder.and_(*values)
 
 
@@ -143,17 +143,17 @@ def bits(_context, mask):
 
 
 @intrinsic
-def lowest(_context, bits):
-    """The place of the lowest bit that is set, for bits other than 0."""
+def lowest_bit(_context, bits):
+    """The position of the lowest set bit of a nonzero integer."""
     return types.int64(bits), lambda context, builder, signature, values: builder.cttz(values[0], ir.IntType(1)(1))
 
 
 @intrinsic
 def select(_context, mask, yes, no):
-    """`yes` where the mask is set, else `no`. What is not taken may be anything, even NaN."""
+    """`yes` where the mask is set, else `no`. Lanes that are not selected may hold anything, even NaN."""
 
     def generate(context, builder, signature, values):
-        options = (_spread(context, builder, v, k, lanes) for v, k in zip(values[1:], signature.args[1:], strict=True))
+        options = (_broadcast(context, builder, v, k, lanes) for v, k in zip(values[1:], signature.args[1:], strict=True))
         return builder.select(values[0], *options)
 
     lanes = _common((yes, no))
@@ -162,7 +162,7 @@ def select(_context, mask, yes, no):
 
 @intrinsic
 def fma(_context, a, b, c):
-    """a·b + c, rounded once where the processor can."""
+    """a·b + c, rounded once where the processor has such an instruction."""
     return lane_wise(partial(_call, "fmuladd"))(a, b, c)
 
 
@@ -192,7 +192,7 @@ def ceil(_context, a):
 
 
 @intrinsic
-def spread(_context, value):
+def broadcast(_context, value):
     """A scalar in every lane."""
     return lane_wise(lambda builder, value: value)(value)
 
@@ -212,13 +212,13 @@ def wide(_context, lanes):
 
 @intrinsic
 def narrow(_context, doubles):
-    """float64 rounded to float32; infinite where that is too small."""
+    """float64 rounded to float32; infinite where float32 overflows."""
     return LANES(doubles), lambda context, builder, signature, values: builder.fptrunc(values[0], VECTOR32)
 
 
 @intrinsic
 def total(_context, lanes):
-    """The sum of all lanes, halves first: the same order on every processor."""
+    """The sum of all lanes, adding halves: the same order on every processor."""
 
     def generate(context, builder, signature, values):
         value, width = values[0], WIDTH

@@ -1,6 +1,6 @@
-"""Exponentials and logarithms of lanes. numba's own are scalar."""
+"""Exponentials and logarithms of lanes; numba's own take scalars only."""
 
-# numba gives calls and operators a meaning of its own.
+# numba redefines calls and operators.
 # mypy: ignore-errors
 
 import math
@@ -14,7 +14,7 @@ from mipmap_plugin.backends.cpu_kernels.lanes import INTS32, INTS64, VECTOR32, V
 
 @intrinsic
 def _add_to_exponent(_context, lanes, rounded):
-    """lanes · 2^n, for n held in the low bits of `rounded` as `exp2` leaves them."""
+    """lanes · 2^n, with n in the low bits of `rounded` as in `exp2`."""
 
     def emit(builder, lanes, rounded):
         shift = ir.Constant(INTS32, [23] * WIDTH)
@@ -24,20 +24,20 @@ def _add_to_exponent(_context, lanes, rounded):
     return lane_wise(emit)(lanes, rounded)
 
 
-# 1.5 · 2^23: added to a float32 it leaves the nearest integer in the low bits.
+# 1.5 · 2^23: adding it to a float32 leaves the nearest integer in the low bits.
 _ROUNDER = 12582912.0
 
 
 @inner
 def exp2(power):
-    """2^power to 1e-7 for -126 < power < 127; outside, anything."""
+    """2^power, relative error 1e-7, for -126 < power < 127; undefined outside."""
     rounded = power + _ROUNDER
-    rest = power - (rounded - _ROUNDER)  # -0.5 .. 0.5
-    series = fma(rest, 0.00132647272, 0.00967151264)  # minimax in relative error, exactly 1 at 0
-    series = fma(series, rest, 0.0555073374)
-    series = fma(series, rest, 0.240222421)
-    series = fma(series, rest, 0.693146978)
-    series = fma(series, rest, 1.0)
+    remainder = power - (rounded - _ROUNDER)  # -0.5 .. 0.5
+    series = fma(remainder, 0.00132647272, 0.00967151264)  # minimax in relative error, exactly 1 at 0
+    series = fma(series, remainder, 0.0555073374)
+    series = fma(series, remainder, 0.240222421)
+    series = fma(series, remainder, 0.693146978)
+    series = fma(series, remainder, 1.0)
     return _add_to_exponent(series, rounded)
 
 
@@ -54,7 +54,7 @@ def _exponent(_context, lanes):
 
 @intrinsic
 def _mantissa(_context, lanes):
-    """What is left of positive float64 without their exponents, 1 .. 2."""
+    """The mantissas of positive float64, 1 .. 2."""
 
     def emit(builder, lanes):
         digits = builder.and_(builder.bitcast(lanes, INTS64), ir.Constant(INTS64, [(1 << 52) - 1] * WIDTH))
@@ -65,7 +65,7 @@ def _mantissa(_context, lanes):
 
 @inner
 def log2(x):
-    """The logarithm of positive, normal float64 to 1e-10: twice the series of artanh((m - 1)/(m + 1))."""
+    """The logarithm of positive, normal float64, error 1e-10: twice the series of artanh((m - 1)/(m + 1))."""
     m, n = _mantissa(x), _exponent(x)
     large = m > math.sqrt(2)
     m, n = select(large, m * 0.5, m), select(large, n + 1, n)
@@ -82,11 +82,11 @@ def log2(x):
 
 @inner
 def tanh(x):
-    """Of float64 lanes of at least 0, to 3e-7."""
+    """The hyperbolic tangent of float64 lanes of at least 0, relative error 3e-7."""
     xx = x * x
     series = fma(xx, 62 / 2835, -17 / 315)
     series = fma(series, xx, 2 / 15)
     series = fma(series, xx, -1 / 3)
     series = fma(series, xx, 1.0) * x
-    fallen = wide(exp2(narrow(maximum(x * (-2 / math.log(2)), -125.0))))
-    return select(x < 0.25, series, (1 - fallen) / (1 + fallen))
+    decay = wide(exp2(narrow(maximum(x * (-2 / math.log(2)), -125.0))))
+    return select(x < 0.25, series, (1 - decay) / (1 + decay))

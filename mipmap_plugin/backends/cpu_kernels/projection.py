@@ -1,6 +1,6 @@
-"""Splats in the world -> rows of the splat table, 16 at a time. Geometry in float64: with less, needles and far splats are lost."""
+"""Splats in the world to rows of the splat table, 16 at a time. Geometry is in float64: float32 would lose needles and distant splats."""
 
-# numba gives calls and operators a meaning of its own.
+# numba redefines calls and operators.
 # mypy: ignore-errors
 
 import math
@@ -8,74 +8,73 @@ import math
 import numpy as np
 from numba import types
 
-from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, windows
+from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout, windows
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, lowest, maximum, narrow, select, spread, sqrt
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, lowest_bit, maximum, narrow, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.powers import log2
-from mipmap_plugin.backends.cpu_kernels.records import SEEN_AT_CENTER, SEEN_IN_PIXEL
+from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, minus, plus, times
 from mipmap_plugin.effects import MIN_ALPHA
 
 # -q/2 = -HALF_LOG2E · q in powers of two.
 HALF_LOG2E = 0.5 / math.log(2)
 
-# Sizes (px, px²) and brightnesses beyond this are as good as infinite: float32 could not carry their squares.
-FAR = 1e30
+# Sizes (px, px²), opacities and colors beyond this count as infinite: their squares would overflow float32.
+HUGE = 1e30
 
-# The least color that is not black, and the share of the largest color that is not the largest, in float32.
-TINY, BELOW = 1e-30, 1 - 1e-7
+# The least positive color, and the factor that makes the largest color slightly less, in float32.
+MIN_COLOR, BELOW_MAX = 1e-30, 1 - 1e-7
 
-# A block of what is known of splats in the world, float64: the columns of `Splats`, of which shapes are a covariance or the other two.
+# Fields of a block of splats in the world, float64, as in `SplatArrays`. A shape is either a covariance or a quaternion and scales.
 MEAN, OPACITY, COVARIANCE, QUAT, SCALE = 0, 3, 4, 4, 8
-WORLD = 13
+WORLD_FIELDS = 13
 
-new_world, new_numbers = scratch(WORLD * WIDTH, types.float64), scratch(2 * WIDTH, types.float64)
-new_block, new_bands = scratch(col.COLUMNS * WIDTH, types.float32), scratch(harmonics.MAX_BANDS * WIDTH, types.float32)
+new_world, new_sizes = scratch(WORLD_FIELDS * WIDTH, types.float64), scratch(2 * WIDTH, types.float64)
+new_block, new_bands = scratch(layout.SPLAT_FIELDS * WIDTH, types.float32), scratch(harmonics.MAX_BANDS * WIDTH, types.float32)
 
 
 @kernel
 def project(start, stop, view, splats, table, depths, counts):
-    """Fill the rows start..stop of the table, the depths and the numbers of tiles touched; 0 tiles: not drawn."""
+    """Fill the rows start..stop of the table, of the depths and of the numbers of tiles touched; 0 tiles: not drawn."""
     covariances, sh = len(splats.covariances) > 0, pointer(splats.sh)
-    sources, rows, stride = pointers(splats), pointer(table), 3 * splats.sh.shape[1]
-    world, numbers, block, bands = new_world(), new_numbers(), new_block(), new_bands()
+    arrays, rows, stride = pointers(splats), pointer(table), 3 * splats.sh.shape[1]
+    world, sizes, block, bands = new_world(), new_sizes(), new_block(), new_bands()
     for first in range(start, stop, WIDTH):
         size = min(WIDTH, stop - first)
         for lane in range(size):
             counts[first + lane] = 0
-            fetch(first + lane, lane, sources, covariances, world)
+            load_splat(first + lane, lane, arrays, covariances, world)
         p = plus(apply(view.rotation, get_vector(world, MEAN)), view.translation)
-        axes = ellipses.lens(view, p)
-        flat = flatten_matrix(axes, world) if covariances else flatten(axes, world)
-        drawn = both(p[2] > view.near, fill_shape(view, p, flat, get(world, OPACITY), block))
-        put(numbers, 0, sqrt(dot(p, p)) if view.radial else p[2])
-        put(numbers, 1, count_tiles(block, drawn, view.width, view.height))
-        shown = bits(get(numbers, 1) > 0) & ((1 << size) - 1)
-        if shown != 0:
-            harmonics.basis(narrowed(sight(view, get_vector(world, MEAN))[0]), view.sh_degree, bands)
-        while shown != 0:
-            lane = lowest(shown)
-            shown &= shown - 1
+        jac = ellipses.jacobian(view, p)
+        shape = project_covariance(jac, world) if covariances else project_axes(jac, world)
+        drawn = both(p[2] > view.near_plane, fill_shape(view, p, shape, get(world, OPACITY), block))
+        put(sizes, 0, sqrt(dot(p, p)) if view.radial else p[2])
+        put(sizes, 1, count_tiles(block, drawn, view.width, view.height))
+        visible = bits(get(sizes, 1) > 0) & ((1 << size) - 1)
+        if visible != 0:
+            harmonics.basis(narrowed(view_direction(view, get_vector(world, MEAN))[0]), view.sh_degree, bands)
+        while visible != 0:
+            lane = lowest_bit(visible)
+            visible &= visible - 1
             i = first + lane
             if fill_color(i * stride, lane, view, sh, bands, block):
-                depths[i], counts[i] = numbers[lane], int(numbers[WIDTH + lane])
-                for k in range(col.COLUMNS):
-                    rows[i * col.COLUMNS + k] = block[k * WIDTH + lane]
+                depths[i], counts[i] = sizes[lane], int(sizes[WIDTH + lane])
+                for k in range(layout.SPLAT_FIELDS):
+                    rows[i * layout.SPLAT_FIELDS + k] = block[k * WIDTH + lane]
 
 
 @inner
 def pointers(splats):
-    """Where the tensors of splats begin, but for the coefficients."""
+    """Pointers to the arrays of splats, without the coefficients."""
     return pointer(splats.means), pointer(splats.opacities), pointer(splats.quats), pointer(splats.scales), pointer(splats.covariances)
 
 
 @inner
-def fetch(i, lane, sources, has_covariances, world):
-    """Write what is known of splat i into a lane of the block."""
-    means, opacities, quats, scales, covariances = sources
+def load_splat(i, lane, arrays, has_covariances, world):
+    """Load splat i into a lane of the block `world`."""
+    means, opacities, quats, scales, covariances = arrays
     for k in range(3):
         world[(MEAN + k) * WIDTH + lane] = means[3 * i + k]
     world[OPACITY * WIDTH + lane] = opacities[i]
@@ -95,97 +94,97 @@ def quaternion(world):
 
 
 @inner
-def matrix(world):
+def covariance_of(world):
     return get_vector(world, COVARIANCE), get_vector(world, COVARIANCE + 3), get_vector(world, COVARIANCE + 6)
 
 
 @inner
-def flatten(axes, world):
-    return ellipses.flatten(axes, ellipses.rotation(quaternion(world)), get_vector(world, SCALE))
+def project_axes(jac, world):
+    return ellipses.project_axes(jac, ellipses.rotation(quaternion(world)), get_vector(world, SCALE))
 
 
 @inner
-def flatten_matrix(axes, world):
-    return ellipses.flatten_matrix(axes, matrix(world))
+def project_covariance(jac, world):
+    return ellipses.project_covariance(jac, covariance_of(world))
 
 
 @inner
-def fill_shape(view, p, flat, opacity, block):
-    """Write what the splats' ellipses are on the image, and tell which there are to draw."""
+def fill_shape(view, p, shape, opacity, block):
+    """Write the splats' ellipses on the image; returns which splats are drawn."""
     per_z = 1 / p[2]
     x, y = view.fx * p[0] * per_z + view.cx, view.fy * p[1] * per_z + view.cy
-    dilated, light = ellipses.screen_filter(view, flat)
-    if view.seen == SEEN_AT_CENTER:
-        return fill_point(view, x, y, dilated, opacity, light, block)
-    along = integrals.axes(dilated)
-    if view.seen == SEEN_IN_PIXEL:
-        mass, bound, corner = integrals.mass(along, opacity), integrals.BRIGHTER * opacity, integrals.CORNER
-        drawn = integrals.brightest(along, opacity) >= MIN_ALPHA
+    dilated, compensation = ellipses.screen_filter(view, shape)
+    if view.sampling == AT_CENTER:
+        return fill_at_center(view, x, y, dilated, opacity, compensation, block)
+    splat_axes = integrals.axes(dilated)
+    if view.sampling == OVER_PIXEL:
+        mass, bound, corner = integrals.mass(splat_axes, opacity), integrals.BOUND_SQUARED * opacity, integrals.CORNER
+        drawn = integrals.peak_alpha(splat_axes, opacity) >= MIN_ALPHA
     else:
         mass, bound, corner = opacity, opacity, windows.CORNER
-        drawn = both(opacity >= MIN_ALPHA, along[3] * FAR > 1)
-    wider, bound = integrals.around(dilated, along, bound, corner)
-    drawn = both(drawn, fill_ellipse(x, y, wider, bound, block))
-    integrals.fill(along, mass, block)
+        drawn = both(opacity >= MIN_ALPHA, splat_axes[3] * HUGE > 1)
+    bounds, bound = integrals.bounding_ellipse(dilated, splat_axes, bound, corner)
+    drawn = both(drawn, fill_ellipse(x, y, bounds, bound, block))
+    integrals.put_integral(splat_axes, mass, block)
     return drawn
 
 
 @inner
-def fill_point(view, x, y, shape, opacity, light, block):
-    """`fill_shape` of splats that are seen at the centers of pixels."""
-    shown = opacity * light
-    aside = maximum(abs_of(x * (2 / view.width) - 1), abs_of(y * (2 / view.height) - 1))
-    drawn = both(shown >= view.min_alpha, aside <= view.frame)
-    put(block, col.GATE, spread(1))
+def fill_at_center(view, x, y, shape, opacity, compensation, block):
+    """`fill_shape` for splats that are sampled at pixel centers."""
+    compensated = opacity * compensation
+    offset_from_middle = maximum(absolute(x * (2 / view.width) - 1), absolute(y * (2 / view.height) - 1))
+    drawn = both(compensated >= view.min_alpha, offset_from_middle <= view.max_offset)
+    put(block, layout.GATE, broadcast(1))
     if view.culls:
-        there = culling.is_drawn(view, shape, opacity)
-        put(block, col.GATE, narrow(select(there, 1.0, opacity * 0)))
-        drawn = drawn if view.felt else both(drawn, there)
+        kept = culling.is_drawn(view, shape, opacity)
+        put(block, layout.GATE, narrow(select(kept, 1.0, opacity * 0)))
+        drawn = drawn if view.lists_culled else both(drawn, kept)
         if view.least_spread > 0:
-            shape, _ = culling.stretched(view, shape, there)
+            shape, _ = culling.stretched(view, shape, kept)
     if view.max_variance < math.inf:
         shape = culling.limited(view, shape)
-    # alpha = whole·(w - faded), which ends where it is `end`
-    whole = shown * (1 / (1 - view.faded))
-    floor, end = whole * view.faded, maximum(shown * view.cut, view.min_alpha)
-    gain = (end + floor) / MIN_ALPHA
-    put(block, col.GAIN, narrow(gain))
-    put(block, col.FLOOR, narrow(floor))
-    return both(drawn, fill_ellipse(x, y, shape, whole / gain, block))
+    # alpha = peak·(w - w_end), down to `last_alpha`
+    peak = compensated * (1 / (1 - view.w_end))
+    offset, last_alpha = peak * view.w_end, maximum(compensated * view.w_cut, view.min_alpha)
+    gain = (last_alpha + offset) / MIN_ALPHA
+    put(block, layout.GAIN, narrow(gain))
+    put(block, layout.OFFSET, narrow(offset))
+    return both(drawn, fill_ellipse(x, y, shape, peak / gain, block))
 
 
 @inner
-def abs_of(lanes):
+def absolute(lanes):
     return maximum(lanes, 0 - lanes)
 
 
 @inner
 def fill_ellipse(x, y, shape, opacity, block):
-    """Write the ellipses alpha >= 1/255 of shapes, and tell which are finite and bright enough."""
+    """Write the ellipses alpha >= 1/255 of shapes; returns which are finite and bright enough."""
     xx, xy, yy, det = shape
-    small = both(both(maximum(x, -x) < FAR, maximum(y, -y) < FAR), both(both(xx < FAR, yy < FAR), opacity < FAR))
-    sharp = both(yy * FAR > 1, det * FAR > yy)
-    drawn = both(both(small, sharp), opacity >= MIN_ALPHA)  # NaN passes no comparison
+    bounded = both(both(maximum(x, -x) < HUGE, maximum(y, -y) < HUGE), both(both(xx < HUGE, yy < HUGE), opacity < HUGE))
+    not_thin = both(yy * HUGE > 1, det * HUGE > yy)
+    drawn = both(both(bounded, not_thin), opacity >= MIN_ALPHA)  # NaN passes no comparison
     peak = log2(opacity)
     reach = 2 * math.log(2) * (peak - math.log2(MIN_ALPHA))
     per_yy = 1 / yy
     across = det * per_yy
-    put(block, col.X, narrow(x))
-    put(block, col.Y, narrow(y))
-    put(block, col.SHEAR, narrow(xy * per_yy))
-    put(block, col.FALL_Y, narrow(HALF_LOG2E * per_yy))
-    put(block, col.FALL_X, HALF_LOG2E / narrow(across))
-    put(block, col.PEAK, narrow(peak))
-    put(block, col.SPREAD, narrow(across * (1 / HALF_LOG2E)))
-    put(block, col.REACH_Y, sqrt(narrow(reach * yy)))
-    put(block, col.TIP, narrow(xy) * sqrt(narrow(reach) / narrow(xx)))
+    put(block, layout.X, narrow(x))
+    put(block, layout.Y, narrow(y))
+    put(block, layout.SHEAR, narrow(xy * per_yy))
+    put(block, layout.FALL_Y, narrow(HALF_LOG2E * per_yy))
+    put(block, layout.FALL_X, HALF_LOG2E / narrow(across))
+    put(block, layout.PEAK, narrow(peak))
+    put(block, layout.PER_FALL_X, narrow(across * (1 / HALF_LOG2E)))
+    put(block, layout.REACH_Y, sqrt(narrow(reach * yy)))
+    put(block, layout.RIGHTMOST_DY, narrow(xy) * sqrt(narrow(reach) / narrow(xx)))
     return drawn
 
 
 @inner
 def fill_color(at, lane, view, sh, bands, block):
-    """Write a splat's color in this view's direction into its lane; False where it is not finite. Its coefficients begin at sh[at]."""
-    half, most = np.float32(0.5), np.float32(view.max_color)
+    """Write a splat's color in this view's direction to its lane; returns whether it is finite. Its coefficients start at sh[at]."""
+    half, largest = np.float32(0.5), np.float32(view.max_color)
     red, green, blue = half, half, half
     for j in range((view.sh_degree + 1) ** 2):
         band = bands[j * WIDTH + lane]
@@ -193,28 +192,28 @@ def fill_color(at, lane, view, sh, bands, block):
         green += band * sh[at + 3 * j + 1]
         blue += band * sh[at + 3 * j + 2]
     red_step, green_step, blue_step = view.color_steps
-    block[col.RED * WIDTH + lane] = in_steps(min(max(red, 0), most), red_step, most)
-    block[col.GREEN * WIDTH + lane] = in_steps(min(max(green, 0), most), green_step, most)
-    block[col.BLUE * WIDTH + lane] = in_steps(min(max(blue, 0), most), blue_step, most)
-    return abs(red) < FAR and abs(green) < FAR and abs(blue) < FAR
+    block[layout.RED * WIDTH + lane] = quantized(min(max(red, 0), largest), red_step, largest)
+    block[layout.GREEN * WIDTH + lane] = quantized(min(max(green, 0), largest), green_step, largest)
+    block[layout.BLUE * WIDTH + lane] = quantized(min(max(blue, 0), largest), blue_step, largest)
+    return abs(red) < HUGE and abs(green) < HUGE and abs(blue) < HUGE
 
 
 @inner
-def in_steps(value, step, most):
-    """The nearest multiple of a step; 0: the value as it is. Never quite 0 or `most` but for what is: there a channel's gradient ends."""
-    if step == 0 or value <= 0 or value >= most:
+def quantized(value, step, largest):
+    """The nearest multiple of `step`; step 0: unchanged. Other values never become 0 or `largest`, where a channel has no gradient."""
+    if step == 0 or value <= 0 or value >= largest:
         return value
-    return np.float32(max(min(round(value / step) * step, most * BELOW), TINY))
+    return np.float32(max(min(round(value / step) * step, largest * BELOW_MAX), MIN_COLOR))
 
 
 @inner
-def sight(view, mean):
-    """The unit vectors from the eye to means, and the distances; (0, 0, 1) and 0 for a splat in the very eye."""
+def view_direction(view, mean):
+    """The unit vectors from the eye to means, and the distances; (0, 0, 1) and 0 for a splat at the eye."""
     ray = minus(mean, view.eye)
     length = sqrt(dot(ray, ray))
-    away = length > 0
+    apart = length > 0
     x, y, z = times(1 / length, ray)
-    return (select(away, x, 0.0), select(away, y, 0.0), select(away, z, 1.0)), length
+    return (select(apart, x, 0.0), select(apart, y, 0.0), select(apart, z, 1.0)), length
 
 
 @inner

@@ -1,4 +1,4 @@
-"""What the kernels are given: records that numba reads as tuples."""
+"""The arguments of kernels: named tuples, which numba reads as tuples."""
 
 from __future__ import annotations
 
@@ -6,49 +6,49 @@ from typing import NamedTuple
 
 import numpy as np
 
-# What of a splat its alpha is: what lies at the pixel's center, or its mean over the pixel's square, or over the pixel's window.
-SEEN_AT_CENTER, SEEN_IN_PIXEL, SEEN_IN_WINDOW = range(3)
+# Where a splat's alpha comes from: its value at the pixel's center, its mean over the pixel's square, or its mean over the pixel's window.
+AT_CENTER, OVER_PIXEL, OVER_WINDOW = range(3)
 
 
 class View(NamedTuple):
-    """A camera and the effects that concern a splat. Numbers alone, no arrays."""
+    """A camera, and the effects and settings that kernels need. Numbers only, no arrays."""
 
-    rotation: tuple  # three rows of three, world to camera
-    translation: tuple  # three
-    eye: tuple  # three, world
+    rotation: tuple[tuple[float, ...], ...]  # 3 rows of 3, world to camera
+    translation: tuple[float, ...]  # 3
+    eye: tuple[float, ...]  # 3, in world coordinates
     fx: float
     fy: float
     cx: float
     cy: float
-    left: float  # least x/z
-    right: float  # most x/z
-    top: float  # least y/z
-    bottom: float  # most y/z at which the Jacobian is not yet frozen
+    left: float  # bounds of x/z and y/z, beyond which the Jacobian is frozen
+    right: float
+    top: float
+    bottom: float
     width: int
     height: int
-    near: float
+    near_plane: float
     eps2d: float
-    least_light: float  # the share of its opacity that compensation leaves at least; 1: there is no compensation
-    seen: int  # one of the three above
+    min_compensation: float  # the least factor that compensation applies to an opacity; 1: no compensation
+    sampling: int  # AT_CENTER, OVER_PIXEL or OVER_WINDOW
     sh_degree: int
     max_color: float
-    color_steps: tuple  # three; 0: not rounded
-    radial: bool  # whether the order is that of distances
-    frame: float  # half pictures
+    color_steps: tuple[float, ...]  # 3; 0: not rounded
+    radial: bool  # whether splats are sorted by distance from the eye instead of depth
+    max_offset: float  # a splat is drawn if its center lies within this many half pictures of the middle, along x and y
     min_alpha: float
-    cut: float  # the weight at which a splat is cut off; 0: none is
-    faded: float  # the weight at which a splat has faded to 0; 0: none does
-    culls: bool  # whether any of the next four is asked for
+    w_cut: float  # the weight at which splats are cut off; 0: not cut off
+    w_end: float  # the weight at which splats have faded to 0; 0: no fading
+    culls: bool  # whether one of min_variance, min_contribution and least_spread is set
     min_variance: float  # px²
     boxed: bool
     min_contribution: float  # px²
     least_spread: float  # px²
-    max_variance: float  # px²; infinite: splats may be of any size
-    felt: bool  # whether splats that are culled are listed, for their gradient
+    max_variance: float  # px²; infinite: no limit
+    lists_culled: bool  # whether the lists of tiles contain culled splats, for their gradient
 
 
-class Splats(NamedTuple):
-    """The tensors of `Gaussians`, or their gradients, as contiguous float32 arrays. [0, ...] for the shape that is not used."""
+class SplatArrays(NamedTuple):
+    """The tensors of `Gaussians`, or their gradients, as contiguous float32 arrays; [0, ...] for a shape that is not in use."""
 
     means: np.ndarray  # [N, 3]
     quats: np.ndarray  # [N, 4] or [0, 4]
@@ -59,7 +59,7 @@ class Splats(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What ends a splat and a pixel."""
+    """Cut-offs of alpha and of transmittance, and the rounding of pictures."""
 
     max_alpha: float
     min_transmittance: float
@@ -67,17 +67,17 @@ class Limits(NamedTuple):
 
 
 class Lists(NamedTuple):
-    """Which splats each tile shows; front to back once `sorting.sort` was there, which the compositing calls."""
+    """Each tile's list of splats; front to back after `sorting.sort`, which compositing calls."""
 
-    starts: np.ndarray  # [tiles + 1] where each tile's members begin
-    members: np.ndarray  # [pairs] splats
-    slots: np.ndarray  # [pairs] where each keeps what it has to do with this tile, splat after splat
-    splats: np.ndarray  # [pairs] whose slot each is
+    starts: np.ndarray  # [tiles + 1] where each tile's list begins
+    members: np.ndarray  # [pairs] the splats of each list
+    slots: np.ndarray  # [pairs] the slot of each member: its row of the gradient table, where the pairs of a splat are adjacent
+    splats: np.ndarray  # [pairs] the splat of each slot
 
 
 class Frame(NamedTuple):
-    """What the backward pass needs to know of an image."""
+    """What the backward pass needs of an image."""
 
     background: np.ndarray  # [3]
-    through: np.ndarray  # [H, W] transmittance in the end
-    stops: np.ndarray  # [H, W] place in the tile's list at which the pixel was finished
+    transmittance: np.ndarray  # [H, W] behind all splats
+    stops: np.ndarray  # [H, W] the position in the tile's list at which the pixel stopped

@@ -1,84 +1,84 @@
-"""Each tile's list of splats, front to back: sorted by tile while they are cut into runs, then by depth as tiles are composited.
+"""The tiles' lists of splats: a counting sort by tile here, and a sort by depth when a tile is composited.
 
-Each run of splats counts its tiles; the counts of all runs tell where each puts its first splat of each tile; then each writes its
-own. As the runs are in order, the outcome is the same for any number of them.
+The splats are divided into runs. Each run counts its splats per tile; from all counts follows the offset at which each run writes its
+splats of each tile. The runs are in order, so the lists do not depend on the number of runs.
 """
 
-# numba gives calls and operators a meaning of its own.
+# numba redefines calls and operators.
 # mypy: ignore-errors
 
 import numpy as np
 from numba import types
 
-from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel
-from mipmap_plugin.backends.cpu_kernels import columns as col
+from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.records import Lists
+from mipmap_plugin.backends.cpu_kernels.threads import Team
 
-# More than one for each thread, so that none waits long for the last; but all count every tile.
+# Several per thread, so that no thread waits long for the last run; but each run needs a counter for every tile.
 RUNS_PER_THREAD = 8
 
-# Bits of a depth sorted at a time: most lists hold some hundred splats, and more counters than that would take longest.
-DIGIT = 8
+# Bits of a depth per pass of the radix sort: most lists hold a few hundred splats, so more counters would dominate the time.
+DIGIT_BITS = 8
 
-# Lists of up to so many are sorted by insertion.
-SHORT = 32
+# Lists of at most this length are sorted by insertion.
+MAX_INSERTION = 32
 
-# An entry of a list while it is sorted: the depth's bits above, the slot below. Positive floats sort as their bits do.
+# An entry of a list during sorting: the depth's bits above, the slot below. Positive floats sort like their bits.
 SLOT_BITS = 32
 _SLOT = (1 << SLOT_BITS) - 1
 
-new_block, new_spans = scratch(col.OUTLINE * WIDTH, types.float32), scratch(2 * WIDTH, types.float64)
-new_places = scratch(WIDTH, types.int64)
+new_block, new_spans = scratch(layout.OUTLINE_FIELDS * WIDTH, types.float32), scratch(2 * WIDTH, types.float64)
+new_slots = scratch(WIDTH, types.int64)
 
 
-def tile_lists(table, depths, slots, width, height, team):
+def tile_lists(table: np.ndarray, depths: np.ndarray, slots: np.ndarray, width: int, height: int, team: Team) -> Lists:
     """Each tile's splats and their slots, not yet sorted by depth."""
-    columns, rows = binning.tile_grid(width, height)
+    tiles_x, tiles_y = binning.tile_grid(width, height)
     pairs = int(slots[-1])
     runs = 1 if team.threads == 1 else RUNS_PER_THREAD * team.threads
-    tiles, splats, counts = np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty((runs, columns * rows), np.int64)
-    team.share(cover, runs, table, slots, width, height, tiles, splats, counts)
-    starts = np.append(begin(counts), pairs)
+    tiles, splats, counts = np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty((runs, tiles_x * tiles_y), np.int64)
+    team.share(write_slots, runs, table, slots, width, height, tiles, splats, counts)
+    starts = np.append(offsets(counts), pairs)
     entries = np.empty(pairs, np.int64)
-    team.share(fill, runs, depths.view(np.int32), slots, tiles, counts, entries)
+    team.share(fill_entries, runs, depths.view(np.int32), slots, tiles, counts, entries)
     return Lists(starts, np.empty(pairs, np.int32), entries, splats)
 
 
 @inner
-def cut(slots, run, runs):
-    """Where a run of splats begins and ends."""
+def run_bounds(slots, run, runs):
+    """The first splat of a run, and the first of the next."""
     count = len(slots) - 1
     return count * run // runs, count * (run + 1) // runs
 
 
 @kernel
-def cover(start, stop, table, slots, width, height, tiles, splats, counts):
-    """Write the tile and the splat of every slot in the runs start..stop, and count how often each tile occurs in each run."""
-    rows, block, spans, at = pointer(table), new_block(), new_spans(), new_places()
+def write_slots(start, stop, table, slots, width, height, tiles, splats, counts):
+    """Write the tile and the splat of every slot in the runs start..stop, and count the slots per run and tile."""
+    fields, block, spans, next_slots = pointer(table), new_block(), new_spans(), new_slots()
     for run in range(start, stop):
         counts[run] = 0
-        tally = pointer(counts[run])
-        first, last = cut(slots, run, len(counts))
-        for begin in range(first, last, WIDTH):
+        run_counts = pointer(counts[run])
+        first, last = run_bounds(slots, run, len(counts))
+        for block_start in range(first, last, WIDTH):
             drawn = 0
-            for lane in range(min(WIDTH, last - begin)):
-                i = begin + lane
-                at[lane] = slots[i]
+            for lane in range(min(WIDTH, last - block_start)):
+                i = block_start + lane
+                next_slots[lane] = slots[i]
                 if slots[i] < slots[i + 1]:
                     drawn |= 1 << lane
-                    for k in range(col.OUTLINE):
-                        block[k * WIDTH + lane] = rows[i * col.COLUMNS + k]
+                    for k in range(layout.OUTLINE_FIELDS):
+                        block[k * WIDTH + lane] = fields[i * layout.SPLAT_FIELDS + k]
                 for slot in range(slots[i], slots[i + 1]):
                     splats[slot] = i
             if drawn != 0:
-                binning.cover(block, spans, drawn, at, width, height, pointer(tiles), tally)
+                binning.write_tiles(block, spans, drawn, next_slots, width, height, pointer(tiles), run_counts)
 
 
 @kernel
-def begin(counts):
-    """Turn the counts into the places where each run begins to write each tile; where the tiles begin."""
+def offsets(counts):
+    """Replace the counts [runs, tiles] by the offsets at which each run writes each tile, and return where each tile's list starts."""
     at, starts = 0, np.empty(counts.shape[1], np.int64)
     for tile in range(len(starts)):
         starts[tile] = at
@@ -90,31 +90,31 @@ def begin(counts):
 
 
 @kernel
-def fill(start, stop, depths, slots, tiles, begins, entries):
+def fill_entries(start, stop, depths, slots, tiles, run_offsets, entries):
     """Write the entries of the runs start..stop into the lists of their tiles."""
     for run in range(start, stop):
-        first, last = cut(slots, run, len(begins))
+        first, last = run_bounds(slots, run, len(run_offsets))
         for i in range(first, last):
             for slot in range(slots[i], slots[i + 1]):
-                at = begins[run, tiles[slot]]
+                at = run_offsets[run, tiles[slot]]
                 entries[at] = np.int64(depths[i]) << SLOT_BITS | slot
-                begins[run, tiles[slot]] = at + 1
+                run_offsets[run, tiles[slot]] = at + 1
 
 
 @kernel
 def sort(start, stop, lists):
-    """Sort the lists of the tiles start..stop front to back, and leave of each entry its slot and its splat.
+    """Sort the lists of the tiles start..stop front to back, and replace each entry by its slot and its splat.
 
-    Of equal depths, the splat with the lower index is in front.
+    Of splats at equal depth, the one with the lower index is in front.
     """
     starts, members, entries, splats = lists
     longest = 0
     for tile in range(start, stop):
         longest = max(longest, starts[tile + 1] - starts[tile])
-    spare, counts = np.empty(longest, np.int64), np.empty(1 << DIGIT, np.int64)
+    spare, counts = np.empty(longest, np.int64), np.empty(1 << DIGIT_BITS, np.int64)
     for tile in range(start, stop):
         first, last = starts[tile], starts[tile + 1]
-        if last - first > SHORT:
+        if last - first > MAX_INSERTION:
             sort_long(entries[first:last], spare[: last - first], counts)
         else:
             sort_short(entries, first, last)
@@ -125,6 +125,7 @@ def sort(start, stop, lists):
 
 @inner
 def sort_short(entries, first, last):
+    """Insertion sort."""
     for n in range(first + 1, last):
         entry, at = entries[n], n
         while at > first and entries[at - 1] > entry:
@@ -135,22 +136,22 @@ def sort_short(entries, first, last):
 
 @inner
 def sort_long(entries, spare, counts):
-    """A radix sort by depth, which leaves equal depths in order."""
-    here, there = entries, spare
-    for shift in range(SLOT_BITS, 2 * SLOT_BITS, DIGIT):
+    """Radix sort by depth; stable."""
+    source, target = entries, spare
+    for shift in range(SLOT_BITS, 2 * SLOT_BITS, DIGIT_BITS):
         counts[:] = 0
-        for entry in here:
-            counts[(entry >> shift) & ((1 << DIGIT) - 1)] += 1
-        if counts[(here[0] >> shift) & ((1 << DIGIT) - 1)] == len(here):
-            continue  # all alike
+        for entry in source:
+            counts[(entry >> shift) & ((1 << DIGIT_BITS) - 1)] += 1
+        if counts[(source[0] >> shift) & ((1 << DIGIT_BITS) - 1)] == len(source):
+            continue  # all entries have the same digit
         at = 0
-        for digit in range(1 << DIGIT):
+        for digit in range(1 << DIGIT_BITS):
             count = counts[digit]
             counts[digit] = at
             at += count
-        for entry in here:
-            digit = (entry >> shift) & ((1 << DIGIT) - 1)
-            there[counts[digit]] = entry
+        for entry in source:
+            digit = (entry >> shift) & ((1 << DIGIT_BITS) - 1)
+            target[counts[digit]] = entry
             counts[digit] += 1
-        here, there = there, here
-    entries[:] = here
+        source, target = target, source
+    entries[:] = source

@@ -1,4 +1,4 @@
-"""Threads for kernels, without torch's own in their way."""
+"""Threads for kernels, after dismissing torch's own idle ones."""
 
 from __future__ import annotations
 
@@ -9,39 +9,40 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from mipmap_plugin import threads
 
-# Crowded tiles take longer than others. So a thread's part is cut finer and finer, each time by this share of what is left, for others
-# take from its end; but not finer than this share of all, or handing it out would take time.
-CUT, LEAST_CUT = 1 / 2, 1 / 128
+# Crowded tiles take longer than others, so idle threads take chunks from the end of other threads' queues. Each chunk is CHUNK_SHARE of
+# what is left of a queue, but at least MIN_CHUNK_SHARE of all work, because taking a chunk costs time.
+CHUNK_SHARE, MIN_CHUNK_SHARE = 1 / 2, 1 / 128
 
-# Splats and pixels for which a second thread is worth waking: all that is done with them takes some 3 ms.
-LEAST_WORK = 1 << 14
+# Splats plus pixels from which on a second thread pays off: this many take some 3 ms.
+MIN_WORK = 1 << 14
 
 
 @dataclass(frozen=True)
 class Team:
-    """Threads that share work: the caller's, and those of a pool."""
+    """Threads that share work: the caller's and those of a pool."""
 
     threads: int
 
-    def share(self, kernel: Callable[..., None], count: int, *arguments) -> None:
-        """Run `kernel(start, stop, *arguments)` over 0..count."""
+    def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
+        """Call `kernel(start, stop, *arguments)` on ranges that cover 0..count, in all threads."""
         if self.threads == 1:
             kernel(0, count, *arguments)
             return
         ends = [count * thread // self.threads for thread in range(self.threads + 1)]
-        parts = [deque(cut(first, last, max(1, int(count * LEAST_CUT)))) for first, last in pairwise(ends)]
+        queues = [deque(chunks(first, last, max(1, int(count * MIN_CHUNK_SHARE)))) for first, last in pairwise(ends)]
 
         def work(thread: int) -> None:
-            # Always the same part first, which is still in this processor's cache; of the others' what they come to last.
-            for part in parts[thread:] + parts[:thread]:
-                while part:
+            # First the thread's own queue, whose data is still in its cache; then the ends of the other queues.
+            for queue in queues[thread:] + queues[:thread]:
+                while queue:
                     try:
-                        start, stop = part.popleft() if part is parts[thread] else part.pop()
+                        start, stop = queue.popleft() if queue is queues[thread] else queue.pop()
                     except IndexError:  # another thread was quicker
                         break
                     kernel(start, stop, *arguments)
@@ -49,35 +50,35 @@ class Team:
         threads.team(work, self.threads)
 
 
-def cut(first: int, last: int, least: int) -> Iterator[tuple[int, int]]:
-    """Ranges of first..last, ever smaller ones."""
+def chunks(first: int, last: int, min_chunk: int) -> Iterator[tuple[int, int]]:
+    """Ranges that cover first..last, each smaller than the one before."""
     while first < last:
-        stop = min(last, first + max(least, int((last - first) * CUT)))
+        stop = min(last, first + max(min_chunk, int((last - first) * CHUNK_SHARE)))
         yield first, stop
         first = stop
 
 
 def team(work: int) -> Team:
-    """As many threads as there are for kernels, if there is enough work, in splats and pixels."""
-    most = threads.count() if work >= LEAST_WORK else 1
+    """As many threads as there are for kernels if `work`, splats plus pixels, is large enough; else one."""
+    most = threads.count() if work >= MIN_WORK else 1
     if most > 1 and torch.get_num_threads() > 1:
         _dismiss_idle_threads()
     return Team(most)
 
 
 def _dismiss_idle_threads() -> None:
-    """Let torch's threads go; it starts new ones at its next operation.
+    """End torch's idle threads; torch starts new ones at its next operation.
 
-    GNU OpenMP keeps idle threads spinning for up to 15 ms, as long as a small image takes, on the very cores that kernels want.
+    GNU OpenMP keeps idle threads spinning for up to 15 ms, as long as a small image takes, on the cores that kernels need.
     """
     openmp = _openmp()
     if openmp is not None:
-        openmp.omp_pause_resource_all(1)  # 1: omp_pause_soft, which forgets no setting
+        openmp.omp_pause_resource_all(1)  # 1: omp_pause_soft, which keeps all settings
 
 
 @cache
 def _openmp() -> ctypes.CDLL | None:
-    """The GNU OpenMP that torch brought; None where it brought none, or one that cannot dismiss threads (before torch 2.2)."""
+    """The GNU OpenMP library that torch ships; None if there is none, or it cannot dismiss threads (before torch 2.2)."""
     libraries = sorted((Path(torch.__file__).parent / "lib").glob("libgomp*.so*"))
     openmp = ctypes.CDLL(str(libraries[0])) if libraries else None
     return openmp if hasattr(openmp, "omp_pause_resource_all") else None

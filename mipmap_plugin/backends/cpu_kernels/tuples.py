@@ -1,4 +1,7 @@
-"""Vectors of three, and matrices as three rows, in tuples: numba keeps them in registers."""
+"""Vectors of three, and matrices of three rows, as tuples, which numba keeps in registers."""
+
+# numba redefines calls and operators.
+# mypy: ignore-errors
 
 from mipmap_plugin.backends.cpu_kernels import inner
 
@@ -29,7 +32,7 @@ def times(s, a):
 
 
 @inner
-def blend(s, a, t, b):
+def weighted_sum(s, a, t, b):
     """s·a + t·b"""
     return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
 
@@ -43,4 +46,4 @@ def apply(matrix, v):
 @inner
 def apply_transposed(matrix, v):
     """matrixᵀ · v"""
-    return plus(blend(v[0], matrix[0], v[1], matrix[1]), times(v[2], matrix[2]))
+    return plus(weighted_sum(v[0], matrix[0], v[1], matrix[1]), times(v[2], matrix[2]))

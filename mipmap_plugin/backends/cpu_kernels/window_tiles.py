@@ -1,187 +1,198 @@
-"""Front-to-back "over" through windows, forward and backward: as `compositing`, but what a splat shows depends on those in front.
+"""Front-to-back compositing through windows, and its gradients: as `compositing`, but alpha depends on the splats in front.
 
-Windows cannot be undone like transmittance. The backward pass walks forward first and keeps every window that a splat was seen through.
+Unlike transmittance, windows cannot be recomputed back to front. So the backward pass first repeats the forward pass and stores the
+windows before each visit.
 """
 
-# numba gives calls and operators a meaning of its own.
+# numba redefines calls and operators.
 # mypy: ignore-errors
 
 import numpy as np
 from numba import types
 
-from mipmap_plugin.backends.cpu_kernels import columns as col
-from mipmap_plugin.backends.cpu_kernels import inner, kernel, windows
-from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, TILE_COLUMNS, TILE_ROWS
-from mipmap_plugin.backends.cpu_kernels.compositing import AHEAD, PATIENCE, bounds, close_tile, fill, finished, open_tile, reopen_tile, trace
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, lowest, ramp, select, spread, total
+from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout, windows
+from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, TILE_HEIGHT, TILE_WIDTH
+from mipmap_plugin.backends.cpu_kernels.compositing import (
+    CHECK_EVERY,
+    PREFETCH_AHEAD,
+    fill_range,
+    finished,
+    init_tile,
+    outline_rows,
+    tile_box,
+    write_tile,
+)
+from mipmap_plugin.backends.cpu_kernels.compositing_back import init_tile_back
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, fma, lowest_bit, ramp, select, total
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, prefetch, row_of, scratch, store
-from mipmap_plugin.backends.cpu_kernels.planes import BEGIN, END, ENDS, LIGHT, PLANE, STATE, STRIDE, cover, uncover
+from mipmap_plugin.backends.cpu_kernels.planes import PLANE, ROW_BEGIN, ROW_END, STATE_SIZE, STOPS, STRIDE, TRANSMITTANCE, blend, unblend
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
-USUAL = (MAX_ALPHA, MIN_TRANSMITTANCE, 0.0)
+USUAL_LIMITS = (MAX_ALPHA, MIN_TRANSMITTANCE, 0.0)
 
-# Where the planes of windows begin in a tile's state: x, y, width, height; in the backward pass their gradients.
-WINDOWS = STATE
-ROOM = STATE + 4 * PLANE
-new_room = scratch(ROOM, types.float32)
+# The offset of four more planes in a tile's state: the windows' x, y, width and height; in the backward pass their gradients.
+WINDOWS = STATE_SIZE
+WINDOW_STATE_SIZE = STATE_SIZE + 4 * PLANE
+new_window_state = scratch(WINDOW_STATE_SIZE, types.float32)
 
-# Of one visit to 16 pixels the windows are kept: so many numbers. A splat makes at most MOST visits in a tile.
-KEPT = 4 * WIDTH
-MOST = TILE_ROWS * (TILE_COLUMNS // WIDTH + 1)
+# A visit blends one splat into 16 pixels. The backward pass stores VISIT_SIZE numbers per visit, the windows before it. A splat makes at
+# most MAX_VISITS visits in a tile.
+VISIT_SIZE = 4 * WIDTH
+MAX_VISITS = TILE_HEIGHT * (TILE_WIDTH // WIDTH + 1)
 
 
 @kernel
-def composite(start, stop, table, lists, frame, shown):
-    """Render the tiles start..stop: fill the frame, and the image [H, W, 3] and alpha [H, W] that are shown."""
+def composite(start, stop, table, lists, frame, outputs):
+    """Render the tiles start..stop into `frame`, and into the outputs: image [H, W, 3] and alpha [H, W]."""
     sort(start, stop, lists)
     starts, members, _, _ = lists
-    _, through, _ = frame
-    height, width = through.shape
-    state, nowhere = new_room(), (pointer(table), pointer(starts), False)
+    _, transmittance, _ = frame
+    height, width = transmittance.shape
+    state, no_record = new_window_state(), (pointer(table), pointer(starts), False)
     for tile in range(start, stop):
-        box = bounds(tile, width, height)
+        box = tile_box(tile, width, height)
         length = starts[tile + 1] - starts[tile]
-        open_windows(box, length, state)
+        init_windows(box, length, state)
         for n in range(length):
-            if n % PATIENCE == 0 and finished(state):
+            if n % CHECK_EVERY == 0 and finished(state):
                 break
             at = starts[tile] + n
-            prefetch(table, members[min(at + AHEAD, starts[stop] - 1)])
+            prefetch(table, members[min(at + PREFETCH_AHEAD, starts[stop] - 1)])
             splat = row_of(table, members[at])
-            lay(splat, n, box, state, nowhere, 0)
-        close_tile(box, state, frame, shown)
+            draw_splat(splat, n, box, state, no_record, 0)
+        write_tile(box, state, frame, outputs)
 
 
 @inner
-def open_windows(box, length, state):
-    """Begin with an empty tile: each window is its pixel."""
-    open_tile(box, length, state)
-    fill(state, WINDOWS, WINDOWS + 2 * PLANE, 0)
-    fill(state, WINDOWS + 2 * PLANE, ROOM, 1)
+def init_windows(box, length, state):
+    """Clear the state. Each window is at first its pixel."""
+    init_tile(box, length, state)
+    fill_range(state, WINDOWS, WINDOWS + 2 * PLANE, 0)
+    fill_range(state, WINDOWS + 2 * PLANE, WINDOW_STATE_SIZE, 1)
 
 
 @inner
-def load_windows(state, at, apart):
-    return load(state, at), load(state, at + apart), load(state, at + 2 * apart), load(state, at + 3 * apart)
+def load_windows(state, at, stride):
+    return load(state, at), load(state, at + stride), load(state, at + 2 * stride), load(state, at + 3 * stride)
 
 
 @inner
-def store_windows(state, at, apart, window):
+def store_windows(state, at, stride, window):
     store(state, at, window[0])
-    store(state, at + apart, window[1])
-    store(state, at + 2 * apart, window[2])
-    store(state, at + 3 * apart, window[3])
+    store(state, at + stride, window[1])
+    store(state, at + 2 * stride, window[2])
+    store(state, at + 3 * stride, window[3])
 
 
 @inner
-def choose(mask, yes, no):
-    """`select`, of windows."""
+def select_windows(mask, yes, no):
+    """`select`, for windows."""
     return select(mask, yes[0], no[0]), select(mask, yes[1], no[1]), select(mask, yes[2], no[2]), select(mask, yes[3], no[3])
 
 
 @inner
-def look(shape, room, dx, dy, unfinished, color, n, at, state, memory, visits):
-    """Lay a splat over the 16 pixels at `at`, as their windows show it. 1 if it is seen at all, else 0."""
+def draw_pixels(shape, margin, dx, dy, open_pixels, color, n, at, state, record, visits):
+    """Blend a splat into the 16 pixels at `at`, seen through their windows. Returns the number of visits, 0 or 1."""
     window = load_windows(state, WINDOWS + at, PLANE)
-    if bits(both(unfinished, windows.reached(shape, room, dx, dy, window))) == 0:
+    if bits(both(open_pixels, windows.may_reach(shape, margin, dx, dy, window))) == 0:
         return 0
-    alpha, seen = windows.look(shape, dx, dy, window)
-    bright = both(alpha >= MIN_ALPHA, unfinished)
+    alpha, integral = windows.integrate(shape, dx, dy, window)
+    bright = both(alpha >= MIN_ALPHA, open_pixels)
     if bits(bright) == 0:
         return 0
-    kept, places, keep = memory
-    if keep:
-        store_windows(kept, visits * KEPT, WIDTH, window)
-        places[visits] = at
-    cover(alpha, bright, USUAL, color, n, at, state)
-    after = windows.kept(windows.behind(shape, window, alpha, seen)[0])
-    store_windows(state, WINDOWS + at, PLANE, choose(bright, after, window))
+    stored, positions, keeps = record
+    if keeps:
+        store_windows(stored, visits * VISIT_SIZE, WIDTH, window)
+        positions[visits] = at
+    blend(alpha, bright, USUAL_LIMITS, color, n, at, state)
+    after = windows.clamp_window(windows.windows_behind(shape, window, alpha, integral)[0])
+    store_windows(state, WINDOWS + at, PLANE, select_windows(bright, after, window))
     return 1
 
 
 @inner
-def lay(splat, n, box, state, memory, visits):
-    """Lay a splat, the n-th of its tile, behind what is there, and count its visits.
+def draw_splat(splat, n, box, state, record, visits):
+    """Blend a splat, the n-th of its tile, behind those already blended; returns the number of visits so far.
 
-    memory: where the windows that it was seen through are kept, where the places, and whether they are.
+    record: where the windows before each visit are stored, where its position, and whether to store them.
     """
-    color, shape = (splat[col.RED], splat[col.GREEN], splat[col.BLUE]), windows.shape_of(splat)
-    room, rows = splat[col.PEAK] - LOG_MIN_ALPHA, trace(splat, box, state)
+    color, shape = (splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]), windows.splat_parameters(splat)
+    margin, rows = splat[layout.PEAK] - LOG_MIN_ALPHA, outline_rows(splat, box, state)
     while rows != 0:
-        r = lowest(rows)
+        r = lowest_bit(rows)
         rows &= rows - 1
-        column, end = state[BEGIN + r], state[END + r]
-        at = r * STRIDE + int(column)
-        center, dy = splat[col.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[col.Y]
-        while column <= end:
-            unfinished = both(load(state, LIGHT + at) >= 0, end >= ramp(column))
-            if bits(unfinished) != 0:
-                visits += look(shape, room, ramp(column - center), dy, unfinished, color, n, at, state, memory, visits)
-            column += WIDTH
+        x, end = state[ROW_BEGIN + r], state[ROW_END + r]
+        at = r * STRIDE + int(x)
+        center, dy = splat[layout.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[layout.Y]
+        while x <= end:
+            open_pixels = both(load(state, TRANSMITTANCE + at) >= 0, end >= ramp(x))
+            if bits(open_pixels) != 0:
+                visits += draw_pixels(shape, margin, ramp(x - center), dy, open_pixels, color, n, at, state, record, visits)
+            x += WIDTH
             at += WIDTH
     return visits
 
 
 @kernel
-def composite_back(start, stop, table, lists, frame, d_frame, pulls):
-    """Walk the lists of the tiles start..stop back to front and write each splat's pull in each tile into its slot.
+def composite_back(start, stop, table, lists, frame, d_outputs, tile_grads):
+    """Walk the lists of the tiles start..stop back to front and write each splat's gradients in each tile to its slot.
 
-    d_frame: the gradients of the image [H, W, 3] and of its alpha [H, W].
+    d_outputs: the gradients of the image [H, W, 3] and of its alpha [H, W].
     """
     starts, members, slots, _ = lists
-    background, through, stops = frame
-    d_image, d_alpha = d_frame
-    height, width = through.shape
-    state, kept, places = new_room(), np.empty(16 * MOST * KEPT, np.float32), np.empty(16 * MOST, np.int64)
+    background, transmittance, stops = frame
+    d_image, d_alpha = d_outputs
+    height, width = transmittance.shape
+    state, stored, positions = new_window_state(), np.empty(16 * MAX_VISITS * VISIT_SIZE, np.float32), np.empty(16 * MAX_VISITS, np.int64)
     for tile in range(start, stop):
-        box = bounds(tile, width, height)
+        box = tile_box(tile, width, height)
         length = starts[tile + 1] - starts[tile]
-        firsts, visits = np.zeros(length + 1, np.int64), 0
-        open_windows(box, length, state)
+        visit_offsets, visits = np.zeros(length + 1, np.int64), 0
+        init_windows(box, length, state)
         for n in range(length):
-            if n % PATIENCE == 0 and finished(state):
+            if n % CHECK_EVERY == 0 and finished(state):
                 break
-            if visits + MOST > len(places):
-                kept, places = np.append(kept, np.empty_like(kept)), np.append(places, np.empty_like(places))
-            memory = pointer(kept), pointer(places), True
-            visits = lay(row_of(table, members[starts[tile] + n]), n, box, state, memory, visits)
-            firsts[n + 1] = visits
+            if visits + MAX_VISITS > len(positions):
+                stored, positions = np.append(stored, np.empty_like(stored)), np.append(positions, np.empty_like(positions))
+            record = pointer(stored), pointer(positions), True
+            visits = draw_splat(row_of(table, members[starts[tile] + n]), n, box, state, record, visits)
+            visit_offsets[n + 1] = visits
 
-        used = reopen_tile(box, background, through, stops, d_image, d_alpha, state)
-        fill(state, WINDOWS, ROOM, 0)
+        used = init_tile_back(box, background, transmittance, stops, d_image, d_alpha, state)
+        fill_range(state, WINDOWS, WINDOW_STATE_SIZE, 0)
         for at in range(starts[tile] + used, starts[tile + 1]):
-            for k in range(col.PULLS):
-                pulls[slots[at], k] = 0
+            for k in range(layout.GRADS):
+                tile_grads[slots[at], k] = 0
         for n in range(used - 1, -1, -1):
             at = starts[tile] + n
-            prefetch(table, members[max(at - AHEAD, 0)])
-            splat, pull = row_of(table, members[at]), row_of(pulls, slots[at])
-            lift(splat, n, box, state, memory, (firsts[n], firsts[n + 1]), pull)
+            prefetch(table, members[max(at - PREFETCH_AHEAD, 0)])
+            splat, grads = row_of(table, members[at]), row_of(tile_grads, slots[at])
+            undraw_splat(splat, n, box, state, record, (visit_offsets[n], visit_offsets[n + 1]), grads)
 
 
 @inner
-def lift(splat, n, box, state, memory, visits, pull):
-    """Take a splat, the n-th of its tile, off again and write its pull."""
-    kept, places, _ = memory
-    color, shape = (splat[col.RED], splat[col.GREEN], splat[col.BLUE]), windows.shape_of(splat)
-    sum_1 = sum_u = sum_v = sum_long = sum_short = sum_turn = sum_red = sum_green = sum_blue = spread(0)
+def undraw_splat(splat, n, box, state, record, visits, grads):
+    """Remove a splat, the n-th of its tile, and write its gradients. visits: the first of its visits, and the first of the next splat's."""
+    stored, positions, _ = record
+    color, shape = (splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]), windows.splat_parameters(splat)
+    sum_1 = sum_u = sum_v = sum_log_long = sum_log_short = sum_angle = sum_red = sum_green = sum_blue = broadcast(0)
     for visit in range(visits[0], visits[1]):
-        at, window = places[visit], load_windows(kept, visit * KEPT, WIDTH)
+        at, window = positions[visit], load_windows(stored, visit * VISIT_SIZE, WIDTH)
         r = at // STRIDE
-        dx, dy = ramp(at - r * STRIDE - (splat[col.X] - box[0] - 0.5)), box[1] + r + 0.5 - splat[col.Y]
-        alpha, seen = windows.look(shape, dx, dy, window)
+        dx, dy = ramp(at - r * STRIDE - (splat[layout.X] - box[0] - 0.5)), box[1] + r + 0.5 - splat[layout.Y]
+        alpha, integral = windows.integrate(shape, dx, dy, window)
         bright = alpha >= MIN_ALPHA
-        shown = both(bright, n < load(state, ENDS + at))
-        s, _, weight, d_red, d_green, d_blue = uncover(alpha, bright, USUAL, color, n, at, state)
-        after, outcome = windows.behind(shape, window, alpha, seen)
+        visible = both(bright, n < load(state, STOPS + at))
+        s, _, weight, d_red, d_green, d_blue = unblend(alpha, bright, USUAL_LIMITS, color, n, at, state)
+        after, behind = windows.windows_behind(shape, window, alpha, integral)
         d_window = load_windows(state, WINDOWS + at, PLANE)
-        d_before, s, slopes = windows.pull_behind(shape, alpha, s, seen, outcome, windows.pull_kept(after, d_window))
-        store_windows(state, WINDOWS + at, PLANE, choose(shown, d_before, d_window))
-        sum_1, sum_u, sum_v = sum_1 + select(shown, s, 0), sum_u + select(shown, slopes[0], 0), sum_v + select(shown, slopes[1], 0)
-        sum_long, sum_short = sum_long + select(shown, slopes[2], 0), sum_short + select(shown, slopes[3], 0)
-        sum_turn = sum_turn + select(shown, slopes[4], 0)
+        d_before, s, slopes = windows.grad_windows_behind(shape, alpha, s, integral, behind, windows.grad_clamp_window(after, d_window))
+        store_windows(state, WINDOWS + at, PLANE, select_windows(visible, d_before, d_window))
+        sum_1, sum_u, sum_v = sum_1 + select(visible, s, 0), sum_u + select(visible, slopes[0], 0), sum_v + select(visible, slopes[1], 0)
+        sum_log_long, sum_log_short = sum_log_long + select(visible, slopes[2], 0), sum_log_short + select(visible, slopes[3], 0)
+        sum_angle = sum_angle + select(visible, slopes[4], 0)
         sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
-    pull[col.SUM], pull[col.BY_LONG], pull[col.BY_SHORT] = total(sum_1), total(sum_u) / shape[3], total(sum_v) / shape[4]
-    pull[col.GROW_LONG], pull[col.GROW_SHORT], pull[col.TURN] = total(sum_long), total(sum_short), total(sum_turn)
-    pull[col.PULL_RED], pull[col.PULL_GREEN], pull[col.PULL_BLUE] = total(sum_red), total(sum_green), total(sum_blue)
+    grads[layout.SUM], grads[layout.GRAD_U], grads[layout.GRAD_V] = total(sum_1), total(sum_u) / shape[3], total(sum_v) / shape[4]
+    grads[layout.GRAD_LOG_LONG], grads[layout.GRAD_LOG_SHORT], grads[layout.GRAD_ANGLE] = total(sum_log_long), total(sum_log_short), total(sum_angle)
+    grads[layout.GRAD_RED], grads[layout.GRAD_GREEN], grads[layout.GRAD_BLUE] = total(sum_red), total(sum_green), total(sum_blue)

@@ -1,0 +1,230 @@
+"""The backward pass of `projection`: gradients of splats in the world from those of their tiles, 16 splats at a time."""
+
+# numba redefines calls and operators.
+# mypy: ignore-errors
+
+import math
+
+import numpy as np
+from numba import types
+
+from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout
+from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, select, wide
+from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
+from mipmap_plugin.backends.cpu_kernels.projection import (
+    COVARIANCE,
+    MEAN,
+    OPACITY,
+    QUAT,
+    SCALE,
+    covariance_of,
+    load_splat,
+    narrowed,
+    new_bands,
+    new_world,
+    pointers,
+    quaternion,
+    view_direction,
+)
+from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER
+from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, plus, weighted_sum
+
+new_sums, new_rows = scratch(layout.GRADS * WIDTH, types.float64), scratch(WIDTH, types.int64)
+
+
+@kernel
+def project_back(start, stop, view, splats, table, slots, tile_grads, grads):
+    """Write the gradients of the splats start..stop; splat i's tiles have the rows slots[i]..slots[i + 1] of tile_grads."""
+    covariances, stride = len(splats.covariances) > 0, 3 * splats.sh.shape[1]
+    colors = pointer(splats.sh), pointer(grads.sh), pointer(table), stride, len(grads.sh) > 0
+    arrays, targets, tile_rows = pointers(splats), pointers(grads), pointer(tile_grads)
+    world, d_world, sums, bands, d_bands, rows, size = new_world(), new_world(), new_sums(), new_bands(), new_bands(), new_rows(), 0
+    for i in range(start, stop):
+        if slots[i] < slots[i + 1]:
+            sum_tiles(tile_rows, slots[i], slots[i + 1], size, sums)
+            load_splat(i, size, arrays, covariances, world)
+            rows[size] = i
+            size += 1
+        else:
+            clear(i, targets, covariances, colors)
+        if size == WIDTH or (i == stop - 1 and size > 0):
+            grad_splats(view, covariances, world, sums, d_world)
+            grad_colors(view, rows, size, world, sums, colors, bands, d_bands, d_world)
+            for lane in range(size):
+                store_grads(rows[lane], lane, d_world, targets, covariances)
+            size = 0
+
+
+@inner
+def clear(i, targets, has_covariances, colors):
+    """Write zero gradients for splat i."""
+    d_means, d_opacities, d_quats, d_scales, d_covariances = targets
+    _, d_sh, _, stride, wanted = colors
+    fill_zeros(d_means, 3 * i, 3)
+    fill_zeros(d_opacities, i, 1)
+    if wanted:
+        fill_zeros(d_sh, stride * i, stride)
+    if has_covariances:
+        fill_zeros(d_covariances, 9 * i, 9)
+    else:
+        fill_zeros(d_scales, 3 * i, 3)
+        fill_zeros(d_quats, 4 * i, 4)
+
+
+@inner
+def fill_zeros(target, first, count):
+    """Set target[first : first + count] to 0."""
+    for at in range(first, first + count):
+        target[at] = 0
+
+
+@inner
+def sum_tiles(tile_rows, first, last, lane, sums):
+    """Sum a splat's gradients over its tiles, always in the same order, whichever threads they came from."""
+    for k in range(layout.GRADS):
+        sums[k * WIDTH + lane] = tile_rows[first * layout.GRADS + k]
+    for slot in range(first + 1, last):
+        for k in range(layout.GRADS):
+            sums[k * WIDTH + lane] += tile_rows[slot * layout.GRADS + k]
+
+
+@inner
+def store_grads(i, lane, d_world, targets, has_covariances):
+    """Write a lane of the block `d_world` to the gradients of splat i."""
+    d_means, d_opacities, d_quats, d_scales, d_covariances = targets
+    for k in range(3):
+        d_means[3 * i + k] = d_world[(MEAN + k) * WIDTH + lane]
+    d_opacities[i] = d_world[OPACITY * WIDTH + lane]
+    if has_covariances:
+        for k in range(9):
+            d_covariances[9 * i + k] = d_world[(COVARIANCE + k) * WIDTH + lane]
+    else:
+        for k in range(4):
+            d_quats[4 * i + k] = d_world[(QUAT + k) * WIDTH + lane]
+        for k in range(3):
+            d_scales[3 * i + k] = d_world[(SCALE + k) * WIDTH + lane]
+
+
+@inner
+def grad_splats(view, has_covariances, world, sums, d_world):
+    """Write the gradients of means, shapes and opacities, without the means' gradient through the color."""
+    p = plus(apply(view.rotation, get_vector(world, MEAN)), view.translation)
+    jac, opacity = ellipses.jacobian(view, p), get(world, OPACITY)
+    if has_covariances:
+        covariance = covariance_of(world)
+        d_shape, d_opacity, d_x, d_y = grad_shape(view, ellipses.project_covariance(jac, covariance), opacity, sums)
+        d_jac, d_covariance = ellipses.grad_project_covariance(jac, covariance, d_shape)
+        for k in range(3):
+            put_vector(d_world, COVARIANCE + 3 * k, d_covariance[k])
+    else:
+        quat, scale = quaternion(world), get_vector(world, SCALE)
+        axes = ellipses.rotation(quat)
+        d_shape, d_opacity, d_x, d_y = grad_shape(view, ellipses.project_axes(jac, axes, scale), opacity, sums)
+        d_jac, d_axes, d_scale = ellipses.grad_project_axes(jac, axes, scale, d_shape)
+        put_vector(d_world, SCALE, d_scale)
+        d_quat = ellipses.grad_rotation(quat, d_axes)
+        put_vector(d_world, QUAT, (d_quat[0], d_quat[1], d_quat[2]))
+        put(d_world, QUAT + 3, d_quat[3])
+    put(d_world, OPACITY, d_opacity)
+    put_vector(d_world, MEAN, ellipses.grad_mean(view, p, jac, d_jac, d_x, d_y))
+
+
+@inner
+def grad_shape(view, shape, opacity, sums):
+    """The gradients of shapes before the screen filter, of opacities, and of positions on the image."""
+    dilated, compensation = ellipses.screen_filter(view, shape)
+    if view.sampling != AT_CENTER:
+        return grad_integral(view, shape, dilated, opacity, sums)
+    if view.culls:
+        return grad_culled(view, shape, dilated, compensation, opacity, sums)
+    d_dilated, d_x, d_y = grad_limited(view, dilated, sums)
+    d_log_alpha = get(sums, layout.SUM)
+    d_shape = ellipses.grad_screen_filter(view, shape, dilated, compensation, d_dilated, d_log_alpha / compensation)
+    return d_shape, d_log_alpha / opacity, d_x, d_y
+
+
+@inner
+def grad_culled(view, shape, dilated, compensation, opacity, sums):
+    """`grad_shape` where splats are culled or stretched."""
+    d_gate, drawn = get(sums, layout.SUM), culling.is_drawn(view, dilated, opacity)
+    d_log_alpha = select(drawn, d_gate, 0.0)
+    if view.least_spread > 0:
+        drawn_shape, changed = culling.stretched(view, dilated, drawn)
+        d_drawn_shape, d_x, d_y = grad_limited(view, drawn_shape, sums)
+        d_dilated = culling.grad_stretched(view, dilated, changed, d_drawn_shape)
+    else:
+        d_dilated, d_x, d_y = grad_limited(view, dilated, sums)
+    d_gated, d_opacity = culling.grad_gate(view, dilated, opacity, d_gate)
+    d_dilated = d_dilated[0] + d_gated[0], d_dilated[1] + d_gated[1], d_dilated[2] + d_gated[2], d_dilated[3] + d_gated[3]
+    d_shape = ellipses.grad_screen_filter(view, shape, dilated, compensation, d_dilated, d_log_alpha / compensation)
+    return d_shape, d_log_alpha / opacity + d_opacity, d_x, d_y
+
+
+@inner
+def grad_limited(view, shape, sums):
+    """The gradients of ellipses before `culling.limited`, and of their positions on the image."""
+    if view.max_variance == math.inf:
+        return grad_ellipse(shape, sums)
+    d_limited, d_x, d_y = grad_ellipse(culling.limited(view, shape), sums)
+    return culling.grad_limited(view, shape, d_limited), d_x, d_y
+
+
+@inner
+def grad_ellipse(shape, sums):
+    """The gradients of ellipses and of their positions on the image."""
+    _, xy, yy, det = shape
+    per_yy, per_det = 1 / yy, 1 / det
+    shear, per_across = xy * per_yy, yy * per_det
+
+    d_x = per_across * get(sums, layout.SUM_U)
+    d_y = per_yy * get(sums, layout.SUM_Y) - shear * d_x
+    d_shear = per_across * get(sums, layout.SUM_UY)
+    d_per_yy, d_per_across = -0.5 * get(sums, layout.SUM_YY), -0.5 * get(sums, layout.SUM_UU)
+
+    d_yy = d_per_across * per_det - per_yy * (d_per_yy * per_yy + d_shear * shear)
+    return (d_yy * 0, d_shear * per_yy, d_yy, -d_per_across * per_across * per_det), d_x, d_y
+
+
+@inner
+def grad_integral(view, shape, dilated, opacity, sums):
+    """`grad_shape` for splats that are integrated over pixels or windows."""
+    cos, sin, long, short = integrals.axes(dilated)
+    d_dilated = integrals.grad_axes(dilated, get(sums, layout.GRAD_LOG_LONG), get(sums, layout.GRAD_LOG_SHORT), get(sums, layout.GRAD_ANGLE))
+    d_shape = ellipses.grad_screen_filter(view, shape, dilated, opacity * 0 + 1, d_dilated, opacity * 0)
+    d_u, d_v = get(sums, layout.GRAD_U) / long, get(sums, layout.GRAD_V) / short
+    return d_shape, get(sums, layout.SUM) / opacity, sin * d_v - cos * d_u, -sin * d_u - cos * d_v
+
+
+@inner
+def grad_colors(view, rows, size, world, sums, colors, bands, d_bands, d_world):
+    """The gradients through the color: write those of the coefficients if wanted, and add to those of the means."""
+    direction, length = view_direction(view, get_vector(world, MEAN))
+    harmonics.basis(narrowed(direction), view.sh_degree, bands)
+    for lane in range(size):
+        grad_color(rows[lane], lane, view, colors, sums, bands, d_bands)
+    if view.sh_degree > 0:
+        d_x, d_y, d_z = harmonics.grad_direction(narrowed(direction), view.sh_degree, d_bands)
+        d_direction = wide(d_x), wide(d_y), wide(d_z)
+        per_length = select(length > 0, 1 / length, 0.0)
+        d_mean = weighted_sum(per_length, d_direction, -dot(d_direction, direction) * per_length, direction)
+        put_vector(d_world, MEAN, plus(get_vector(d_world, MEAN), d_mean))
+
+
+@inner
+def grad_color(i, lane, view, colors, sums, bands, d_bands):
+    """The gradients of splat i's coefficients and, in its lane, of its spherical harmonics."""
+    sh, d_sh, table, stride, wanted = colors
+    at, row, zero, largest = i * stride, i * layout.SPLAT_FIELDS, np.float32(0), np.float32(view.max_color)
+    # A channel that was clamped to black or to the largest color has no gradient.
+    d_red = np.float32(sums[layout.GRAD_RED * WIDTH + lane]) if 0 < table[row + layout.RED] < largest else zero
+    d_green = np.float32(sums[layout.GRAD_GREEN * WIDTH + lane]) if 0 < table[row + layout.GREEN] < largest else zero
+    d_blue = np.float32(sums[layout.GRAD_BLUE * WIDTH + lane]) if 0 < table[row + layout.BLUE] < largest else zero
+    used = (view.sh_degree + 1) ** 2
+    for j in range(used):
+        d_bands[j * WIDTH + lane] = d_red * sh[at + 3 * j] + d_green * sh[at + 3 * j + 1] + d_blue * sh[at + 3 * j + 2]
+    if wanted:
+        for j in range(used):
+            band = bands[j * WIDTH + lane]
+            d_sh[at + 3 * j], d_sh[at + 3 * j + 1], d_sh[at + 3 * j + 2] = d_red * band, d_green * band, d_blue * band
+        fill_zeros(d_sh, at + 3 * used, stride - 3 * used)
