@@ -69,7 +69,7 @@ def outline_rows(splat, box, state):
 def composite(start, stop, integrated, limits, table, lists, frame, outputs):
     """Render the tiles start..stop into `frame`, and into the outputs: image [H, W, 3] and alpha [H, W].
 
-    integrated: whether splats are integrated over pixels.
+    integrated: True where splats are integrated over pixels, else None.
     """
     sort(start, stop, lists)
     starts, members, _, _ = lists
@@ -86,7 +86,7 @@ def composite(start, stop, integrated, limits, table, lists, frame, outputs):
             at = starts[tile] + n
             prefetch(table, members[min(at + PREFETCH_AHEAD, starts[stop] - 1)])
             splat = row_of(table, members[at])
-            if integrated:
+            if integrated is not None:
                 draw_integral(splat, limits, n, box, state)
             elif splat[layout.GATE] > 0:
                 draw_splat(splat, limits, n, box, state)

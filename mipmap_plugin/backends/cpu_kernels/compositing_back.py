@@ -27,7 +27,7 @@ from mipmap_plugin.effects import MIN_ALPHA
 
 
 @kernel
-def composite_back(start, stop, integrated, limits, table, lists, frame, d_outputs, tile_grads):
+def composite_back(start, stop, integrated, reshaped, faded, limits, table, lists, frame, d_outputs, tile_grads):
     """Walk the lists of the tiles start..stop back to front and write each splat's gradients in each tile to its slot.
 
     d_outputs: the gradients of the image [H, W, 3] and of its alpha [H, W].
@@ -47,14 +47,21 @@ def composite_back(start, stop, integrated, limits, table, lists, frame, d_outpu
             at = starts[tile] + n
             prefetch(table, members[max(at - PREFETCH_AHEAD, 0)])
             splat, grads = row_of(table, members[at]), row_of(tile_grads, slots[at])
-            if integrated:
+            if integrated is not None:
                 undraw_integral(splat, limits, n, box, state, grads)
-            elif splat[layout.GATE] == 0:
-                undraw_culled(splat, n, box, state, grads)
-            elif splat[layout.OFFSET] > 0:
-                undraw_splat(splat, limits, True, n, box, state, grads)
             else:
-                undraw_splat(splat, limits, False, n, box, state, grads)
+                undraw_at_center(splat, limits, reshaped, faded, n, box, state, grads)
+
+
+@inner
+def undraw_at_center(splat, limits, reshaped, faded, n, box, state, grads):
+    """Remove a splat that is sampled at pixel centers, as it is drawn. reshaped, faded: as of `records.Flags`."""
+    if reshaped is not None and splat[layout.GATE] == 0:
+        undraw_culled(splat, n, box, state, grads)
+    elif faded is not None and splat[layout.OFFSET] > 0:
+        undraw_splat(splat, limits, True, n, box, state, grads)
+    else:
+        undraw_splat(splat, limits, False, n, box, state, grads)
 
 
 @inner

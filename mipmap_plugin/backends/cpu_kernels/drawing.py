@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import compositing, compositing_back, layout, projection, projection_back, rounding, sorting, window_tiles
-from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL, OVER_WINDOW, Frame, Limits, Lists, SplatArrays, View
+from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL, OVER_WINDOW, Flags, Frame, Limits, Lists, SplatArrays, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -47,13 +47,14 @@ def draw(
     outputs = _empty(height, width, 3), _empty(height, width)
     frame = Frame(np.array(effects.background, np.float32), _empty(height, width), _empty(height, width))
     threads = team(count + width * height)
-    threads.share(projection.project, count, view, splats, table, depths, counts)
+    flags = flags_of(view, splats)
+    threads.share(projection.project, count, flags, view, splats, table, depths, counts)
     np.cumsum(counts, out=slots[1:])
     lists = sorting.tile_lists(table, depths if ranks is None else ranks, slots, width, height, threads)
     if view.sampling == OVER_WINDOW:
         threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, outputs)
     else:
-        threads.share(compositing.composite, len(lists.starts) - 1, view.sampling == OVER_PIXEL, limits, table, lists, frame, outputs)
+        threads.share(compositing.composite, len(lists.starts) - 1, flags.integrated, limits, table, lists, frame, outputs)
         if limits.picture_step > 0:
             threads.share(rounding.composite, len(lists.starts) - 1, limits, table, lists, frame, outputs)
     return *outputs, Drawing(view, splats, table, slots, lists, frame, limits)
@@ -68,15 +69,26 @@ def draw_back(drawing: Drawing, d_image: np.ndarray, d_alpha: np.ndarray, *, har
     tile_grads, grads = _empty(len(lists.members), layout.GRADS), SplatArrays(*(_empty(*array.shape) for array in splats))
     if not harmonics:
         grads = grads._replace(sh=grads.sh[:0])
-    threads = team(len(splats.means) + view.width * view.height)
+    threads, flags = team(len(splats.means) + view.width * view.height), flags_of(view, splats)
     if view.sampling == OVER_WINDOW:
         threads.share(window_tiles.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), tile_grads)
     else:
-        integrated = view.sampling == OVER_PIXEL
-        arguments = integrated, limits, table, lists, frame, (d_image, d_alpha), tile_grads
+        arguments = flags.integrated, flags.reshaped, flags.faded, limits, table, lists, frame, (d_image, d_alpha), tile_grads
         threads.share(compositing_back.composite_back, len(lists.starts) - 1, *arguments)
-    threads.share(projection_back.project_back, len(splats.means), view, splats, table, slots, tile_grads, grads)
+    threads.share(projection_back.project_back, len(splats.means), flags, view, splats, table, slots, tile_grads, grads)
     return grads
+
+
+def flags_of(view: View, splats: SplatArrays) -> Flags:
+    """What kernels are compiled with."""
+    on = dict(
+        covariances=len(splats.covariances) > 0,
+        integrated=view.sampling != AT_CENTER,
+        reshaped=view.culls or view.max_variance < math.inf,
+        faded=view.w_end > 0,
+        fourth=view.sh_degree > 3,
+    )
+    return Flags(**{name: True if is_on else None for name, is_on in on.items()})
 
 
 def view_of(camera: Camera, effects: Effects, splats: SplatArrays, gradients: bool) -> View:

@@ -12,8 +12,8 @@ MAX_BANDS = 25
 
 
 @inner
-def basis(direction, degree, bands):
-    """Write the (degree + 1)² basis functions at unit vectors, 16 float32 per band."""
+def basis(direction, degree, fourth, bands):
+    """Write the (degree + 1)² basis functions at unit vectors, 16 float32 per band. fourth: as of `records.Flags`."""
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
     put(bands, 0, broadcast(C0))
@@ -35,7 +35,7 @@ def basis(direction, degree, bands):
         put(bands, 13, C3[4] * x * (4 * zz - xx - yy))
         put(bands, 14, C3[5] * z * (xx - yy))
         put(bands, 15, C3[6] * x * (xx - 3 * yy))
-    if degree > 3:
+    if fourth is not None:
         put(bands, 16, C4[0] * x * y * (xx - yy))
         put(bands, 17, C4[1] * y * z * (3 * xx - yy))
         put(bands, 18, C4[2] * x * y * (7 * zz - 1))
@@ -48,7 +48,7 @@ def basis(direction, degree, bands):
 
 
 @inner
-def grad_direction(direction, degree, w):
+def grad_direction(direction, degree, fourth, w):
     """The gradient of Σ w_j · basis_j with respect to the directions, before these are normalized."""
     x, y, z = direction
     xx, yy, zz = x * x, y * y, z * z
@@ -68,7 +68,7 @@ def grad_direction(direction, degree, w):
         gy = gy + 3 * v9 * (xx - yy) + v10 * x * z + v11 * (4 * zz - xx - 3 * yy) - 6 * v12 * y * z
         gy = gy - (2 * v13 * x * y + 2 * v14 * y * z + 6 * v15 * x * y)
         gz = gz + v10 * x * y + 8 * v11 * y * z + v12 * (6 * zz - 3 * xx - 3 * yy) + 8 * v13 * x * z + v14 * (xx - yy)
-    if degree > 3:
+    if fourth is not None:
         v16, v17, v18, v19, v20 = C4[0] * get(w, 16), C4[1] * get(w, 17), C4[2] * get(w, 18), C4[3] * get(w, 19), C4[4] * get(w, 20)
         v21, v22, v23, v24 = C4[5] * get(w, 21), C4[6] * get(w, 22), C4[7] * get(w, 23), C4[8] * get(w, 24)
         gx = gx + v16 * y * (3 * xx - yy) + 6 * v17 * x * y * z + v18 * y * (7 * zz - 1) + v21 * z * (7 * zz - 3)

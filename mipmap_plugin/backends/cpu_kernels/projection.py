@@ -14,7 +14,7 @@ from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, lowest_bit, maximum, narrow, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.powers import log2
-from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL
+from mipmap_plugin.backends.cpu_kernels.records import OVER_PIXEL
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, minus, plus, times
 from mipmap_plugin.effects import MIN_ALPHA
 
@@ -36,9 +36,10 @@ new_block, new_bands = scratch(layout.SPLAT_FIELDS * WIDTH, types.float32), scra
 
 
 @kernel
-def project(start, stop, view, splats, table, depths, counts):
-    """Fill the rows start..stop of the table, of the depths and of the numbers of tiles touched; 0 tiles: not drawn."""
-    covariances, sh = len(splats.covariances) > 0, pointer(splats.sh)
+def project(start, stop, flags, view, splats, table, depths, counts):
+    """Fill the rows start..stop of the table, of the depths and of the numbers of tiles touched; 0 tiles: not drawn. flags: see `Flags`."""
+    covariances, integrated, reshaped, _, fourth = flags
+    sh = pointer(splats.sh)
     arrays, rows, stride = pointers(splats), pointer(table), 3 * splats.sh.shape[1]
     world, sizes, block, bands = new_world(), new_sizes(), new_block(), new_bands()
     for first in range(start, stop, WIDTH):
@@ -48,13 +49,13 @@ def project(start, stop, view, splats, table, depths, counts):
             load_splat(first + lane, lane, arrays, covariances, world)
         p = plus(apply(view.rotation, get_vector(world, MEAN)), view.translation)
         jac = ellipses.jacobian(view, p)
-        shape = project_covariance(jac, world) if covariances else project_axes(jac, world)
-        drawn = both(p[2] > view.near_plane, fill_shape(view, p, shape, get(world, OPACITY), block))
+        shape = project_any(jac, covariances, world)
+        drawn = both(p[2] > view.near_plane, fill_shape(view, integrated, reshaped, p, shape, get(world, OPACITY), block))
         put(sizes, 0, sqrt(dot(p, p)) if view.radial else p[2])
         put(sizes, 1, count_tiles(block, drawn, view.width, view.height))
         visible = bits(get(sizes, 1) > 0) & ((1 << size) - 1)
         if visible != 0:
-            harmonics.basis(narrowed(view_direction(view, get_vector(world, MEAN))[0]), view.sh_degree, bands)
+            harmonics.basis(narrowed(view_direction(view, get_vector(world, MEAN))[0]), view.sh_degree, fourth, bands)
         while visible != 0:
             lane = lowest_bit(visible)
             visible &= visible - 1
@@ -78,7 +79,7 @@ def load_splat(i, lane, arrays, has_covariances, world):
     for k in range(3):
         world[(MEAN + k) * WIDTH + lane] = means[3 * i + k]
     world[OPACITY * WIDTH + lane] = opacities[i]
-    if has_covariances:
+    if has_covariances is not None:
         for k in range(9):
             world[(COVARIANCE + k) * WIDTH + lane] = covariances[9 * i + k]
     else:
@@ -99,23 +100,27 @@ def covariance_of(world):
 
 
 @inner
-def project_axes(jac, world):
+def project_any(jac, has_covariances, world):
+    """The shapes of a block's splats on the image."""
+    if has_covariances is not None:
+        return ellipses.project_covariance(jac, covariance_of(world))
     return ellipses.project_axes(jac, ellipses.rotation(quaternion(world)), get_vector(world, SCALE))
 
 
 @inner
-def project_covariance(jac, world):
-    return ellipses.project_covariance(jac, covariance_of(world))
-
-
-@inner
-def fill_shape(view, p, shape, opacity, block):
+def fill_shape(view, integrated, reshaped, p, shape, opacity, block):
     """Write the splats' ellipses on the image; returns which splats are drawn."""
     per_z = 1 / p[2]
     x, y = view.fx * p[0] * per_z + view.cx, view.fy * p[1] * per_z + view.cy
     dilated, compensation = ellipses.screen_filter(view, shape)
-    if view.sampling == AT_CENTER:
-        return fill_at_center(view, x, y, dilated, opacity, compensation, block)
+    if integrated is None:
+        return fill_at_center(view, reshaped, x, y, dilated, opacity, compensation, block)
+    return fill_integral(view, x, y, dilated, opacity, block)
+
+
+@inner
+def fill_integral(view, x, y, dilated, opacity, block):
+    """`fill_shape` for splats that are integrated over pixels or windows."""
     splat_axes = integrals.axes(dilated)
     if view.sampling == OVER_PIXEL:
         mass, bound, corner = integrals.mass(splat_axes, opacity), integrals.BOUND_SQUARED * opacity, integrals.CORNER
@@ -130,12 +135,26 @@ def fill_shape(view, p, shape, opacity, block):
 
 
 @inner
-def fill_at_center(view, x, y, shape, opacity, compensation, block):
+def fill_at_center(view, reshaped, x, y, shape, opacity, compensation, block):
     """`fill_shape` for splats that are sampled at pixel centers."""
     compensated = opacity * compensation
     offset_from_middle = maximum(absolute(x * (2 / view.width) - 1), absolute(y * (2 / view.height) - 1))
     drawn = both(compensated >= view.min_alpha, offset_from_middle <= view.max_offset)
     put(block, layout.GATE, broadcast(1))
+    if reshaped is not None:
+        drawn, shape = reshape(view, drawn, shape, opacity, block)
+    # alpha = peak·(w - w_end), down to `last_alpha`
+    peak = compensated * (1 / (1 - view.w_end))
+    offset, last_alpha = peak * view.w_end, maximum(compensated * view.w_cut, view.min_alpha)
+    gain = (last_alpha + offset) / MIN_ALPHA
+    put(block, layout.GAIN, narrow(gain))
+    put(block, layout.OFFSET, narrow(offset))
+    return both(drawn, fill_ellipse(x, y, shape, peak / gain, block))
+
+
+@inner
+def reshape(view, drawn, shape, opacity, block):
+    """Cull, stretch and shrink as the view asks for it; returns which splats are drawn, and their shapes."""
     if view.culls:
         kept = culling.is_drawn(view, shape, opacity)
         put(block, layout.GATE, narrow(select(kept, 1.0, opacity * 0)))
@@ -144,13 +163,7 @@ def fill_at_center(view, x, y, shape, opacity, compensation, block):
             shape, _ = culling.stretched(view, shape, kept)
     if view.max_variance < math.inf:
         shape = culling.limited(view, shape)
-    # alpha = peak·(w - w_end), down to `last_alpha`
-    peak = compensated * (1 / (1 - view.w_end))
-    offset, last_alpha = peak * view.w_end, maximum(compensated * view.w_cut, view.min_alpha)
-    gain = (last_alpha + offset) / MIN_ALPHA
-    put(block, layout.GAIN, narrow(gain))
-    put(block, layout.OFFSET, narrow(offset))
-    return both(drawn, fill_ellipse(x, y, shape, peak / gain, block))
+    return drawn, shape
 
 
 @inner

@@ -27,16 +27,16 @@ from mipmap_plugin.backends.cpu_kernels.projection import (
     quaternion,
     view_direction,
 )
-from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, plus, weighted_sum
 
 new_sums, new_rows = scratch(layout.GRADS * WIDTH, types.float64), scratch(WIDTH, types.int64)
 
 
 @kernel
-def project_back(start, stop, view, splats, table, slots, tile_grads, grads):
+def project_back(start, stop, flags, view, splats, table, slots, tile_grads, grads):
     """Write the gradients of the splats start..stop; splat i's tiles have the rows slots[i]..slots[i + 1] of tile_grads."""
-    covariances, stride = len(splats.covariances) > 0, 3 * splats.sh.shape[1]
+    covariances, integrated, reshaped, _, fourth = flags
+    stride = 3 * splats.sh.shape[1]
     colors = pointer(splats.sh), pointer(grads.sh), pointer(table), stride, len(grads.sh) > 0
     arrays, targets, tile_rows = pointers(splats), pointers(grads), pointer(tile_grads)
     world, d_world, sums, bands, d_bands, rows, size = new_world(), new_world(), new_sums(), new_bands(), new_bands(), new_rows(), 0
@@ -49,8 +49,8 @@ def project_back(start, stop, view, splats, table, slots, tile_grads, grads):
         else:
             clear(i, targets, covariances, colors)
         if size == WIDTH or (i == stop - 1 and size > 0):
-            grad_splats(view, covariances, world, sums, d_world)
-            grad_colors(view, rows, size, world, sums, colors, bands, d_bands, d_world)
+            grad_splats(view, covariances, integrated, reshaped, world, sums, d_world)
+            grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d_world)
             for lane in range(size):
                 store_grads(rows[lane], lane, d_world, targets, covariances)
             size = 0
@@ -65,7 +65,7 @@ def clear(i, targets, has_covariances, colors):
     fill_zeros(d_opacities, i, 1)
     if wanted:
         fill_zeros(d_sh, stride * i, stride)
-    if has_covariances:
+    if has_covariances is not None:
         fill_zeros(d_covariances, 9 * i, 9)
     else:
         fill_zeros(d_scales, 3 * i, 3)
@@ -96,7 +96,7 @@ def store_grads(i, lane, d_world, targets, has_covariances):
     for k in range(3):
         d_means[3 * i + k] = d_world[(MEAN + k) * WIDTH + lane]
     d_opacities[i] = d_world[OPACITY * WIDTH + lane]
-    if has_covariances:
+    if has_covariances is not None:
         for k in range(9):
             d_covariances[9 * i + k] = d_world[(COVARIANCE + k) * WIDTH + lane]
     else:
@@ -107,20 +107,20 @@ def store_grads(i, lane, d_world, targets, has_covariances):
 
 
 @inner
-def grad_splats(view, has_covariances, world, sums, d_world):
+def grad_splats(view, has_covariances, integrated, reshaped, world, sums, d_world):
     """Write the gradients of means, shapes and opacities, without the means' gradient through the color."""
     p = plus(apply(view.rotation, get_vector(world, MEAN)), view.translation)
     jac, opacity = ellipses.jacobian(view, p), get(world, OPACITY)
-    if has_covariances:
+    if has_covariances is not None:
         covariance = covariance_of(world)
-        d_shape, d_opacity, d_x, d_y = grad_shape(view, ellipses.project_covariance(jac, covariance), opacity, sums)
+        d_shape, d_opacity, d_x, d_y = grad_shape(view, integrated, reshaped, ellipses.project_covariance(jac, covariance), opacity, sums)
         d_jac, d_covariance = ellipses.grad_project_covariance(jac, covariance, d_shape)
         for k in range(3):
             put_vector(d_world, COVARIANCE + 3 * k, d_covariance[k])
     else:
         quat, scale = quaternion(world), get_vector(world, SCALE)
         axes = ellipses.rotation(quat)
-        d_shape, d_opacity, d_x, d_y = grad_shape(view, ellipses.project_axes(jac, axes, scale), opacity, sums)
+        d_shape, d_opacity, d_x, d_y = grad_shape(view, integrated, reshaped, ellipses.project_axes(jac, axes, scale), opacity, sums)
         d_jac, d_axes, d_scale = ellipses.grad_project_axes(jac, axes, scale, d_shape)
         put_vector(d_world, SCALE, d_scale)
         d_quat = ellipses.grad_rotation(quat, d_axes)
@@ -131,11 +131,22 @@ def grad_splats(view, has_covariances, world, sums, d_world):
 
 
 @inner
-def grad_shape(view, shape, opacity, sums):
+def grad_shape(view, integrated, reshaped, shape, opacity, sums):
     """The gradients of shapes before the screen filter, of opacities, and of positions on the image."""
     dilated, compensation = ellipses.screen_filter(view, shape)
-    if view.sampling != AT_CENTER:
+    if integrated is not None:
         return grad_integral(view, shape, dilated, opacity, sums)
+    if reshaped is not None:
+        return grad_reshaped(view, shape, dilated, compensation, opacity, sums)
+    d_dilated, d_x, d_y = grad_ellipse(dilated, sums)
+    d_log_alpha = get(sums, layout.SUM)
+    d_shape = ellipses.grad_screen_filter(view, shape, dilated, compensation, d_dilated, d_log_alpha / compensation)
+    return d_shape, d_log_alpha / opacity, d_x, d_y
+
+
+@inner
+def grad_reshaped(view, shape, dilated, compensation, opacity, sums):
+    """`grad_shape` where a view culls, stretches or shrinks splats."""
     if view.culls:
         return grad_culled(view, shape, dilated, compensation, opacity, sums)
     d_dilated, d_x, d_y = grad_limited(view, dilated, sums)
@@ -197,14 +208,14 @@ def grad_integral(view, shape, dilated, opacity, sums):
 
 
 @inner
-def grad_colors(view, rows, size, world, sums, colors, bands, d_bands, d_world):
+def grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d_world):
     """The gradients through the color: write those of the coefficients if wanted, and add to those of the means."""
     direction, length = view_direction(view, get_vector(world, MEAN))
-    harmonics.basis(narrowed(direction), view.sh_degree, bands)
+    harmonics.basis(narrowed(direction), view.sh_degree, fourth, bands)
     for lane in range(size):
         grad_color(rows[lane], lane, view, colors, sums, bands, d_bands)
     if view.sh_degree > 0:
-        d_x, d_y, d_z = harmonics.grad_direction(narrowed(direction), view.sh_degree, d_bands)
+        d_x, d_y, d_z = harmonics.grad_direction(narrowed(direction), view.sh_degree, fourth, d_bands)
         d_direction = wide(d_x), wide(d_y), wide(d_z)
         per_length = select(length > 0, 1 / length, 0.0)
         d_mean = weighted_sum(per_length, d_direction, -dot(d_direction, direction) * per_length, direction)

@@ -10,6 +10,17 @@ import numpy as np
 AT_CENTER, OVER_PIXEL, OVER_WINDOW = range(3)
 
 
+class Flags(NamedTuple):
+    """What most images do without: True, or None where it is off. The type of None is known when a kernel is compiled, which so leaves out
+    what is off, and takes half the time."""
+
+    covariances: bool | None  # splats have these in place of quaternions and scales
+    integrated: bool | None  # over pixels or windows
+    reshaped: bool | None  # culled, stretched or shrunk
+    faded: bool | None  # they fade to 0 before they end
+    fourth: bool | None  # their colors have harmonics of degree 4
+
+
 class View(NamedTuple):
     """A camera, and the effects and settings that kernels need. Numbers only, no arrays."""
 

@@ -30,7 +30,7 @@ SLOT_BITS = 32
 _SLOT = (1 << SLOT_BITS) - 1
 
 new_block, new_spans = scratch(layout.OUTLINE_FIELDS * WIDTH, types.float32), scratch(2 * WIDTH, types.float64)
-new_slots = scratch(WIDTH, types.int64)
+new_slots, new_counts = scratch(WIDTH, types.int64), scratch(1 << DIGIT_BITS, types.int64)
 
 
 def tile_lists(table: np.ndarray, depths: np.ndarray, slots: np.ndarray, width: int, height: int, team: Team) -> Lists:
@@ -111,13 +111,13 @@ def sort(start, stop, lists):
     longest = 0
     for tile in range(start, stop):
         longest = max(longest, starts[tile + 1] - starts[tile])
-    spare, counts = np.empty(longest, np.int64), np.empty(1 << DIGIT_BITS, np.int64)
+    spare, counts, lists_of = np.empty(longest, np.int64), new_counts(), pointer(entries)
     for tile in range(start, stop):
         first, last = starts[tile], starts[tile + 1]
         if last - first > MAX_INSERTION:
-            sort_long(entries[first:last], spare[: last - first], counts)
+            sort_long(lists_of, first, last - first, pointer(spare), counts)
         else:
-            sort_short(entries, first, last)
+            sort_short(lists_of, first, last)
         for at in range(first, last):
             slot = entries[at] & _SLOT
             entries[at], members[at] = slot, splats[slot]
@@ -135,23 +135,26 @@ def sort_short(entries, first, last):
 
 
 @inner
-def sort_long(entries, spare, counts):
-    """Radix sort by depth; stable."""
-    source, target = entries, spare
+def sort_long(entries, first, length, spare, counts):
+    """Radix sort by depth of the `length` entries from `first` on; stable."""
+    source, target, source_first, target_first = entries, spare, first, 0
     for shift in range(SLOT_BITS, 2 * SLOT_BITS, DIGIT_BITS):
-        counts[:] = 0
-        for entry in source:
-            counts[(entry >> shift) & ((1 << DIGIT_BITS) - 1)] += 1
-        if counts[(source[0] >> shift) & ((1 << DIGIT_BITS) - 1)] == len(source):
+        for digit in range(1 << DIGIT_BITS):
+            counts[digit] = 0
+        for n in range(length):
+            counts[(source[source_first + n] >> shift) & ((1 << DIGIT_BITS) - 1)] += 1
+        if counts[(source[source_first] >> shift) & ((1 << DIGIT_BITS) - 1)] == length:
             continue  # all entries have the same digit
         at = 0
         for digit in range(1 << DIGIT_BITS):
             count = counts[digit]
             counts[digit] = at
             at += count
-        for entry in source:
+        for n in range(length):
+            entry = source[source_first + n]
             digit = (entry >> shift) & ((1 << DIGIT_BITS) - 1)
-            target[counts[digit]] = entry
+            target[target_first + counts[digit]] = entry
             counts[digit] += 1
-        source, target = target, source
-    entries[:] = source
+        source, target, source_first, target_first = target, source, target_first, source_first
+    for n in range(length):  # after an even number of passes, onto themselves
+        entries[first + n] = source[source_first + n]
