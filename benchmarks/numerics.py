@@ -22,7 +22,7 @@ from mipmap_plugin.backends.conformance.checks import Answer, draw
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.filters import LEAST_LIGHT, footprint
+from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, footprint
 from mipmap_plugin.splatting.projection import Projected, _from_factors
 
 HERE = Path(__file__).parent
@@ -94,7 +94,7 @@ def _scale_gradient(eps2d: float, dtype: torch.dtype) -> float:
 
 
 def compensation_slopes() -> list[Row]:
-    floor, rows = LEAST_LIGHT["antialiased"], []
+    floor, rows = LEAST_COMPENSATION["antialiased"], []
     for ratio in (1e-2, 1e-4, 1e-5, 1e-6, 1e-8):
         value = torch.tensor([ratio], dtype=torch.float64, requires_grad=True)
         ours = torch.autograd.grad(_compensation(value).sum(), value)[0]

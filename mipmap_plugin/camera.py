@@ -30,29 +30,31 @@ class Camera:
     name: str = ""
     split: Literal["train", "test"] = "train"
     time: float | None = None  # 0..1, for moving scenes
-    zoom: float = 1.0  # how much finer than in training this view is sampled, for models with levels of detail
-    index: int | None = None  # the number of a training view, for models with an appearance for each
+    zoom: float = 1.0  # sampling rate ÷ that of training; models with levels of detail choose their level by it
+    index: int | None = None  # number of the training view, for models with one appearance embedding per view
 
     def __post_init__(self) -> None:
         if tuple(self.viewmat.shape) != (4, 4):
             raise ShapeError(f"viewmat: expected shape [4, 4], got {list(self.viewmat.shape)}")
-        is_lens = min(self.fx, self.fy) > 0 and all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy)))
-        if min(self.width, self.height) < 1 or not is_lens:
-            raise SettingsError(f"camera {self.name!r}: {self.width}x{self.height} px with focal lengths {self.fx}, {self.fy} is not a view")
+        valid = min(self.fx, self.fy) > 0 and all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy)))
+        if min(self.width, self.height) < 1 or not valid:
+            got = f"{self.width}x{self.height} px, fx {self.fx}, fy {self.fy}, cx {self.cx}, cy {self.cy}"
+            raise SettingsError(f"camera {self.name!r}: image size and focal lengths must be positive and finite, got {got}")
         object.__setattr__(self, "viewmat", self.viewmat.detach().to("cpu", torch.float64))
         if not self.viewmat.isfinite().all():
-            raise SettingsError(f"camera {self.name!r}: its pose holds NaN or infinity, so that it is nowhere")
+            raise SettingsError(f"camera {self.name!r}: the pose contains NaN or infinity")
 
     @property
     def center(self) -> Tensor:
-        """[3] float64, the eye in world space."""
+        """The camera's position in the world, [3] float64."""
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
         return -torch.linalg.solve(rotation, translation)
 
     def to_camera(self, points: Tensor) -> Tensor:
-        """[N, 3] world units -> [N, 3] in camera space, x right, y down, z forward.
+        """Transform world points [N, 3] to camera space [N, 3]: x right, y down, z forward.
 
-        Eye first: in a world far from its origin the rounding of rotation · point + translation is larger than a pixel.
+        The camera's position is subtracted before the rotation: far from the world's origin, the rounding error of
+        rotation · point + translation exceeds a pixel.
         """
         return (points - self.center.to(points)) @ self.viewmat[:3, :3].to(points).T
 
@@ -64,43 +66,43 @@ class Camera:
     def zoomed(self, factor: float) -> Camera:
         """The same view sampled `factor` times more densely per axis.
 
-        Width and height are rounded as Pillow users do, and the focal lengths follow each axis' true factor, so
-        that the field of view is exactly kept. Raises SettingsError for a factor that is no zoom.
+        Width and height are rounded, and each focal length is scaled by its axis' actual ratio, which keeps the field of
+        view exactly. Raises SettingsError if `factor` is out of range.
         """
         check_scale(factor)
         resized = self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
         return replace(resized, zoom=self.zoom * factor)
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same field of view at `width` x `height` px; what the model is asked for (`zoom`) stays."""
+        """The same field of view at `width` x `height` px. `zoom`, and so the model's level of detail, does not change."""
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def window(self, width: int, height: int) -> Camera:
-        """The middle `width` x `height` px of the same view, or as much of it as there is."""
+        """The view's central crop of at most `width` x `height` px."""
         width, height = min(width, self.width), min(height, self.height)
         left, top = (self.width - width) // 2, (self.height - height) // 2
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def moved(self, similarity: Tensor) -> Camera:
-        """The same view after all of the world, this camera included, was moved by `similarity` [4, 4]: turned, sized and shifted."""
-        turned_and_sized = similarity[:3, :3].to("cpu", torch.float64)
-        rotation = turned_and_sized / torch.linalg.det(turned_and_sized).pow(1 / 3)
+        """The same view after the whole scene, this camera included, was transformed by `similarity` [4, 4] (rotation, scale, translation)."""
+        linear = similarity[:3, :3].to("cpu", torch.float64)
+        rotation = linear / torch.linalg.det(linear).pow(1 / 3)
         viewmat = torch.eye(4, dtype=torch.float64)
         viewmat[:3, :3] = self.viewmat[:3, :3] @ rotation.T
-        viewmat[:3, 3] = -viewmat[:3, :3] @ (turned_and_sized @ self.center + similarity[:3, 3].to("cpu", torch.float64))
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (linear @ self.center + similarity[:3, 3].to("cpu", torch.float64))
         return replace(self, viewmat=viewmat)
 
     def looking_from(self, viewmat: Tensor, name: str) -> Camera:
-        """The same lens at another pose."""
+        """The same intrinsics at another pose."""
         return replace(self, viewmat=viewmat, name=name)
 
 
 def evenly(views: Sequence[Item], most: int | None) -> list[Item]:
-    """At most `most` of the views, spread over their order; all of them for None."""
-    return [views[place * len(views) // most] for place in range(most)] if most is not None and len(views) > most else list(views)
+    """At most `most` views, evenly spaced in their order; all of them if `most` is None."""
+    return [views[i * len(views) // most] for i in range(most)] if most is not None and len(views) > most else list(views)
 
 
 def every_nth(views: Sequence[Item], most: int) -> Sequence[Item]:
-    """Every n-th of the views, the first among them, where n is the least that leaves at most `most`."""
+    """Every n-th view, starting with the first, for the smallest n that gives at most `most` views."""
     return views[:: -(-len(views) // most)]

@@ -1,8 +1,9 @@
-"""Gaussians: the one interface between every checkpoint family and every backend."""
+"""Gaussians: the interface between checkpoint families and backends."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -13,7 +14,7 @@ from mipmap_plugin.errors import ShapeError
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N splats in world space, activated: scales are lengths, opacities are in 0..1. Checked once, here."""
+    """N splats in world space, activated: scales are lengths, opacities lie in 0..1. Raises ShapeError if the tensors do not fit together."""
 
     means: Tensor  # [N, 3] world units
     quats: Tensor  # [N, 4] wxyz, any norm > 0
@@ -25,10 +26,10 @@ class Gaussians:
     def __post_init__(self) -> None:
         n = self.means.shape[0]
         bands = math.isqrt(self.sh.shape[1]) if self.sh.dim() == 3 else 0
-        want = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, max(bands, 1) ** 2, 3)}
+        expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, max(bands, 1) ** 2, 3)}
         if self.covariances is not None:
-            want["covariances"] = (n, 3, 3)
-        for name, shape in want.items():
+            expected["covariances"] = (n, 3, 3)
+        for name, shape in expected.items():
             tensor = getattr(self, name)
             if tuple(tensor.shape) != shape:
                 raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(tensor.shape)}")
@@ -40,26 +41,28 @@ class Gaussians:
 
     def __getitem__(self, rows: Tensor) -> Gaussians:
         """The splats at `rows`, a boolean mask [N] or indices."""
-        return self._each(lambda tensor: tensor[rows])
+        return self._map(lambda tensor: tensor[rows])
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
-        return self._each(lambda tensor: tensor.to(device=device, dtype=dtype))
+        """The same splats on `device` in `dtype`."""
+        return self._map(lambda tensor: tensor.to(device=device, dtype=dtype))
 
     def detach(self) -> Gaussians:
-        return self._each(Tensor.detach)
+        """The same splats outside the gradient graph."""
+        return self._map(Tensor.detach)
 
     @property
     def sh_degree(self) -> int:
-        """The degree that the coefficients have room for."""
+        """SH degree of `sh`, whether or not its coefficients are zero."""
         return math.isqrt(self.sh.shape[1]) - 1
 
     def used_sh_degree(self) -> int:
-        """The highest band with a non-zero coefficient; bands above it need no evaluation."""
+        """The highest SH degree with a non-zero coefficient; bands above it need no evaluation."""
         if len(self) == 0:
             return 0
-        lit = self.sh.detach().abs().amax(dim=(0, 2)).nonzero()
-        return math.isqrt(int(lit.max())) if len(lit) else 0
+        nonzero = self.sh.detach().abs().amax(dim=(0, 2)).nonzero()
+        return math.isqrt(int(nonzero.max())) if len(nonzero) else 0
 
-    def _each(self, change) -> Gaussians:
-        held = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: change(tensor) for name, tensor in held.items() if tensor is not None})
+    def _map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        tensors = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: function(tensor) for name, tensor in tensors.items() if tensor is not None})

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-
-import torch
+from typing import TYPE_CHECKING
 
 from mipmap_plugin.errors import SettingsError
+
+if TYPE_CHECKING:
+    import torch
 
 # Zooms beyond these show nothing, and splats as large as their pixels leave the range that is read (`models.health.LARGEST`): a photograph
 # would be far below a pixel, or one of its pixels larger than any screen.
@@ -46,7 +48,7 @@ def check_background(background: Sequence[float]) -> tuple[float, float, float]:
 
 def check_image(width: int, height: int, device: torch.device | str = "cpu", bytes_per_pixel: int = BYTES_PER_PIXEL) -> None:
     """Raise SettingsError for an image of `width` x `height` px that the memory of `device` cannot hold."""
-    needed, held = width * height * bytes_per_pixel, memory(torch.device(device))
+    needed, held = width * height * bytes_per_pixel, memory(device)
     if needed > held:
         told = f"an image of {width:,} x {height:,} px takes {needed / 2**30:,.0f} GiB at least"
         raise SettingsError(f"{told}, and this machine has {held / 2**30:,.1f}; ask for a smaller scale, or give smaller cameras")
@@ -54,12 +56,15 @@ def check_image(width: int, height: int, device: torch.device | str = "cpu", byt
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether a library says in its own way that the memory does not suffice."""
-    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (isinstance(error, RuntimeError) and "allocate memory" in str(error))
+    torchs = isinstance(error, RuntimeError) and (type(error).__name__ == "OutOfMemoryError" or "allocate memory" in str(error))
+    return isinstance(error, MemoryError) or torchs
 
 
-def memory(device: torch.device) -> float:
+def memory(device: torch.device | str) -> float:
     """Bytes of a device's memory; infinite where the system does not tell."""
-    if device.type == "cuda":
+    if str(device).startswith("cuda"):
+        import torch  # not before it is needed: the command line reads its options without
+
         return torch.cuda.get_device_properties(device).total_memory
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, cast
 
 import torch
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted, shown
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import Base, Observer, Session
@@ -27,7 +28,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_background, check_image, check_scale
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Filtered, Placed, SplatModel, TrainedScale, why_no_viewer
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
@@ -53,8 +54,10 @@ class Drawn(TypedDict, total=False):
 class Wrapped:
     """A frozen base model with its cameras, ready to be adapted to any scale."""
 
-    def __init__(self, model: SplatModel, cameras: Sequence[Camera], backend: str, trained: TrainedScale) -> None:
-        self.model, self.cameras, self._backend, self.trained = model, list(cameras), backend, trained
+    def __init__(
+        self, model: SplatModel, cameras: Sequence[Camera], backend: str, trained: TrainedScale, threads: int | None = None
+    ) -> None:
+        self.model, self.cameras, self._backend, self.trained, self.threads = model, list(cameras), backend, trained, threads
         self.background = trained.background or (0.0, 0.0, 0.0)
 
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
@@ -166,7 +169,8 @@ class Wrapped:
         read = self._read_by(viewer)
         given = model if read is self.model else read
         base = Base(model, self.effects(), targets, viewer, backend, why, not any(backend.lacking(each) for each in needs), given)
-        return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
+        with threads.shared(self.threads):
+            return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
         """Raise what saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be known, before any work."""
@@ -229,6 +233,7 @@ def wrap_model(
     backend: str = "auto",
     background: tuple[float, float, float] | None = None,
     screen_filter: str | None = None,
+    threads: int | None = None,
 ) -> Wrapped:
     """Wrap a loaded model, the checkpoint at a path, or another project's live model, which is copied (`models.live.adopt`).
 
@@ -236,7 +241,8 @@ def wrap_model(
 
     `cameras`: views of the scale it was trained at, or the scene that it was trained on; by default those beside the
     checkpoint. `background`: linear RGB; by default what the checkpoint says, else black. `screen_filter`: what it was trained
-    with, where its files do not say ("classic", "antialiased", "mip", "analytic"). Raises CheckpointError, SceneError, and
+    with, where its files do not say ("classic", "antialiased", "mip", "analytic"). `threads`: to adapt with; by default as many as torch has.
+    The result does not depend on it. Raises CheckpointError, SceneError, and
     SettingsError for an unknown filter or an object that is no model.
     """
     color = None if background is None else check_background(background)
@@ -248,7 +254,7 @@ def wrap_model(
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
     if isinstance(cameras, Scene):
         cameras = placed(model, cameras).cameras
-    return Wrapped(model, own_cameras(model) if cameras is None else cameras, backend, trained)
+    return Wrapped(model, own_cameras(model) if cameras is None else cameras, backend, trained, threads)
 
 
 def _loaded(path: str | Path, backend: str) -> SplatModel:
@@ -261,8 +267,8 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
     if not model.traits.placed:
         return scene
     scene = scene.original()
-    taken = Taken(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
-    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, taken))
+    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
+    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
 
 
 def state_path(output: Path) -> Path:

@@ -23,7 +23,7 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.magic import SPLAT_RECORD
 from mipmap_plugin.formats.state_dict import read_state_dict
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import wrap_model
 
@@ -66,7 +66,7 @@ def open_images(path: Path) -> None:
 def open_placed(path: Path) -> None:
     """A checkpoint, and a scene seen in its frame."""
     model = load_model(path)
-    assert model.as_trained(tiny.cameras(2), Taken())
+    assert model.as_trained(tiny.cameras(2), Capture())
 
 
 def open_state(path: Path) -> None:

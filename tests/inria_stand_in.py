@@ -1,4 +1,4 @@
-"""`diff_gaussian_rasterization` on a processor: its names, and pictures that are what the arguments say, by the reference's own steps."""
+"""A stand-in for `diff_gaussian_rasterization` on the CPU: its names, and images that the reference renders from its arguments."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from mipmap_plugin.backends.inria import NEWER, OLDER
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import MIN_ALPHA, USUAL
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.compositing import Splats, alone, composite
+from mipmap_plugin.splatting.compositing import SortedSplats, composite, independent
 from mipmap_plugin.splatting.filters import Footprint
 from mipmap_plugin.splatting.harmonics import colors as colors_of
 from mipmap_plugin.splatting.projection import project
 
-DILATION, NEAR, LEAST_LIGHT = 0.3, 0.2, 0.005
+DILATION, NEAR, LEAST_COMPENSATION = 0.3, 0.2, 0.005
 
 
 def package(newer: bool) -> SimpleNamespace:
-    """The module, of the generation with or without `antialiasing`. What was asked for is kept in `asked`."""
-    asked: list[tuple] = []
+    """The module, of the generation with or without `antialiasing`. The arguments are kept in `received`."""
+    received: list[tuple] = []
 
     class GaussianRasterizer:
         def __init__(self, raster_settings):
@@ -30,14 +30,14 @@ def package(newer: bool) -> SimpleNamespace:
         def __call__(self, means3D, means2D, opacities, shs=None, colors_precomp=None, scales=None, rotations=None, cov3D_precomp=None):
             assert (shs is None) != (colors_precomp is None)
             assert (cov3D_precomp is None) != (scales is None or rotations is None)
-            asked.append((self.settings, shs, cov3D_precomp))
+            received.append((self.settings, shs, cov3D_precomp))
             splats = splats_of(means3D, opacities, scales, rotations, cov3D_precomp)
             image = draw(splats, shs, colors_precomp, self.settings)
             radii = torch.zeros(len(means3D), dtype=torch.int32)
             return (image, radii, image[:1]) if newer else (image, radii)
 
     settings = namedtuple("GaussianRasterizationSettings", NEWER if newer else OLDER)
-    return SimpleNamespace(GaussianRasterizationSettings=settings, GaussianRasterizer=GaussianRasterizer, asked=asked)
+    return SimpleNamespace(GaussianRasterizationSettings=settings, GaussianRasterizer=GaussianRasterizer, received=received)
 
 
 def camera_of(settings) -> Camera:
@@ -64,17 +64,17 @@ def splats_of(means, opacities, scales, rotations, packed) -> Gaussians:
     return Gaussians(means, rotations, scales, opacities[:, 0], means.new_zeros(n, 1, 3), covariances)
 
 
-def draw(splats: Gaussians, shs, painted, settings):
+def draw(splats: Gaussians, shs, colors_precomp, settings):
     camera = camera_of(settings)
     p = project(splats, camera, NEAR)
     xx, yy = p.xx + DILATION, p.yy + DILATION
     det = xx * yy - p.xy.square()
-    light = (p.det / det).clamp_min(LEAST_LIGHT**2).sqrt() if getattr(settings, "antialiasing", False) else 1.0
-    feet = Footprint(yy, p.xy / yy, det / yy, xx, splats.opacities * light)
-    rgb = painted if shs is None else colors_of(shs, splats.means, settings.campos, settings.sh_degree)
+    compensation = (p.det / det).clamp_min(LEAST_COMPENSATION**2).sqrt() if getattr(settings, "antialiasing", False) else 1.0
+    footprints = Footprint(yy, p.xy / yy, det / yy, xx, splats.opacities * compensation)
+    rgb = colors_precomp if shs is None else colors_of(shs, splats.means, settings.campos, settings.sh_degree)
     least = torch.full_like(splats.opacities, MIN_ALPHA)
-    rows = (feet.visible(least) & (p.depths > NEAR)).nonzero()[:, 0]
+    rows = (footprints.visible(least) & (p.depths > NEAR)).nonzero()[:, 0]
     rows = rows[p.depths[rows].argsort(stable=True)]
-    chosen = Splats(p.means2d[rows], feet.packed()[rows], rgb[rows], least[rows], alone(feet.alpha))
-    color, through = composite(chosen, feet.extents(least)[rows], camera, USUAL)
-    return (color + through[..., None] * settings.bg).permute(2, 0, 1)
+    chosen = SortedSplats(p.means2d[rows], footprints.packed()[rows], rgb[rows], least[rows], independent(footprints.alpha))
+    color, transmittance = composite(chosen, footprints.extents(least)[rows], camera, USUAL)
+    return (color + transmittance[..., None] * settings.bg).permute(2, 0, 1)

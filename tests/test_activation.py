@@ -17,8 +17,11 @@ def gradients(model, views, *, share):
     activate = student.gaussians
     student.gaussians = lambda camera: (asked.append(camera), activate(camera))[1]
     splats = Activation(student, share=share)
+    splats.activate(views[0])
     for view in views:
-        backend.render(splats(view), view, Effects(1)).image.square().sum().backward()
+        seen = splats(view)
+        backend.render(seen, view, Effects(1)).image.square().sum().backward()
+        splats.gather(seen)
     splats.backward()
     return {name: tensor.grad for name, tensor in student.parameters().items()}, len(asked)
 

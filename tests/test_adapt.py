@@ -56,7 +56,7 @@ def test_every_recipe_runs_and_its_report_is_whole(recipe, settings, scale):
     report = json.loads(json.dumps(adapted.report.model_dump()))
     steps = settings.get("steps", 0)
     assert (report["scale"], report["settings"]["recipe"], report["ended_by"]) == (scale, recipe, f"{steps} steps")
-    assert report["backend"] == "reference: asked for"
+    assert report["backend"] == "reference: requested"
     assert (report["gaussians_before"], report["gaussians_after"]) == (40, len(adapted.model))
     assert [point["step"] for point in report["curve"]] == [*range(0, steps, 2), *([steps] if steps else [0])]
     assert all(math.isfinite(point["validation_db"]) for point in report["curve"])

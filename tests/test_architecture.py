@@ -14,7 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 STOREYS = [
     {"errors"},
     {"limits"},
-    {"registry", "config", "torchvision_absent"},
+    {"registry", "config", "torchvision_absent", "threads", "progress"},
     {"gaussians", "camera"},
     {"formats"},
     {"effects"},
@@ -45,7 +45,7 @@ CONFINED = {
     "safetensors": ["adaptation/target/super_resolution.py"],
     "skimage": ["evaluation/metrics.py"],
     "spandrel": ["adaptation/target/super_resolution.py"],
-    "tqdm": ["adaptation/", "evaluation/"],
+    "tqdm": ["adaptation/", "evaluation/", "progress.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
     "typing_extensions": ["wrap.py"],
@@ -152,6 +152,19 @@ def test_importing_the_package_loads_nothing_optional():
     optional = ["numba", "llvmlite", "gsplat", "triton", "matplotlib", "pycolmap", "pytest", "skimage", "tyro"]
     optional += ["spandrel", "safetensors", "lpips", "torchvision"]
     code = f"import sys, mipmap_plugin; print([name for name in {optional} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_options_are_read_and_explained_without_torch():
+    code = """
+import contextlib, io, sys
+from mipmap_plugin.cli import main
+for options in (["--help"], ["adapt", "--help"], ["--version"]):
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
+        main(options)
+print([name for name in ("torch", "numpy", "numba") if name in sys.modules])
+"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -86,7 +86,7 @@ def test_a_viewmat_of_another_shape_is_refused():
 
 
 @pytest.mark.parametrize("size", [(0, 4, 1.0), (4, 4, 0.0), (4, 4, -1.0)])
-def test_a_lens_that_sees_nothing_is_refused(size):
+def test_an_empty_image_or_a_focal_length_that_is_not_positive_is_refused(size):
     width, height, focal = size
-    with pytest.raises(SettingsError, match="is not a view"):
+    with pytest.raises(SettingsError, match="image size and focal lengths must be positive and finite, got"):
         Camera(width, height, focal, focal, 0.0, 0.0, torch.eye(4))

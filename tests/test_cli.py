@@ -104,7 +104,7 @@ def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
         assert provenance_of(read_ply(ply).comments)["scale"] == scale
         assert json.loads(ply.with_name("point_cloud.ply.adaptation.json").read_text())["scale"] == scale
         assert f"x{scale:g}: {ply}" in out
-    assert "ended by 2 steps" in out and "backend reference: asked for" in out and "the 4 given views" in out
+    assert "ended by 2 steps" in out and "backend reference: requested" in out and "the 4 given views" in out
     assert not list(tmp_path.rglob("*.resume"))
 
 
@@ -170,7 +170,7 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
 
 
 def test_ctrl_c_anywhere_else_says_interrupted(run, monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.commands.inspect.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("mipmap_plugin.models.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     code, _, err = run("inspect", "a.ply")
     assert code == 130 and err.strip() == "mipmap-plugin: interrupted"
 

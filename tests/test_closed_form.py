@@ -13,7 +13,7 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.filters import footprint, keeps_light
+from mipmap_plugin.splatting.filters import compensates, footprint
 from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.viewers import find_viewer
 
@@ -44,7 +44,7 @@ def adapted(gaussians: Gaussians, scale: float, base: Effects = Effects(0), targ
 def finer(width: float, height: float, scale: float, base: Effects, opacity: float = 0.7, averaged: float = 1 / 12):
     """The picture at zoom-in of the disc that `base` shows: what an average of `averaged` px² widened is narrower again, and no light is lost."""
     shown = BASE_WIDTH[base.screen_filter] - averaged + averaged / scale**2
-    light = 0.0 if keeps_light(base.screen_filter) else BASE_WIDTH[base.screen_filter]
+    light = 0.0 if compensates(base.screen_filter) else BASE_WIDTH[base.screen_filter]
     areas = [math.sqrt((width**2 + more) * (height**2 + more)) for more in (light, shown)]
     return show(disc(width, height, opacity * areas[0] / areas[1]), scale, shown * scale**2)
 

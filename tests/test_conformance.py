@@ -64,7 +64,7 @@ class SpreadsNan(ReferenceBackend):
 
     def render(self, gaussians, camera, effects):
         rendered = super().render(gaussians, camera, effects)
-        return rendered.but(image=rendered.image + 0 * gaussians.opacities.sum())
+        return rendered.replaced(image=rendered.image + 0 * gaussians.opacities.sum())
 
 
 class Raises(ReferenceBackend):

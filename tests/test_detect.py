@@ -123,7 +123,7 @@ def test_an_incomplete_newest_iteration_is_passed_over_with_a_note(tmp_path):
     newest.write_bytes(newest.read_bytes()[:-1])
     found = detect(folder)
     assert found.iteration == 7000
-    assert "iteration_7000 is taken, since" in found.notes[0]
+    assert "iteration_7000 is used, since" in found.notes[0]
     assert "truncated" in found.notes[0]
     with pytest.raises(CheckpointError, match="truncated"):
         detect(folder, iteration=30000)

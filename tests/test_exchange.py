@@ -79,7 +79,7 @@ def test_a_file_is_read_under_the_ending_that_the_tool_knows(tmp_path, tool, end
     path = tmp_path / (f"my scene.{ending}" if named else "-scene.bin")
     path.write_bytes(content)
     model = load_model(path)
-    assert len(model) == 60 and model.family == "3dgs" and "rounds off" in model.notes[0]
+    assert len(model) == 60 and model.family == "3dgs" and "rounds the trained values" in model.notes[0]
     assert (model.source, model.digest, model.folder) == (path, hashlib.sha256(content).hexdigest(), None)
     options, source, target, began = asked(tool)
     assert Path(source).is_absolute() and source.endswith(f".{ending}") and bytes.fromhex(began) == content[:32]

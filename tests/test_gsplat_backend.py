@@ -1,4 +1,4 @@
-"""What gsplat is asked for, and what its own torch twins make of it where there is no GPU."""
+"""The arguments that gsplat is called with, and what its torch implementations render with them on the CPU."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from mipmap_plugin.backends import gsplat as module
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, check_backend
 from mipmap_plugin.backends.conformance.cases import covariances
+from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.gsplat import NO_GSPLAT, NOT_COMPILED, GsplatBackend, arguments
-from mipmap_plugin.backends.guests import NO_CUDA
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects, RenderSettings
 from mipmap_plugin.errors import BackendUnavailable
@@ -34,11 +34,11 @@ WIDE = camera(50, 40, 30.0, 26.0, cx=21.3, cy=18.9)
 # Where gsplat 1.5 differs from the reference by more than rounding, and why.
 FEWER_DIGITS = {f"needle-1e12-{kind}" for kind in ("classic", "antialiased", "mip")}
 LARGER_ALPHA = {f"opacity-{how}-{kind}" for how in ("1", "1-1e-7", "logit-80") for kind in ("classic", "antialiased", "mip")}
-NO_LEAST_LIGHT = {f"scale-{size}-antialiased" for size in ("0-on-two-axes", "0-on-three-axes", "1e-20", "1e-20-on-two-axes")} | {
+NO_LEAST_COMPENSATION = {f"scale-{size}-antialiased" for size in ("0-on-two-axes", "0-on-three-axes", "1e-20", "1e-20-on-two-axes")} | {
     "antialiased-1", "antialiased-2",
 }  # fmt: skip
 TWINS_ROOT_AT_ZERO = {"scale-0-on-three-axes-antialiased", "scale-0-on-three-axes-mip", "scale-1e-20-mip"}  # its kernel divides by a little more
-KNOWN = FEWER_DIGITS | LARGER_ALPHA | NO_LEAST_LIGHT | TWINS_ROOT_AT_ZERO
+KNOWN = FEWER_DIGITS | LARGER_ALPHA | NO_LEAST_COMPENSATION | TWINS_ROOT_AT_ZERO
 
 
 class OnProcessor(GsplatBackend):
@@ -55,44 +55,44 @@ def stand_in(monkeypatch):
     return twin
 
 
-def test_gsplat_is_asked_in_its_own_words(stand_in):
+def test_the_arguments_are_those_of_gsplat(stand_in):
     splats = gaussians(20, 2, dtype=torch.float32)
     effects = Effects(1, "classic", 0.3 * 4**2, (0.2, 0.5, 0.9), near_plane=0.25)  # the `scaled` filter at x4
     OnProcessor().render(splats, WIDE, effects)
-    asked, named = stand_in.asked, arguments(splats, WIDE, effects)
+    args, named = stand_in.received, arguments(splats, WIDE, effects)
     assert set(named) <= set(stand_in.signature.parameters)
-    assert (asked["width"], asked["height"], asked["sh_degree"], asked["eps2d"], asked["rasterize_mode"]) == (50, 40, 1, 4.8, "classic")
-    assert asked["Ks"][0].tolist() == [[30.0, 0.0, pytest.approx(21.3)], [0.0, 26.0, pytest.approx(18.9)], [0.0, 0.0, 1.0]]
-    assert asked["backgrounds"].tolist() == [[pytest.approx(0.2), 0.5, pytest.approx(0.9)]]
-    assert (asked["packed"], asked["covars"], asked["render_mode"]) == (False, None, "RGB")
-    assert 0.25 < asked["near_plane"] < 0.25 + 1e-7
-    assert torch.equal(asked["colors"], splats.sh) and torch.equal(asked["quats"], unit(splats.quats))
+    assert (args["width"], args["height"], args["sh_degree"], args["eps2d"], args["rasterize_mode"]) == (50, 40, 1, 4.8, "classic")
+    assert args["Ks"][0].tolist() == [[30.0, 0.0, pytest.approx(21.3)], [0.0, 26.0, pytest.approx(18.9)], [0.0, 0.0, 1.0]]
+    assert args["backgrounds"].tolist() == [[pytest.approx(0.2), 0.5, pytest.approx(0.9)]]
+    assert (args["packed"], args["covars"], args["render_mode"]) == (False, None, "RGB")
+    assert 0.25 < args["near_plane"] < 0.25 + 1e-7
+    assert torch.equal(args["colors"], splats.sh) and torch.equal(args["quats"], unit(splats.quats))
 
 
-def test_the_eye_is_where_the_world_begins(stand_in):
+def test_the_eye_becomes_the_origin(stand_in):
     splats = gaussians(20, dtype=torch.float32)
     OnProcessor().render(splats, WIDE, Effects(1))
-    viewmat, means = stand_in.asked["viewmats"][0], stand_in.asked["means"]
+    viewmat, means = stand_in.received["viewmats"][0], stand_in.received["means"]
     assert viewmat[:3, 3].tolist() == [0.0, 0.0, 0.0]
     there = splats.means.double() @ WIDE.viewmat[:3, :3].T + WIDE.viewmat[:3, 3]
     torch.testing.assert_close(means @ viewmat[:3, :3].T, there.float())
 
 
 @pytest.mark.parametrize("screen_filter", ["antialiased", "mip"])
-def test_filters_that_keep_light_are_gsplats_antialiased(stand_in, screen_filter):
+def test_filters_that_compensate_are_gsplats_antialiased(stand_in, screen_filter):
     OnProcessor().render(gaussians(20, dtype=torch.float32), WIDE, Effects(1, screen_filter, 0.1))
-    assert (stand_in.asked["rasterize_mode"], stand_in.asked["eps2d"]) == ("antialiased", 0.1)
+    assert (stand_in.received["rasterize_mode"], stand_in.received["eps2d"]) == ("antialiased", 0.1)
 
 
-def test_covariances_are_handed_on(stand_in):
+def test_covariances_are_passed_on(stand_in):
     splats = gaussians(20, dtype=torch.float32)
     splats = replace(splats, covariances=covariances(splats))
     OnProcessor().render(splats, WIDE, Effects(1))
-    assert torch.equal(stand_in.asked["covars"], splats.covariances)
+    assert torch.equal(stand_in.received["covars"], splats.covariances)
 
 
 def test_gsplats_twins_draw_the_reference_but_for_what_is_known(stand_in):
-    cases = {name: build for name, build in CASES.items() if not name.startswith("10000")}  # too many for the twins' loops in Python
+    cases = {name: build for name, build in CASES.items() if not name.startswith("10000")}  # too slow in the Python loops of the stand-in
     outcomes = check_backend(OnProcessor(), cases)
     assert {outcome.case for outcome in outcomes if not outcome.passed} == KNOWN
     drawn = [outcome for outcome in outcomes if not outcome.skipped]
@@ -114,7 +114,7 @@ def test_nothing_is_cut_that_the_reference_draws(stand_in):
     assert torch.equal(ours.alpha > 0, ReferenceBackend().render(splats, WIDE, Effects(1)).alpha > 0)
 
 
-def test_what_is_missing_is_said(monkeypatch):
+def test_what_is_missing_is_reported(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert GsplatBackend().lacking(USUAL) == [NO_CUDA]
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
@@ -136,12 +136,12 @@ def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
         GsplatBackend().render(gaussians(2, dtype=torch.float32), WIDE, Effects(1))
 
 
-def test_what_is_missing_is_looked_for_once(stand_in, monkeypatch):
-    backend, looked = OnProcessor(), []
-    monkeypatch.setattr(OnProcessor, "lacking", lambda self, needs: looked.append(needs) or [])
+def test_requirements_are_checked_once_per_kind_of_request(stand_in, monkeypatch):
+    backend, checked = OnProcessor(), []
+    monkeypatch.setattr(OnProcessor, "lacking", lambda self, needs: checked.append(needs) or [])
     for filters in ("classic", "classic", "mip"):
         backend.render(gaussians(2, dtype=torch.float32), WIDE, Effects(1, filters))
-    assert [needs.screen_filter for needs in looked] == ["classic", "mip"]
+    assert [needs.screen_filter for needs in checked] == ["classic", "mip"]
 
 
 def test_the_module_loads_no_gsplat():

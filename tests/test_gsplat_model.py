@@ -17,7 +17,7 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.wrap import wrap_model
 
 NAMES = ["means", "scales", "quats", "opacities", "sh0", "shN"]
@@ -219,20 +219,20 @@ def test_the_normalized_world_is_found_again_whatever_half_turn_was_taken(tmp_pa
     frame = np.diag([*turn, 1.0]) @ normalized_by_numpy(cameras, points)
     raw = {**splats(500), "means": torch.tensor(points @ frame[:3, :3].T + frame[:3, 3], dtype=torch.float32)}
     model = load_model(gsplat_folder(tmp_path / "r", raw))
-    placed = model.as_trained(cameras, Taken(torch.tensor(points)))
+    placed = model.as_trained(cameras, Capture(torch.tensor(points)))
     for camera, new in zip(cameras, placed, strict=True):
         pose = frame @ np.linalg.inv(camera.viewmat.numpy())
         pose[:3, :3] /= np.linalg.norm(pose[0, :3])
         assert np.allclose(new.viewmat.numpy(), np.linalg.inv(pose), atol=1e-6)
         assert (new.width, new.height, new.fx) == (32, 24, camera.fx / 4)
-    with pytest.raises(SceneError, match="another than gsplat trained on"):
-        model.as_trained(cameras, Taken(torch.tensor(points) @ torch.diag(torch.tensor([1.0, 9.0, 1.0])).double()))
+    with pytest.raises(SceneError, match="give the scene that gsplat was trained on"):
+        model.as_trained(cameras, Capture(torch.tensor(points) @ torch.diag(torch.tensor([1.0, 9.0, 1.0])).double()))
     with pytest.raises(SceneError, match="give the COLMAP scene"):
-        model.as_trained(cameras, Taken())
+        model.as_trained(cameras, Capture())
 
 
 def test_a_world_that_was_not_normalized_is_the_scenes_own(tmp_path):
     model = load_model(gsplat_folder(tmp_path / "r", splats(), normalized="false"))
     camera = tiny.cameras(1, width=128, height=96)[0]
-    [placed] = model.as_trained([camera], Taken())
+    [placed] = model.as_trained([camera], Capture())
     assert torch.equal(placed.viewmat, camera.viewmat) and placed.size == (24, 32)

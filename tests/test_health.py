@@ -30,7 +30,7 @@ def spoiled(name: str, row: int, value) -> VanillaModel:
 def test_a_healthy_model_has_nothing_to_tell():
     health = examine(healthy())
     assert health.sentences() == []
-    assert not health.poisonous.any()
+    assert not health.invalid.any()
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_oddities_are_counted_and_kept(name, value, sentence):
     health = examine(spoiled(name, 7, value))
     assert [told for told in health.sentences() if told.startswith(sentence)]
     assert len(health.sentences()) == 1
-    assert not health.poisonous.any()
+    assert not health.invalid.any()
 
 
 @pytest.mark.parametrize("logit", [math.log(1 / 254) - 1e-4, math.log(1 / 254) + 1e-4])
@@ -72,7 +72,7 @@ def test_poison_in_one_row_is_dropped_at_load_with_a_note(tmp_path, field, value
 @pytest.mark.parametrize("log_scale", [89.0, 45.0])
 def test_scales_whose_variance_overflows_are_poison(log_scale):
     health = examine(spoiled("scales", 5, [log_scale, 0, 0]))
-    assert health.poisonous.nonzero().tolist() == [[5]]
+    assert health.invalid.nonzero().tolist() == [[5]]
 
 
 def test_strays_do_not_set_the_extent():
@@ -99,7 +99,7 @@ def test_a_few_splats_say_nothing_about_distributions():
 @pytest.mark.parametrize("count", [0, 1])
 def test_nearly_empty_models(count):
     health = examine(healthy(count))
-    assert (health.splats, health.extent, health.huge, len(health.poisonous)) == (count, 0.0, 0, count)
+    assert (health.splats, health.extent, health.huge, len(health.invalid)) == (count, 0.0, 0, count)
 
 
 def test_drop_takes_rows_of_every_field_and_of_extra_columns(tmp_path):

@@ -1,4 +1,4 @@
-"""What INRIA's rasterizer is asked for, in both generations, and that the answer would be the reference's image."""
+"""The arguments that INRIA's rasterizer is called with, in both generations, and that they describe the reference's image."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from samples import camera, gaussians
 from mipmap_plugin.backends import BACKENDS, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, check_backend
-from mipmap_plugin.backends.guests import NO_CUDA
+from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.inria import NO_PACKAGE, OLDER, PACKAGE, Frame, InriaBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects, RenderSettings
@@ -47,10 +47,10 @@ def is_newer(package) -> bool:
     return package.GaussianRasterizationSettings._fields != OLDER
 
 
-def test_it_is_asked_in_its_own_words(package):
+def test_the_arguments_are_those_of_the_rasterizer(package):
     splats = gaussians(20, 2, dtype=torch.float32)
     OnProcessor().render(splats, WIDE, Effects(1, background=(0.2, 0.5, 0.9)))
-    ((settings, shs, packed),) = package.asked
+    ((settings, shs, packed),) = package.received
     assert (settings.image_height, settings.image_width, settings.sh_degree) == (40, 50, 1)
     assert (settings.tanfovx, settings.tanfovy) == (50 / 60, 40 / 52)
     assert (settings.scale_modifier, settings.prefiltered, settings.debug) == (1.0, False, False)
@@ -64,16 +64,16 @@ def test_it_is_asked_in_its_own_words(package):
 def test_a_point_falls_where_the_camera_says(package):
     OnProcessor().render(gaussians(2, dtype=torch.float32), WIDE, Effects(1))
     point = torch.tensor([0.4, -0.3, 2.0, 1.0])
-    seen = (point @ package.asked[0][0].projmatrix).double()
+    seen = (point @ package.received[0][0].projmatrix).double()
     x, y, z = (WIDE.viewmat[:3, :3] @ point[:3].double()).tolist()
     pixel = [(float(seen[axis] / seen[3]) + 1) / 2 * size for axis, size in enumerate((50, 40))]
     assert pixel == pytest.approx([30 * x / z + 21.3, 26 * y / z + 18.9], abs=1e-5)
 
 
 @pytest.mark.parametrize(("kind", "eps2d"), [("classic", 0.3), ("classic", 4.8), ("classic", 0.3 / 64), ("antialiased", 0.3), ("mip", 0.1)])
-def test_it_filters_itself_where_it_can(package, kind, eps2d):
+def test_its_own_filter_is_used_where_possible(package, kind, eps2d):
     OnProcessor().render(gaussians(20, dtype=torch.float32), WIDE, Effects(1, kind, eps2d))
-    settings, _, packed = package.asked[0]
+    settings, _, packed = package.received[0]
     own = eps2d == 0.3 and (kind == "classic" or (kind == "antialiased" and is_newer(package)))
     assert (packed is None) == own
     assert settings._asdict().get("antialiasing", False) == (own and kind == "antialiased")
@@ -88,19 +88,19 @@ def test_it_draws_the_reference_but_for_extreme_needles(package):
     assert skipped == integrated | {case for case, build in cases.items() if build().effects.settings != RenderSettings()} | {"sh-degree-4"}
 
 
-def test_alpha_is_drawn_when_it_is_asked_for(package):
+def test_alpha_is_rendered_on_first_access(package):
     splats = gaussians(40, dtype=torch.float32)
     rendered = OnProcessor().render(splats, WIDE, Effects(1))
-    assert len(package.asked) == 1
+    assert len(package.received) == 1
     torch.testing.assert_close(rendered.alpha, ReferenceBackend().render(splats, WIDE, Effects(1)).alpha, atol=1e-5, rtol=0)
-    assert rendered.alpha is rendered.alpha and len(package.asked) == 2
-    assert rendered.but(effects=()).alpha is rendered.alpha
+    assert rendered.alpha is rendered.alpha and len(package.received) == 2
+    assert rendered.replaced(effects=()).alpha is rendered.alpha
 
 
 @pytest.mark.parametrize("near", [0.0, 0.01, 0.2, 1.5])
-def test_the_near_plane_is_the_one_asked_for(package, near):
+def test_the_near_plane_is_the_requested_one(package, near):
     splats = gaussians(40, dtype=torch.float32)
-    splats.means[:4] = 0  # behind the camera or in the very eye
+    splats.means[:4] = 0  # behind the camera or exactly at the eye
     effects = Effects(1, near_plane=near)
     torch.testing.assert_close(
         OnProcessor().render(splats, WIDE, effects).image, ReferenceBackend().render(splats, WIDE, effects).image, atol=1e-4, rtol=0
@@ -114,12 +114,12 @@ def test_a_principal_point_far_off_comes_to_the_middle(center, left, width):
     assert (frame.left, frame.camera.width, frame.camera.cx) == (left, width, center + left)
     assert abs(frame.camera.cx - width / 2) <= max(0.5, 0.15 * width)
     image = torch.arange(width)[None].expand(32, width)
-    assert frame.cut(image)[0].tolist() == list(range(left, left + 40))
+    assert frame.crop(image)[0].tolist() == list(range(left, left + 40))
 
 
-def test_what_is_missing_is_said(monkeypatch):
-    found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == PACKAGE else found(name))
+def test_what_is_missing_is_reported(monkeypatch):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == PACKAGE else find_spec(name))
     assert InriaBackend().lacking(USUAL) == [NO_PACKAGE]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)

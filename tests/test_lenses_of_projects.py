@@ -12,7 +12,7 @@ from PIL import Image
 from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import load_scene, read_cameras, write_cameras
 from mipmap_plugin.wrap import placed
 
@@ -30,7 +30,7 @@ def of_gsplat(path, factor):
 def test_gsplat_divides_the_lens_and_then_fits_it_to_the_picture(tmp_path, width, factor, actual):
     """examples/datasets/colmap.py: K over the factor, times the size of the first photograph over a size that was rounded down."""
     [camera] = tiny.cameras(1, width=width, height=width * 3 // 4)
-    [new] = of_gsplat(tmp_path / "r", factor).as_trained([camera], Taken(smaller=lambda asked: actual if asked == factor else None))
+    [new] = of_gsplat(tmp_path / "r", factor).as_trained([camera], Capture(smaller=lambda asked: actual if asked == factor else None))
     floored = width // factor, width * 3 // 4 // factor
     assert (new.width, new.height) == (int(floored[0] * (actual[0] / floored[0])), int(floored[1] * (actual[1] / floored[1])))
     assert new.fx == pytest.approx(camera.fx / factor * actual[0] / floored[0], rel=1e-12)
@@ -39,7 +39,7 @@ def test_gsplat_divides_the_lens_and_then_fits_it_to_the_picture(tmp_path, width
 
 def test_gsplat_without_photographs_rounds_as_its_resizing_does(tmp_path):
     [camera] = tiny.cameras(1, width=1003, height=752)
-    [new] = of_gsplat(tmp_path / "r", 7).as_trained([camera], Taken())
+    [new] = of_gsplat(tmp_path / "r", 7).as_trained([camera], Capture())
     assert (new.width, new.height) == (143, 107)
 
 

@@ -123,8 +123,8 @@ class Anchors:
         (dict.fromkeys(splats()), "holds no tensor for means"),
         (Mip(), "has a 3D filter .* give the path"),
         (Anchors(), "has anchors with networks .* give the path"),
-        ({**splats(), "features": torch.zeros(30, 32)}, "a dict with means, .*is no model that is known"),
-        (7, "a int is no model that is known; give a path"),
+        ({**splats(), "features": torch.zeros(30, 32)}, "a dict with means, .*is not a known kind of model"),
+        (7, "a int is not a known kind of model; give a path"),
     ],
 )
 def test_other_objects_are_refused_in_one_sentence(thing, sentence):

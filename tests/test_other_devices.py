@@ -15,7 +15,7 @@ import torch
 import torch_checkpoints
 
 from mipmap_plugin import load_model, load_scene, wrap_model
-from mipmap_plugin.adaptation.optimization import optimizer, run
+from mipmap_plugin.adaptation.optimization import run
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends import gsplat, inria
@@ -32,8 +32,15 @@ EXACT = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 10)
 @pytest.fixture(autouse=True)
 def plain_adam(monkeypatch):
     """Torch fuses Adam on devices that it knows to be real."""
-    real = torch.optim.Adam
-    monkeypatch.setattr(optimizer.torch.optim, "Adam", lambda *args, fused, **named: real(*args, **named, foreach=False))
+
+    def update(tensors, grads, first, second, _, steps, *, lr, beta1, beta2, eps, **_others):
+        for tensor, grad, mean, square, step in zip(tensors, grads, first, second, steps, strict=True):
+            mean.lerp_(grad, 1 - beta1)
+            square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+            root = square.sqrt() / (1 - beta2**step).sqrt() + eps
+            tensor.sub_(lr / (1 - beta1**step) * mean / root)
+
+    monkeypatch.setattr(torch, "_fused_adam_", update)
 
 
 FAMILIES = {

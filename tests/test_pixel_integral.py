@@ -50,8 +50,8 @@ def test_float32_loses_nothing_at_any_width(sigma):
     torch.testing.assert_close(integral(u, torch.tensor(sigma)).double(), exact, rtol=2e-4 if sigma < 0.01 else 1e-5, atol=1e-7)
 
 
-def test_light_is_what_the_splat_holds():
-    """Summed over all pixels, an integral is the whole: opacity · 2π · both standard deviations, while alpha stays small."""
+def test_the_sum_over_pixels_is_the_integral_of_the_splat():
+    """While alpha is small, the sum over all pixels is opacity · 2π · σ_long · σ_short."""
     for size in ((0.3, 0.05), (1.5, 0.7), (2.0, 2.0)):
         g = facing(size, turned=0.4)
         mass = 0.5 * 2 * math.pi * size[0] * size[1]

@@ -56,14 +56,14 @@ def test_portable_is_every_built_in_viewer_with_the_usual_one_first():
 
 
 def test_several_viewers_draw_no_picture():
-    with pytest.raises(SettingsError, match=r"portable is not one viewer but several, .*; name one: classic, antialiased, mip"):
+    with pytest.raises(SettingsError, match=r"portable is a group of viewers, .*; name one of them: classic, antialiased, mip"):
         find_viewer("portable")
 
 
 def test_the_command_does_not_draw_as_several(tmp_path, capsys):
     words = ["render", tiny.folder(tmp_path / "base"), "--output", tmp_path / "out", "--viewer", "portable"]
     assert cli.main([str(word) for word in words]) == 2
-    assert "portable is not one viewer but several" in capsys.readouterr().err
+    assert "portable is a group of viewers" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -75,7 +75,7 @@ def test_files_of_a_family_that_keeps_its_filter_are_not_portable():
 def test_a_group_is_made_of_names():
     for wrong in ((), (find_viewer("spark"),)):
         register_viewer("wrong", wrong, replace=True)
-        with pytest.raises(PluginError, match="it has to be the names of registered viewers"):
+        with pytest.raises(PluginError, match="must contain names of registered viewers"):
             viewers_for("wrong")
 
 

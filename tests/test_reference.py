@@ -47,8 +47,8 @@ def test_covariances_override_quats_and_scales():
     g = gaussians()
     rotation = torch.linalg.qr(torch.randn(len(g), 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))[0]
     covariances = rotation @ torch.diag_embed(g.scales**2) @ rotation.mT
-    given = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh, covariances)
-    torch.testing.assert_close(BACKEND.render(given, camera(), Effects(1)).image, brute_force(given, camera())[0], atol=1e-10, rtol=0)
+    turned = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh, covariances)
+    torch.testing.assert_close(BACKEND.render(turned, camera(), Effects(1)).image, brute_force(turned, camera())[0], atol=1e-10, rtol=0)
 
 
 def test_batches_do_not_change_the_image(monkeypatch):
@@ -58,7 +58,7 @@ def test_batches_do_not_change_the_image(monkeypatch):
 
 
 def test_gradients_equal_finite_differences():
-    # The cut-offs are steps, where no derivative exists: opacities are kept so high, and splats so few and large, that none is crossed.
+    # At cut-offs there is no derivative: opacities are so high, and splats so few and large, that no pixel is near one.
     g = gaussians(5, seed=3)
     view = camera(6, 5, 7.0, 6.5)
     g = Gaussians(torch.cat([g.means[:, :2] * 0.2, 2 + g.means[:, 2:].abs()], 1), g.quats, g.scales + 0.8, 0.1 + 0.6 * g.opacities, g.sh)
@@ -76,10 +76,10 @@ def test_every_parameter_has_a_gradient():
 
 
 def test_t1_spherical_harmonics():
-    want = [0.282094792, -0.261169028, 0.391753542, -0.130584514, 0.156078347, -0.468235042, 0.292863596, -0.234117521,
-            -0.117058760, 0.022527969, 0.331092173, -0.540952781, 0.064115724, -0.270476391, -0.248319130, 0.123903829]  # fmt: skip
+    expected = [0.282094792, -0.261169028, 0.391753542, -0.130584514, 0.156078347, -0.468235042, 0.292863596, -0.234117521,
+                -0.117058760, 0.022527969, 0.331092173, -0.540952781, 0.064115724, -0.270476391, -0.248319130, 0.123903829]  # fmt: skip
     direction = torch.nn.functional.normalize(torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64))
-    torch.testing.assert_close(basis(direction, 3)[0], torch.tensor(want, dtype=torch.float64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(basis(direction, 3)[0], torch.tensor(expected, dtype=torch.float64), atol=1e-9, rtol=0)
 
 
 def test_degree_four_is_orthonormal():
@@ -104,8 +104,8 @@ def t3_gaussian() -> Gaussians:
 def test_t3_projection():
     projected = project(t3_gaussian(), t2_camera(), 0.2)
     got = torch.cat([projected.depths, projected.means2d[0], projected.xx, projected.xy, projected.yy])
-    want = [4.325263158, 37.758091993, 21.765879776, 2.718538992, 0.113341465, 0.784628197]
-    torch.testing.assert_close(got, torch.tensor(want, dtype=torch.float64), atol=1e-7, rtol=0)
+    expected = [4.325263158, 37.758091993, 21.765879776, 2.718538992, 0.113341465, 0.784628197]
+    torch.testing.assert_close(got, torch.tensor(expected, dtype=torch.float64), atol=1e-7, rtol=0)
     dilated = footprint(projected, t3_gaussian().opacities, "classic", 0.3)
     assert float(dilated.across * dilated.yy) == pytest.approx(3.261146218, abs=1e-7)
     compensated = footprint(projected, t3_gaussian().opacities, "antialiased", 0.3)

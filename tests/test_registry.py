@@ -1,4 +1,4 @@
-"""Names in, objects out: strangers' backends are listed with their reasons, and a broken one breaks nothing."""
+"""Registries: third-party backends are listed with their reasons, and a broken one breaks nothing."""
 
 import sys
 from dataclasses import replace
@@ -68,7 +68,7 @@ def test_auto_takes_the_fastest_that_lacks_nothing_and_says_why():
     register_backend("fussy", Fussy)
     backend, why = choose_backend("auto", NEEDS)
     assert isinstance(backend, Fast)
-    assert why == "fast: the fastest that lacks nothing; fussy not, because it is not in the mood"
+    assert why == "fast: the fastest that can serve the request; fussy cannot: it is not in the mood"
 
 
 def test_on_a_gpu_the_users_own_rasterizer_comes_first_and_what_is_untried_is_said(monkeypatch):
@@ -83,8 +83,8 @@ def test_on_a_gpu_the_users_own_rasterizer_comes_first_and_what_is_untried_is_sa
     assert taken == ["gsplat", "triton", "inria"]
     monkeypatch.setattr("mipmap_plugin.backends.triton.TritonBackend.lacking", lambda self, needs: [])
     assert choose_backend("auto", on_gpu)[1] == (
-        "triton: the fastest that lacks nothing (never run on a GPU by this package's author); "
-        "gsplat not, because it is not built; inria not, because it is not built"
+        "triton: the fastest that can serve the request (not tested on a GPU by this package's author); "
+        "gsplat cannot: it is not built; inria cannot: it is not built"
     )
 
 
@@ -100,7 +100,7 @@ def test_checkpoints_go_to_a_gpu_that_something_faster_serves(monkeypatch):
 def test_asking_by_name():
     register_backend("fussy", Fussy)
     backend, why = choose_backend("reference", NEEDS)
-    assert (type(backend), why) == (ReferenceBackend, "reference: asked for")
+    assert (type(backend), why) == (ReferenceBackend, "reference: requested")
     with pytest.raises(BackendUnavailable, match="backend 'fussy' cannot do this: it is not in the mood; nor will it be"):
         choose_backend("fussy", NEEDS)
     with pytest.raises(SettingsError, match=r"mipmap_plugin\.backends: there is no 'gpu'; known are fussy, reference"):
@@ -122,9 +122,9 @@ def test_no_backend_at_all_gives_every_reason():
         ("no_such_package:Backend", "'bad' (no_such_package:Backend) cannot be loaded: ModuleNotFoundError: No module named 'no_such_package'"),
         ("mipmap_plugin.backends.reference:Missing", "cannot be loaded: AttributeError"),
         ("mipmap_plugin.backends.reference", "cannot be loaded: AttributeError"),
-        (Crashing, "backend 'bad' cannot be made: RuntimeError: no driver"),
-        (Ancient, f"backend 'bad' is written for API version {API_VERSION - 1}, this package has {API_VERSION}"),
-        (object, f"backend 'bad' is written for API version unknown, this package has {API_VERSION}"),
+        (Crashing, "backend 'bad' cannot be created: RuntimeError: no driver"),
+        (Ancient, f"backend 'bad' is written for API version {API_VERSION - 1}, but this package has API version {API_VERSION}"),
+        (object, f"backend 'bad' is written for API version unknown, but this package has API version {API_VERSION}"),
     ],
 )
 def test_a_broken_plugin_is_listed_with_its_reason_and_breaks_nothing(target, reason):
@@ -155,7 +155,7 @@ def test_the_listing_names_every_backend_and_its_reasons():
 def test_the_listing_notes_what_never_ran():
     register_backend("triton", "mipmap_plugin.backends.triton:TritonBackend")
     notes = {row.name: row.note for row in listing()}
-    assert notes == {"reference": "", "triton": "never run on a GPU by this package's author"}
+    assert notes == {"reference": "", "triton": "not tested on a GPU by this package's author"}
     assert notes["triton"] in listing_table(listing())
 
 

@@ -81,7 +81,7 @@ def test_a_training_view_sees_its_own_appearance(tmp_path):
     view = Camera(**{**vars(VIEWS[0]), "index": 3})
     model = load(tmp_path, layout)
     agrees(model.gaussians(view), oracle.decode(checkpoints.columns(layout), states, layout, view, states["appearance"]["embedding.weight"][3]))
-    with pytest.raises(SettingsError, match="number 5, but the model knows the appearance of 5"):
+    with pytest.raises(SettingsError, match="index 5, but the model has the appearance of 5"):
         model.gaussians(Camera(**{**vars(view), "index": 5}))
 
 
@@ -104,7 +104,7 @@ def test_what_is_inspected_tells_the_layout(tmp_path):
     notes = load(tmp_path, LAYOUTS["feature bank"]).notes
     assert "40 anchors with 3 splats each, which are decoded for each camera" in notes
     assert "the distance of the camera goes into opacity_mlp, feature_bank_mlp" in notes
-    assert any("appearance of 3 training views" in note for note in notes)
+    assert any("appearance for each of 3 training views" in note for note in notes)
 
 
 def test_a_bare_ply_finds_the_networks_beside_it(folder):

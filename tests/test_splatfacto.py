@@ -14,7 +14,7 @@ from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.yaml_scalars import read_scalars
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.wrap import wrap_model
 
 CKPT = "nerfstudio_models/step-000029999.ckpt"
@@ -119,7 +119,7 @@ def test_the_cameras_of_the_scene_are_carried_into_the_frame_of_the_checkpoint(t
     folder = splatfacto_folder(tmp_path / "r", splats())
     (folder / "dataparser_transforms.json").write_text(json.dumps(TRANSFORMS))
     model, camera = load_model(folder), tiny.cameras()[0]
-    [placed] = model.as_trained([camera], Taken())
+    [placed] = model.as_trained([camera], Capture())
     transform, scale = torch.tensor(TRANSFORMS["transform"], dtype=torch.float64), TRANSFORMS["scale"]
     assert torch.allclose(placed.center, scale * (transform[:, :3] @ camera.center + transform[:, 3]))
     seen = lambda view, points: points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]  # noqa: E731
@@ -133,7 +133,7 @@ def test_the_cameras_of_the_scene_are_carried_into_the_frame_of_the_checkpoint(t
 def test_large_photographs_were_shrunk_for_the_training(tmp_path, downscale, size):
     folder = splatfacto_folder(tmp_path / "r", splats(), downscale=downscale)
     (folder / "dataparser_transforms.json").write_text(json.dumps(TRANSFORMS))
-    [placed] = load_model(folder).as_trained(tiny.cameras(1, width=4000, height=2000), Taken())
+    [placed] = load_model(folder).as_trained(tiny.cameras(1, width=4000, height=2000), Capture())
     assert placed.size == size
 
 
@@ -143,7 +143,7 @@ def test_without_its_transform_the_cameras_cannot_be_placed(tmp_path, content):
     if content is not None:
         (folder / "dataparser_transforms.json").write_text(content)
     with pytest.raises(SceneError, match=r"dataparser_transforms.json.*copy it"):
-        load_model(folder).as_trained(tiny.cameras(), Taken())
+        load_model(folder).as_trained(tiny.cameras(), Capture())
 
 
 # Adapting

@@ -96,18 +96,18 @@ def test_a_place_that_another_family_has_too_is_no_claim(tmp_path):
         ("no_such_package:FAMILY", "cannot be loaded: ModuleNotFoundError"),
         (lambda path: None, "is of type function; make it a mipmap_plugin.models.Family"),
         (mine(name="other"), "calls itself 'other'"),
-        (mine(api_version=API_VERSION + 1), f"is written for API version {API_VERSION + 1}, this package has {API_VERSION}"),
+        (mine(api_version=API_VERSION + 1), f"is written for API version {API_VERSION + 1}, but this package has API version {API_VERSION}"),
         (mine(recognize=lambda files: files.nothing), "has no attribute 'nothing'"),
         (mine(recognize=lambda files: True), "its recognize returns a bool; it has to be a Match or None"),
-        (mine(before="3dgs"), "names '3dgs' as what it comes before; give a tuple of names"),
+        (mine(before="3dgs"), "`before` must be a tuple of names, got '3dgs'"),
     ],
 )
 def test_a_broken_family_is_told_of_and_breaks_nothing(tmp_path, target, reason):
     register_model("mine", target)
     found = detect(ply(tmp_path / "a.ply"))
-    assert found.family == "3dgs" and "the family 'mine' could not be asked" in found.notes[0] and reason in found.notes[0]
+    assert found.family == "3dgs" and "the family 'mine' failed" in found.notes[0] and reason in found.notes[0]
     assert wrap_model(found.path).model.family == "3dgs"
-    with pytest.raises(CheckpointError, match="could not be asked"):
+    with pytest.raises(CheckpointError, match="the family 'mine' failed"):
         detect(ply_files.write(tmp_path / "points.ply", {name: np.zeros(2, np.float32) for name in "xyz"}))
 
 

@@ -1,4 +1,4 @@
-"""The Triton backend where there is no GPU: its kernels compile, and it says what is missing. What they compute: `test_triton_interpreted.py`."""
+"""The Triton backend without a GPU: its kernels compile, and it reports what is missing. Their results: `test_triton_interpreted.py`."""
 
 from __future__ import annotations
 
@@ -16,23 +16,24 @@ from samples import camera, gaussians
 from mipmap_plugin.backends import BACKENDS, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import check_backend
-from mipmap_plugin.backends.guests import NO_CUDA
+from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.triton import NO_TRITON, TritonBackend, interpreted
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 
 MISSING = importlib.util.find_spec("triton") is None
-pytestmark = pytest.mark.skipif(interpreted(), reason="under the interpreter nothing is compiled, and a processor will do")
+pytestmark = pytest.mark.skipif(interpreted(), reason="under the interpreter nothing is compiled, and the CPU is supported")
 USUAL = Needs("cuda", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
 
 FLOAT, INT32, INT64 = "*fp32", "*i32", "*i64"
-TYPES = {"members": INT32, "owners": INT32, "boxes": INT32, "counts": INT32, "tiles": "*i16", "edges": INT64, "places": INT64, "starts": INT64}
-TYPES |= dict.fromkeys(("count", "width", "height", "columns", "rows", "nowhere"), "i32")
+TYPES = {"splat_ids": INT32, "owners": INT32, "boxes": INT32, "counts": INT32, "tiles": "*i16"}
+TYPES |= dict.fromkeys(("tile_offsets", "places", "starts"), INT64)
+TYPES |= dict.fromkeys(("count", "width", "height", "tiles_x", "tiles_y", "no_tile"), "i32")
 
 
 def compile_for(capability: int, kernel, warps: int = 4, **constants) -> str:
-    """The kernel's assembly for a compute capability, by the very compiler that a GPU's machine has."""
+    """The kernel's assembly for a compute capability, from the same compiler as on a machine with a GPU."""
     import triton
     from triton.backends.compiler import GPUTarget
     from triton.compiler import ASTSource
@@ -51,9 +52,9 @@ def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeyp
     from mipmap_plugin.backends.triton_kernels import binning, compositing, compositing_back, projection, projection_back
 
     splat = {"COMPENSATES": True, "DEGREE": 1, "BANDS": 4, "BLOCK": sizes.SPLATS}
-    for given in (False, True):
-        compile_for(capability, projection.project_kernel, GIVEN=given, TILE=sizes.TILE, **splat)
-        compile_for(capability, projection_back.project_back_kernel, GIVEN=given, **splat)
+    for has_covariances in (False, True):
+        compile_for(capability, projection.project_kernel, HAS_COVARIANCES=has_covariances, TILE=sizes.TILE, **splat)
+        compile_for(capability, projection_back.project_back_kernel, HAS_COVARIANCES=has_covariances, **splat)
     compile_for(capability, binning.emit_kernel, TILE=sizes.TILE, BLOCK=sizes.PAIRS)
     compile_for(capability, compositing.composite_kernel, sizes.WARPS_OF_MANY, TILE=sizes.TILE, BATCH=sizes.FORWARD_BATCH)
     for in_order in (False, True):
@@ -63,7 +64,7 @@ def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeyp
     compile_for(capability, compositing_back.gather_kernel, 1, ROWS=32)
 
 
-def test_what_is_missing_is_said(monkeypatch):
+def test_what_is_missing_is_reported(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert TritonBackend().lacking(USUAL) == [NO_TRITON if MISSING else NO_CUDA]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())

@@ -1,4 +1,4 @@
-"""The Triton kernels in Triton's interpreter: tiny images on a processor. Run them with `TRITON_INTERPRET=1 pytest -m interpreter`."""
+"""The Triton kernels in Triton's interpreter: tiny images on the CPU. Run with `TRITON_INTERPRET=1 pytest -m interpreter`."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ MISSING = importlib.util.find_spec("triton") is None
 pytestmark = [
     pytest.mark.interpreter,
     pytest.mark.skipif(MISSING or os.environ.get("TRITON_INTERPRET") != "1", reason="triton is not installed, or TRITON_INTERPRET is not 1"),
-    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # numpy's, of infinities that a GPU passes over in silence
+    pytest.mark.filterwarnings("ignore::RuntimeWarning"),  # numpy's, about infinities, on which a GPU does not warn
 ]
 
-# Two by three tiles, the last ones cut; off center, fx != fy.
+# Two by three tiles, the last ones cropped; off center, fx != fy.
 WIDE = camera(40, 24, 30.0, 26.0, cx=18.3, cy=13.9)
 
-# Of each kind of hard case one that has broken a rasterizer, here or elsewhere.
+# One case of each kind, which has broken a rasterizer here or elsewhere.
 HARD = [
     "no-splat", "no-splat-in-view", "identical-splats", "1e6-units-from-the-origin", "1e25-units-aside-classic", "in-the-eye-classic",
     "on-the-near-plane-classic", "center-beyond-the-frustum-body-on-antialiased", "needle-1e12-classic", "scale-0-on-three-axes-mip",
@@ -39,9 +39,9 @@ HARD = [
 
 
 def draw(backend, g: Gaussians, view, effects: Effects):
-    """Image, alpha and the gradients of a fixed weighting of all pixels, by the name of the tensor."""
-    given = {f.name: getattr(g, f.name) for f in fields(g)}
-    g = Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in given.items()})
+    """Image, alpha, and the gradients of a fixed weighted sum of all pixels by the name of the tensor."""
+    tensors = {f.name: getattr(g, f.name) for f in fields(g)}
+    g = Gaussians(**{name: t if t is None else t.detach().clone().requires_grad_() for name, t in tensors.items()})
     rendered = backend(g, view, effects)
     image, alpha = (rendered.image, rendered.alpha) if hasattr(rendered, "image") else rendered
     weights = torch.randn(*alpha.shape, 4, generator=torch.Generator().manual_seed(7), dtype=torch.float64).to(image)
@@ -110,7 +110,7 @@ def test_pixels_stop_where_they_should():
 
 
 def test_sums_in_one_order_are_the_same_sums():
-    """Torch also fills memory with NaN that nobody has written yet, so that none of it may be read."""
+    """In this mode torch also fills new memory with NaN, so reading uninitialized memory would be noticed."""
     g, view = gaussians(12), camera(24, 20)
     right = ours(g, view)
     try:
@@ -124,29 +124,29 @@ def test_sums_in_one_order_are_the_same_sums():
         torch.testing.assert_close(grad, right[2][name], atol=1e-6 * float(grad.abs().max()), rtol=1e-4)
 
 
-def test_a_tile_lists_what_it_shows_front_to_back_and_little_else():
+def test_a_tile_lists_its_visible_splats_front_to_back_and_few_others():
     from mipmap_plugin.backends.triton_kernels import drawing
     from mipmap_plugin.backends.triton_kernels.records import WIDTH
 
     g, view = gaussians(150, dtype=torch.float32), camera(64, 48)
-    splats = drawing.Splats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None)
-    made = drawing.draw(splats, view, Effects(1))[2]
-    x, y, along, shear, across, strength = made.records[:, :6].T[:, :, None, None]
-    assert made.records.shape[1] == WIDTH
+    splats = drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None)
+    drawn = drawing.draw(splats, view, Effects(1))[2]
+    x, y, along, shear, across, log2_opacity = drawn.records[:, :6].T[:, :, None, None]
+    assert drawn.records.shape[1] == WIDTH
     ys, xs = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     u = xs - x - shear * (ys - y)
-    alpha = torch.exp2(along * (ys - y) ** 2 + across * u**2 + strength)
-    seen = (alpha >= 1 / 255) & torch.isfinite(made.depths)[:, None, None]
+    alpha = torch.exp2(along * (ys - y) ** 2 + across * u**2 + log2_opacity)
+    seen = (alpha >= 1 / 255) & torch.isfinite(drawn.depths)[:, None, None]
     needed = seen.unflatten(2, (4, 16)).unflatten(1, (3, 16)).any(4).any(2).flatten(1)  # [N, tiles]
     listed = torch.zeros_like(needed)
     for tile in range(12):
-        members = made.bins.members[made.bins.edges[tile] : made.bins.edges[tile + 1]].long()
-        listed[members, tile] = True
-        assert (made.depths[members].diff() >= 0).all()
+        ids = drawn.bins.splat_ids[drawn.bins.tile_offsets[tile] : drawn.bins.tile_offsets[tile + 1]].long()
+        listed[ids, tile] = True
+        assert (drawn.depths[ids].diff() >= 0).all()
     assert not (needed & ~listed).any()
-    boxed = int(made.bins.counts.sum())
+    boxed = int(drawn.bins.counts.sum())
     assert needed.sum() <= listed.sum() < boxed
-    assert listed.sum() - needed.sum() < 0.2 * (boxed - needed.sum())  # what a box lists in vain, an ellipse hardly does
+    assert listed.sum() - needed.sum() < 0.2 * (boxed - needed.sum())  # far fewer than by boxes
 
 
 @pytest.mark.parametrize("case", HARD)
@@ -155,6 +155,6 @@ def test_hard_cases_equal_the_reference(case):
     assert outcome.passed and not outcome.skipped, outcome.message
 
 
-def test_under_the_interpreter_it_serves_processors_and_is_nobodys_choice():
+def test_under_the_interpreter_it_serves_the_cpu_and_is_never_chosen_by_auto():
     needs = Needs("cpu", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
     assert TritonBackend().lacking(needs) == [] and TritonBackend().speed < 0

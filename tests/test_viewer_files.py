@@ -61,10 +61,10 @@ WRITERS = {"2dgs": write_flat, "scaffold": anchor_checkpoints.write, "deformable
 @pytest.mark.parametrize(
     ("family", "why"),
     [
-        ("2dgs", "its splats are flat and met by rays (2DGS), which no viewer of the list does"),
-        ("scaffold", "networks decode its splats for each camera, which no viewer of the list does"),
-        ("deformable", "a network moves its splats, which no viewer of the list does"),
-        ("4dgs", "a network moves its splats, which no viewer of the list does"),
+        ("2dgs", "its splats are flat (2DGS), which none of the viewers draws"),
+        ("scaffold", "networks decode its splats for each camera, which none of the viewers does"),
+        ("deformable", "a network moves its splats, which none of the viewers supports"),
+        ("4dgs", "a network moves its splats, which none of the viewers supports"),
     ],
 )
 def test_what_no_viewer_draws_is_refused_before_any_work_and_inspect_says_why(tmp_path, capsys, family, why):

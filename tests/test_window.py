@@ -1,4 +1,4 @@
-"""Windows: what they hide, what they leave, and sizes at which their integrals would cancel or overflow."""
+"""Windows: occlusion by an edge, and sizes at which the integrals would cancel or overflow."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def facing(*splats: tuple[float, float, float, float], opacity: float = 1.0) -> 
     return Gaussians(torch.stack([x, y, depths], 1), quats, torch.stack([wide, high, 0 * x], 1), torch.full((count,), opacity).double(), colors)
 
 
-def test_an_edge_hides_what_lies_behind_it_and_nothing_else():
+def test_an_edge_occludes_only_what_lies_behind_it():
     """The edge of a wall over the left of the middle pixel; behind it a splat in the pixel's left or right."""
 
     def alpha(*splats):
@@ -45,7 +45,7 @@ def test_an_edge_hides_what_lies_behind_it_and_nothing_else():
     assert 0.2 < front < 0.4 and hidden[0] > 1.5 * hidden[1], (front, hidden)
 
 
-def test_it_is_nearer_to_many_samples_than_the_square_of_the_pixel_is():
+def test_it_is_closer_to_supersampling_than_the_analytic_filter():
     rng = torch.Generator().manual_seed(0)
     g = facing(*(4 * torch.rand(60, 4, generator=rng) - 2 + torch.tensor([0, 0, 2.2, 2.2])).mul(torch.tensor([1, 1, 0.3, 0.3])).tolist(), opacity=0.8)
     truth = render(ReferenceBackend(), g, VIEW, Effects(0, "classic", 0.0, supersampling=32)).image
@@ -65,8 +65,8 @@ def test_float32_loses_nothing_at_any_width(sigma):
     u = torch.linspace(-3 * sigma - 1, 3 * sigma + 1, 1001, dtype=torch.float64)
     nodes, weights = panels(100)
     shares = weights * torch.exp(-0.5 * ((u[:, None] + nodes) / sigma) ** 2)
-    found = moments(u.float(), torch.ones(1001), torch.tensor(sigma).float())
-    for moment, exact in zip(found, (shares, nodes * shares, nodes**2 * shares), strict=True):
+    computed = moments(u.float(), torch.ones(1001), torch.tensor(sigma).float())
+    for moment, exact in zip(computed, (shares, nodes * shares, nodes**2 * shares), strict=True):
         torch.testing.assert_close(moment.double(), exact.sum(-1), rtol=0, atol=3e-6)
 
 
@@ -81,7 +81,7 @@ def test_extreme_splats_have_finite_gradients(backend):
     assert gradients[2][:3, :2].any()
 
 
-def test_what_a_splat_was_dilated_by_goes_into_it():
+def test_dilation_adds_to_the_variance():
     wide = ReferenceBackend().render(facing((0.2, 0.1, math.hypot(0.5, 0.4), 0.5)), VIEW, WINDOW)
     dilated = ReferenceBackend().render(facing((0.2, 0.1, 0.5, 0.3)), VIEW, Effects(0, "window", 0.16))
     torch.testing.assert_close(dilated.image, wide.image, atol=1e-9, rtol=0)

@@ -61,7 +61,7 @@ def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects,
     if effects.outputs:
         from mipmap_plugin.backends import geometry  # an effect that is off is not imported
 
-        rendered = geometry.beside(rendered, backend, gaussians, camera, effects)
+        rendered = geometry.with_outputs(rendered, backend, gaussians, camera, effects)
     if matrix is not None:
-        rendered = rendered.but(image=exposed(rendered.image, matrix))
-    return rendered.but(effects=tuple(explain(effects, gaussians, effects_of(model))))
+        rendered = rendered.replaced(image=exposed(rendered.image, matrix))
+    return rendered.replaced(effects=tuple(explain(effects, gaussians, effects_of(model))))

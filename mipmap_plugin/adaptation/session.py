@@ -34,6 +34,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
+from mipmap_plugin.progress import announced
 
 # (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
@@ -172,7 +173,8 @@ class Session:
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
         began = time.perf_counter()
-        yield
+        with announced(f"{name} x{self.scale:g}"):
+            yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
     def steer(self, model: SplatModel) -> float:

@@ -1,4 +1,4 @@
-"""The registry of backends, and the choice among them."""
+"""The registry of backends, and the choice of one for a request."""
 
 from __future__ import annotations
 
@@ -25,24 +25,25 @@ BACKENDS = Registry(
 
 
 def register_backend(name: str, target: Any, *, replace: bool = False) -> None:
-    """Add a backend under `name`: a class, or `"package.module:Class"` that is imported at first use."""
+    """Register a backend under `name`: a class, or `"package.module:Class"`, which is imported at first use."""
     BACKENDS.add(name, target, replace=replace)
 
 
 def get_backend(name: str) -> Backend:
-    """The backend `name`. Raises SettingsError when unknown, PluginError when it does not load or is of another API version."""
-    maker = BACKENDS.get(name)
+    """The backend `name`. Raises SettingsError if it is unknown, PluginError if it does not load or has another API version."""
+    factory = BACKENDS.get(name)
     try:
-        backend = maker()
-    except Exception as error:  # a stranger's constructor may fail in any way; one broken plugin must not break the others
-        raise PluginError(f"backend {name!r} cannot be made: {type(error).__name__}: {error}") from error
+        backend = factory()
+    except Exception as error:  # a third-party constructor may fail in any way; one broken plug-in must not break the others
+        raise PluginError(f"backend {name!r} cannot be created: {type(error).__name__}: {error}") from error
     if getattr(backend, "api_version", None) != API_VERSION:
-        raise PluginError(f"backend {name!r} is written for API version {getattr(backend, 'api_version', 'unknown')}, this package has {API_VERSION}")
+        version = getattr(backend, "api_version", "unknown")
+        raise PluginError(f"backend {name!r} is written for API version {version}, but this package has API version {API_VERSION}")
     return backend
 
 
 def survey(*needs: Needs) -> dict[str, list[str]]:
-    """Every known backend and why it cannot serve all of `needs`; an empty list where it can."""
+    """For each registered backend, the reasons why it cannot serve all of `needs`; an empty list if it can."""
     reasons = {}
     for name in BACKENDS.names():
         try:
@@ -53,8 +54,8 @@ def survey(*needs: Needs) -> dict[str, list[str]]:
 
 
 def device_for(name: str) -> str:
-    """Where a model that comes from a file should lie: on the GPU where there is one and the backend `name`, or for `"auto"` any but the
-    reference, serves it there; else on the processor. Raises SettingsError for an unknown name."""
+    """The device to load a model to: "cuda" if there is a GPU that the backend `name` can use (for `"auto"`, any backend but the
+    reference), else "cpu". Raises SettingsError for an unknown name."""
     if not torch.cuda.is_available():
         return "cpu"
     usual = Needs("cuda", torch.float32, gradients=True, sh_degree=0, screen_filter="classic")
@@ -65,37 +66,37 @@ def device_for(name: str) -> str:
 
 
 def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
-    """The backend for all of `needs` and why it was taken. `"auto"`: the fastest that lacks nothing.
+    """The backend that serves all of `needs`, and why it was chosen. `"auto"`: the fastest that can serve them.
 
-    Raises BackendUnavailable with every reason when there is none.
+    Raises BackendUnavailable, with every reason, if there is none.
     """
     if name != "auto":
         backend = get_backend(name)
         reasons = _lacking(backend, needs)
         if reasons:
             raise BackendUnavailable(f"backend {name!r} cannot do this: {'; '.join(reasons)}")
-        return backend, f"{name}: asked for{_noted(backend)}"
+        return backend, f"{name}: requested{_note_in_brackets(backend)}"
     reasons_of = survey(*needs)
     able = [get_backend(name) for name, reasons in reasons_of.items() if not reasons]
     if not able:
         raise BackendUnavailable("no backend can do this: " + " | ".join(f"{n}: {'; '.join(r)}" for n, r in reasons_of.items()))
     best = max(able, key=lambda backend: backend.speed)
-    faster_not = [f"{n} not, because {r[0]}" for n, r in reasons_of.items() if r]
-    return best, f"{best.name}: the fastest that lacks nothing{_noted(best)}" + "".join(f"; {reason}" for reason in faster_not)
+    others = [f"{n} cannot: {r[0]}" for n, r in reasons_of.items() if r]
+    return best, f"{best.name}: the fastest that can serve the request{_note_in_brackets(best)}" + "".join(f"; {reason}" for reason in others)
 
 
 def _lacking(backend: Backend, needs: Sequence[Needs]) -> list[str]:
-    return list(dict.fromkeys(reason for each in needs for reason in backend.lacking(each)))
+    return list(dict.fromkeys(reason for need in needs for reason in backend.lacking(need)))
 
 
 def note_of(name: str) -> str:
-    """What is to be known of a backend; empty where there is nothing, or no backend."""
+    """The backend's own remark on itself; empty if it has none or does not load."""
     try:
         return getattr(get_backend(name), "note", "")
     except PluginError:
         return ""
 
 
-def _noted(backend: Backend) -> str:
+def _note_in_brackets(backend: Backend) -> str:
     note = getattr(backend, "note", "")
     return f" ({note})" if note else ""

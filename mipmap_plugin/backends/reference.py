@@ -1,4 +1,4 @@
-"""The reference backend: pure torch, any device, float32 or float64, exact gradients, in readable steps."""
+"""The reference backend: readable, pure torch, on any device, in float32 or float64, with exact gradients."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import SURFEL, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting import buckets
-from mipmap_plugin.splatting.compositing import Splats, alone, composite
+from mipmap_plugin.splatting.compositing import SortedSplats, composite, independent
 from mipmap_plugin.splatting.filters import SCREEN_FILTERS, Footprint, footprint
 from mipmap_plugin.splatting.harmonics import colors
-from mipmap_plugin.splatting.packing import in_steps, packed
+from mipmap_plugin.splatting.packing import packed, round_to
 from mipmap_plugin.splatting.pixel_integral import PixelIntegral
 from mipmap_plugin.splatting.projection import Projected, project
 from mipmap_plugin.splatting.surfels import Surfels, surfels
@@ -23,7 +23,7 @@ from mipmap_plugin.splatting.window import WindowIntegral
 
 
 class ReferenceBackend:
-    """What every other backend is measured against."""
+    """The backend that all others are compared with."""
 
     name = "reference"
     api_version = API_VERSION
@@ -31,9 +31,11 @@ class ReferenceBackend:
     capabilities = Capabilities(None, frozenset({torch.float32, torch.float64}), SCREEN_FILTERS | {SURFEL}, settings=frozenset(SETTINGS))
 
     def lacking(self, needs: Needs) -> list[str]:
+        """The reasons why this backend cannot serve `needs`; empty if it can."""
         return self.capabilities.lacking(needs)
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+        """The view of `camera`. Only the splats that can touch the image take part in the gradient graph."""
         settings = effects.settings
         ranks = buckets.ranks(gaussians, camera) if settings.bucketed else None
         if settings.packing is not None:
@@ -41,58 +43,58 @@ class ReferenceBackend:
         with torch.no_grad():
             rows = drawn_rows(gaussians, camera, effects, ranks)
         gaussians = gaussians[rows]
-        projected, feet = _footprints(gaussians, camera, effects)
+        projected, footprints = _footprints(gaussians, camera, effects)
         degree = min(effects.sh_degree, gaussians.sh_degree)
         rgb = colors(gaussians.sh, gaussians.means, camera.center.to(gaussians.means), degree)
         if settings.max_color is not None:
             rgb = rgb.clamp_max(settings.max_color)
         if settings.color_steps is not None:
-            rgb = in_steps(rgb, rgb.new_tensor(settings.color_steps))
-        least = least_alpha(feet, settings)
-        one_by_one = alone(feet.alpha, settings.max_alpha, settings.culls)
-        alphas, room = (feet.alphas, feet.ROOM) if isinstance(feet, WindowIntegral) else (one_by_one, 1)
-        splats = Splats(projected.means2d, feet.packed(), rgb, least, alphas, room)
-        image, through = composite(splats, feet.extents(least), camera, settings, rgb.new_tensor(effects.background))
-        return Rendered(image, 1 - through)
+            rgb = round_to(rgb, rgb.new_tensor(settings.color_steps))
+        least = least_alpha(footprints, settings)
+        by_splat = independent(footprints.alpha, settings.max_alpha, settings.culls)
+        alphas, memory = (footprints.alphas, footprints.MEMORY_FACTOR) if isinstance(footprints, WindowIntegral) else (by_splat, 1)
+        splats = SortedSplats(projected.means2d, footprints.packed(), rgb, least, alphas, memory)
+        image, transmittance = composite(splats, footprints.extents(least), camera, settings, rgb.new_tensor(effects.background))
+        return Rendered(image, 1 - transmittance)
 
 
 def drawn_rows(gaussians: Gaussians, camera: Camera, effects: Effects, ranks: Tensor | None = None) -> Tensor:
-    """Indices of the splats that can touch the image, front to back: as `ranks` [N] ascend, where they are given.
+    """Indices of the splats that can touch the image, front to back; in ascending order of `ranks` [N], if given.
 
-    Found first and without gradients, so that a row that is not drawn, however broken, is in no gradient either.
+    Computed first and without gradients, so that splats that are not drawn, even NaN, are not part of any gradient.
     """
-    projected, feet = _footprints(gaussians, camera, effects)
-    least = least_alpha(feet, effects.settings)
-    half = feet.extents(least)
+    projected, footprints = _footprints(gaussians, camera, effects)
+    least = least_alpha(footprints, effects.settings)
+    half = footprints.extents(least)
     low, high = projected.means2d - half, projected.means2d + half
     inside = (high > 0).all(1) & (low < low.new_tensor([camera.width, camera.height])).all(1)
     if effects.settings.frame < math.inf:
         inside &= (2 * projected.means2d / low.new_tensor([camera.width, camera.height]) - 1).abs().amax(1) <= effects.settings.frame
-    drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & feet.visible(least) & inside
+    drawn = finite_rows(gaussians) & (projected.depths > effects.near_plane) & footprints.visible(least) & inside
     rows = drawn.nonzero()[:, 0]
-    along = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1) if effects.settings.radial else projected.depths
-    along = along if ranks is None else ranks
-    return rows[along[rows].argsort(stable=True)]
+    keys = (gaussians.means - camera.center.to(gaussians.means)).norm(dim=1) if effects.settings.radial else projected.depths
+    keys = keys if ranks is None else ranks
+    return rows[keys[rows].argsort(stable=True)]
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:
-    """[N] bool: rows whose every number is finite."""
-    given = [gaussians.means, gaussians.opacities[:, None], gaussians.sh.flatten(1)]
+    """Which splats have finite numbers only, [N] bool."""
+    always = [gaussians.means, gaussians.opacities[:, None], gaussians.sh.flatten(1)]
     shape = [gaussians.quats, gaussians.scales] if gaussians.covariances is None else [gaussians.covariances.flatten(1)]
-    return torch.isfinite(torch.cat(given + shape, dim=1)).all(1)
+    return torch.isfinite(torch.cat(always + shape, dim=1)).all(1)
 
 
 @torch.no_grad()
-def least_alpha(feet: Footprint | PixelIntegral | Surfels, settings: RenderSettings) -> Tensor:
-    """[N]: the alpha below which each splat is not drawn. A radius of r standard deviations is exp(-r²/2) of its brightest.
+def least_alpha(footprints: Footprint | PixelIntegral | Surfels, settings: RenderSettings) -> Tensor:
+    """The alpha below which each splat is not drawn, [N]: `min_alpha`, or exp(-r²/2) times its peak if it is cut at a radius of r.
 
-    One that fades is nothing there.
+    A splat that fades is not cut: its alpha is 0 at that radius.
     """
-    numbers = feet.packed()
+    parameters = footprints.packed()
     if settings.radius is None or settings.fades:
-        return numbers.new_full(numbers.shape[:1], settings.min_alpha)
-    zero = torch.zeros_like(numbers[:, 0])
-    return (feet.alpha(numbers, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
+        return parameters.new_full(parameters.shape[:1], settings.min_alpha)
+    zero = torch.zeros_like(parameters[:, 0])
+    return (footprints.alpha(parameters, zero, zero) * math.exp(-(settings.radius**2) / 2)).clamp_min(settings.min_alpha)
 
 
 def _footprints(gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[Projected, Footprint | PixelIntegral | Surfels]:

@@ -1,4 +1,4 @@
-"""N x N supersampling on top of any backend: the exact answer that other filters are compared with."""
+"""N x N supersampling on top of any backend: the ground truth that screen filters are compared with."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from mipmap_plugin.gaussians import Gaussians
 
 
 def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
-    """The view of `camera` with `effects.supersampling`² samples in each pixel, averaged.
+    """The view of `camera`, averaged over `effects.supersampling`² samples per pixel.
 
-    The screen filter keeps its size in output pixels. With eps2d = 0.3·s² and N = 1/s this is the base render, box-averaged.
+    The screen filter keeps its size in output pixels. With eps2d = 0.3·s² and N = 1/s this is the box-filtered render of the base.
     """
     n = effects.supersampling
     if n == 1:

@@ -1,22 +1,24 @@
-"""A rasterizer for CUDA that needs no build: Triton kernels, which come with torch's CUDA wheels. Same image as the reference.
+"""The Triton backend: a CUDA rasterizer without a build step, for Triton comes with torch's CUDA wheels. Same image as the reference.
 
-Never run on a GPU by its author: the kernels were compiled for compute capability 8.0, 9.0 and 7.5, and run in Triton's interpreter on a
-processor, where they draw tiny images only (`tests/test_triton_backend.py`).
+Not tested on a GPU by its author: the kernels were compiled for compute capability 8.0, 9.0 and 7.5, and run on tiny images in
+Triton's interpreter on a CPU (`tests/test_triton_backend.py`, `tests/test_triton_interpreted.py`).
 
-Gradients of a splat are added up by atomic additions, in whichever order the tiles finish. With
-`torch.use_deterministic_algorithms(True)` they are added in one fixed order instead, for 36 bytes of memory a (splat, tile) pair.
+The gradients of a splat are summed by atomic additions, in the order in which tiles finish. With
+`torch.use_deterministic_algorithms(True)` they are summed in a fixed order, for 36 bytes of memory per (splat, tile) pair.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import os
+from typing import Any
 
 import torch
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.guests import NO_CUDA, UNTRIED, Asked
+from mipmap_plugin.backends.external import NO_CUDA, UNTESTED, CachedCheck
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -25,7 +27,7 @@ NO_TRITON = "it needs triton, which comes with torch's CUDA wheels: pip install 
 
 
 def interpreted() -> bool:
-    """Whether Triton runs its kernels in Python, on a processor: slow, for tests."""
+    """Whether Triton interprets kernels on the CPU: slow, for tests."""
     return os.environ.get("TRITON_INTERPRET") == "1"
 
 
@@ -34,10 +36,10 @@ class TritonBackend:
 
     name = "triton"
     api_version = API_VERSION
-    note = UNTRIED
+    note = UNTESTED
 
     def __init__(self) -> None:
-        self._asked = Asked(self)
+        self._check = CachedCheck(self)
         self.speed = -1 if interpreted() else 30
         self.capabilities = Capabilities(
             devices=frozenset({"cpu" if interpreted() else "cuda"}),
@@ -46,21 +48,22 @@ class TritonBackend:
         )
 
     def lacking(self, needs: Needs) -> list[str]:
+        """The reasons why this backend cannot serve `needs`; empty if it can."""
         return missing() + self.capabilities.lacking(needs)
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
-        """The view of `camera`. Raises BackendUnavailable, an ImportError, where the request is not for this backend.
+        """The view of `camera`. Raises BackendUnavailable, an ImportError, if this backend cannot serve the request.
 
-        The host waits for the GPU once, for the number of (splat, tile) pairs; on the way back it does not wait.
+        The host synchronizes with the GPU once, for the number of (splat, tile) pairs, and not in the backward pass.
         """
-        self._asked.refuse(Needs.of(gaussians, effects, gradients=True))
+        self._check.require(Needs.of(gaussians, effects, gradients=True))
         g = gaussians
         image, alpha = _Draw.apply(camera, effects, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)
         return Rendered(image, alpha)
 
 
 def missing() -> list[str]:
-    """What this machine lacks, in sentences."""
+    """What this machine lacks to run the backend; empty if nothing."""
     if importlib.util.find_spec("triton") is None:
         return [NO_TRITON]
     return [] if interpreted() or torch.cuda.is_available() else [NO_CUDA]
@@ -68,21 +71,22 @@ def missing() -> list[str]:
 
 class _Draw(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, camera, effects, *tensors):
+    def forward(ctx: Any, camera: Camera, effects: Effects, *tensors: Tensor) -> tuple[Tensor, Tensor]:
         from mipmap_plugin.backends.triton_kernels import drawing
 
         with torch.cuda.device_of(tensors[0]):  # kernels are launched on the current GPU, which may be another
-            image, through, ctx.drawing = drawing.draw(drawing.Splats.of(*tensors), camera, effects)
-        ctx.save_for_backward(*tensors, image, through)
-        return image, 1 - through
+            image, transmittance, ctx.drawing = drawing.draw(drawing.KernelSplats.of(*tensors), camera, effects)
+        ctx.save_for_backward(*tensors, image, transmittance)
+        return image, 1 - transmittance
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx, d_image, d_alpha):
+    @once_differentiable  # type: ignore[untyped-decorator]  # torch's decorator has no types
+    def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Tensor | None, ...]:
         from mipmap_plugin.backends.triton_kernels import drawing
 
-        *tensors, image, through = ctx.saved_tensors
+        *tensors, image, transmittance = ctx.saved_tensors
         in_order = torch.are_deterministic_algorithms_enabled()
         with torch.cuda.device_of(image):
-            grads = drawing.draw_back(ctx.drawing, drawing.Splats.of(*tensors), image, through, d_image, d_alpha, deterministic=in_order)
+            splats = drawing.KernelSplats.of(*tensors)
+            grads = drawing.draw_back(ctx.drawing, splats, image, transmittance, d_image, d_alpha, deterministic=in_order)
         return None, None, *grads

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mipmap_plugin.commands.common import tell, wrap
+from mipmap_plugin.commands.common import given, scene, tell, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
-from mipmap_plugin.models.base import SplatModel, why_no_viewer
 from mipmap_plugin.recipes import recipe as make_config
-from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import Adapted, state_path
+
+if TYPE_CHECKING:
+    from mipmap_plugin.models.base import SplatModel
+    from mipmap_plugin.wrap import Adapted, Wrapped
 
 
 def adapt(
@@ -34,6 +36,7 @@ def adapt(
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
     backend: str = "auto",
+    threads: int | None = None,
     seed: int = 0,
     overwrite: bool = False,
     json: bool = False,
@@ -57,26 +60,33 @@ def adapt(
         background: Of the scene; by default what the checkpoint says, else black.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
+        threads: Processor threads at most; by default as many as torch finds. The result does not depend on it.
         seed: Everything random follows from it.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter)
-    settings = _given(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
+    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    settings = given(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     wanted = _wanted(scale, viewer)
     targets = [adapted_path(checkpoint, output, *each, several=len(wanted) > 1) for each in wanted]
     for (each, name), target in zip(wanted, targets, strict=True):
         config = make_config(recipe, each, seed=seed, **settings)
         wrapped.targets(name)
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
-    real = None if images is None else load_scene(images)
-    settings |= dict(recipe=recipe, seed=seed, images=real)
-    reports = []
-    for (each, name), target in zip(wanted, targets, strict=True):
-        adapted = wrapped.adapt(each, viewer=name, resume=state_path(target), **settings)
-        reports.append(_saved(adapted, target, overwrite, quiet=json))
+    settings |= dict(recipe=recipe, seed=seed, images=images and scene(images))
+    reports = [_saved(adapted, target, overwrite, quiet=json) for adapted, target in _adapted(wrapped, wanted, targets, settings)]
     if json:
         tell(reports, json)
+
+
+def _adapted(
+    wrapped: Wrapped, wanted: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any]
+) -> Iterator[tuple[Adapted, Path]]:
+    """Each model as soon as it is adapted, and where it is to be saved."""
+    from mipmap_plugin.wrap import state_path
+
+    for (scale, viewer), target in zip(wanted, targets, strict=True):
+        yield wrapped.adapt(scale, viewer=viewer, resume=state_path(target), **settings), target
 
 
 def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:
@@ -87,10 +97,6 @@ def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> d
     return {"file": str(saved), **adapted.report.model_dump()}
 
 
-def _given(**chosen: Any) -> dict[str, Any]:
-    return {name: value for name, value in chosen.items() if value is not None}
-
-
 def _wanted(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:
     """Each scale with each viewer, none twice."""
     names: list[str | None] = [*dict.fromkeys(viewers)] or [None]
@@ -99,6 +105,8 @@ def _wanted(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, 
 
 def _made_for(model: SplatModel) -> str:
     """Whom a file is for that no viewer was asked for."""
+    from mipmap_plugin.models.base import why_no_viewer
+
     made, others = "made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio)", "; for others give --viewer spark, supersplat, ..."
     if why_no_viewer(model):
         return "made for its own project"

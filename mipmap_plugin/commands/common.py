@@ -4,25 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.backends import BACKENDS
-from mipmap_plugin.camera import Camera
 from mipmap_plugin.commands.types import Background, ScreenFilter
 from mipmap_plugin.formats.atomic import json_text
-from mipmap_plugin.models.inria_folder import read_options
-from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import Wrapped, wrap_model
+from mipmap_plugin.progress import announced
+
+if TYPE_CHECKING:
+    from mipmap_plugin.camera import Camera
+    from mipmap_plugin.scenes import Scene
+    from mipmap_plugin.wrap import Wrapped
 
 
 def wrap(
-    checkpoint: Path, cameras: Path | None, background: Background | None, backend: str, screen_filter: ScreenFilter | None = None
-) -> Wrapped:
+    checkpoint: Path, cameras: Path | None, background: Background | None, backend: str, screen_filter: ScreenFilter | None = None,
+    threads: int | None = None,
+) -> Wrapped:  # fmt: skip
+    from mipmap_plugin.backends import BACKENDS
+    from mipmap_plugin.models.inria_folder import read_options
+    from mipmap_plugin.scenes import load_scene
+    from mipmap_plugin.wrap import wrap_model
+
     if backend != "auto":
         BACKENDS.get(backend)
-    given = None if cameras is None else load_scene(cameras, read_options(checkpoint)[0])
+    scene_cameras = None if cameras is None else load_scene(cameras, read_options(checkpoint)[0])
     color = {None: None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}[background]
-    return wrap_model(checkpoint, cameras=given, backend=backend, background=color, screen_filter=screen_filter)
+    with announced(f"reading {checkpoint.name}"):
+        return wrap_model(checkpoint, cameras=scene_cameras, backend=backend, background=color, screen_filter=screen_filter, threads=threads)
+
+
+def scene(path: Path) -> Scene:
+    """The scene at `path`. Raises SceneError."""
+    from mipmap_plugin.scenes import load_scene
+
+    return load_scene(path)
+
+
+def given(**chosen: Any) -> dict[str, Any]:
+    """The options that were given."""
+    return {name: value for name, value in chosen.items() if value is not None}
 
 
 def summary(cameras: Sequence[Camera]) -> str:

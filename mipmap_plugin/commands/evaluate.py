@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from mipmap_plugin.commands.common import tell, wrap
+from mipmap_plugin.commands.common import given, tell, wrap
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, each_once
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
-from mipmap_plugin.models.outputs import parts_of
-from mipmap_plugin.scenes import Scene, load_scene
+
+if TYPE_CHECKING:
+    from mipmap_plugin.evaluation.perceptual import Perceptual
+    from mipmap_plugin.scenes import Scene
 
 
 def evaluate(
@@ -32,6 +34,7 @@ def evaluate(
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
     backend: str = "auto",
+    threads: int | None = None,
     seed: int = 0,
     output: Path | None = None,
     overwrite: bool = False,
@@ -55,27 +58,32 @@ def evaluate(
         background: Of the scene; by default what the checkpoint says, else black.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: A backend's name; auto takes the fastest that can do it.
+        threads: Processor threads at most; by default as many as torch finds. The result does not depend on it.
         seed: Everything random follows from it.
         output: Also write the rows, and notes on what they lack, as JSON to this file.
         overwrite: Replace that file if it exists.
         json: Print JSON instead of a table.
     """
     from mipmap_plugin.evaluation import evaluate as evaluation
-    from mipmap_plugin.evaluation.perceptual import Perceptual
 
     _refuse(checkpoint, images, output, overwrite)
-    perceptual = Perceptual(lpips, lpips_weights) if lpips else None
-    settings = {name: value for name, value in dict(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer).items() if value is not None}
+    perceptual = _perceptual(lpips, lpips_weights)
+    settings = given(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
     rows, notes = list[Any](), dict[str, None]()  # notes each once, in their order
     for each, folder in zip(checkpoint, images, strict=True):
-        wrapped, scene = wrap(each, None, background, backend, screen_filter), _scene(folder, appearance)
+        wrapped, scene = wrap(each, None, background, backend, screen_filter, threads), _scene(folder, appearance)
         rows += evaluation.evaluate(wrapped, scene, each_once(scale), recipe, protocol, perceptual, **settings)
         notes |= dict.fromkeys(evaluation.notes(wrapped, scale, appearance))
     rows += evaluation.means(rows) if len(checkpoint) > 1 else []
-    facts = _facts(rows, [*notes])
     if output:
-        write_json(output, facts, overwrite)
-    tell(facts, json) if json else _print_tables(_title(checkpoint, images, protocol), rows, [*notes], published, each_once(scale))
+        write_json(output, _facts(rows, [*notes]), overwrite)
+    tell(_facts(rows, [*notes]), json) if json else _print_tables(_title(checkpoint, images, protocol), rows, [*notes], published, each_once(scale))
+
+
+def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path | None) -> Perceptual | None:
+    from mipmap_plugin.evaluation.perceptual import Perceptual
+
+    return Perceptual(network, weights) if network else None
 
 
 def _facts(rows: Sequence[Any], notes: Sequence[str]) -> dict[str, Any]:
@@ -85,6 +93,8 @@ def _facts(rows: Sequence[Any], notes: Sequence[str]) -> dict[str, Any]:
 
 
 def _scene(folder: Path, appearance: str) -> Scene:
+    from mipmap_plugin.scenes import load_scene
+
     scene = load_scene(folder)
     return scene.numbered_as_upstream() if appearance == "upstream" else scene
 
@@ -102,6 +112,8 @@ def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str) ->
 
 
 def _parts(checkpoint: Path) -> list[Path]:
+    from mipmap_plugin.models.outputs import parts_of
+
     return parts_of(None, checkpoint) if checkpoint.is_dir() else [checkpoint]
 
 

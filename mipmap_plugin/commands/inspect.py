@@ -4,12 +4,6 @@ from __future__ import annotations
 
 from mipmap_plugin.commands.common import summary, tell
 from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
-from mipmap_plugin.effects import explain
-from mipmap_plugin.models import load_model
-from mipmap_plugin.models.anchors.model import AnchorModel
-from mipmap_plugin.models.base import effects_of
-from mipmap_plugin.models.health import examine
-from mipmap_plugin.wrap import wrap_model
 
 
 def inspect(
@@ -24,7 +18,13 @@ def inspect(
         viewers: Draw a few views as viewers on the web do, and say how far they are from those of training.
         json: Print JSON instead of sentences.
     """
+    from mipmap_plugin.effects import explain
     from mipmap_plugin.evaluation.looks import looks
+    from mipmap_plugin.models import load_model
+    from mipmap_plugin.models.anchors.model import AnchorModel
+    from mipmap_plugin.models.base import effects_of
+    from mipmap_plugin.models.health import examine
+    from mipmap_plugin.wrap import wrap_model
 
     model = load_model(checkpoint, iteration=iteration)
     wrapped = wrap_model(model, screen_filter=screen_filter)

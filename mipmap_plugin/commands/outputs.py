@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from mipmap_plugin.camera import Camera
 from mipmap_plugin.formats.splat_transform import READ_ONLY, WRITTEN
+
+if TYPE_CHECKING:
+    from mipmap_plugin.camera import Camera
 
 
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from mipmap_plugin.camera import Camera
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
-from mipmap_plugin.formats.images import write_array, write_image
-from mipmap_plugin.models.outputs import parts_of
-from mipmap_plugin.wrap import Drawn, Wrapped
+
+if TYPE_CHECKING:
+    from mipmap_plugin.backends.base import Rendered
+    from mipmap_plugin.camera import Camera
+    from mipmap_plugin.wrap import Drawn, Wrapped
 
 
 def render(
@@ -63,20 +64,33 @@ def render(
         wrapped.effects(scale, asked, supersampling, viewer)  # before anything is looked for or written
     outputs = [name for name, wanted in {"depth": depth, "normals": normals}.items() if wanted]
     pictures = [output / name for name in picture_names(views)]
-    parts = parts_of(wrapped.model.source, wrapped.model.folder)
+    _refuse(wrapped, pictures, outputs, overwrite)
+    if exposure:
+        for camera in views:
+            wrapped.model.traits.exposures.of(camera)  # before anything is written
+    drawn: Drawn = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
     for camera, picture in zip(views, pictures, strict=True):
+        _write(picture, wrapped.render(camera.zoomed(scale), scale, asked, supersampling, **drawn), outputs, overwrite)
+    print(f"{len(views)} pictures in {output}")
+
+
+def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], overwrite: bool) -> None:
+    """Raise what writing the pictures, and what goes beside them, would raise."""
+    from mipmap_plugin.models.outputs import parts_of
+
+    parts = parts_of(wrapped.model.source, wrapped.model.folder)
+    for picture in pictures:
         for path in (picture, *(_beside(picture, name) for name in outputs)):
             refuse_output(path, overwrite, parts, is_file=True)
-        if exposure:
-            wrapped.model.traits.exposures.of(camera)  # before anything is written
     refuse_unwritable(pictures[0])
-    for camera, picture in zip(views, pictures, strict=True):
-        drawn = Drawn(viewer=viewer, filter_3d=filter_3d, outputs=outputs, exposure=exposure)
-        shown = wrapped.render(camera.zoomed(scale), scale, asked, supersampling, **drawn)
-        write_image(picture, shown.image, overwrite=overwrite)
-        for name in outputs:
-            write_array(_beside(picture, name), getattr(shown, name), overwrite=overwrite)
-    print(f"{len(views)} pictures in {output}")
+
+
+def _write(picture: Path, rendered: Rendered, outputs: Sequence[str], overwrite: bool) -> None:
+    from mipmap_plugin.formats.images import write_array, write_image
+
+    write_image(picture, rendered.image, overwrite=overwrite)
+    for name in outputs:
+        write_array(_beside(picture, name), getattr(rendered, name), overwrite=overwrite)
 
 
 def _beside(picture: Path, name: str) -> Path:

@@ -10,7 +10,6 @@ import tyro
 from mipmap_plugin.commands.common import tell, wrap
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
 from mipmap_plugin.recipes import recipe as make_config
-from mipmap_plugin.scenes import load_scene
 
 
 def tradeoff(
@@ -28,6 +27,7 @@ def tradeoff(
     views: int | None = None,
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
+    threads: int | None = None,
     seed: int = 0,
     picture: bool = True,
     overwrite: bool = False,
@@ -52,6 +52,7 @@ def tradeoff(
         views: Views to judge on, at most.
         background: Of the scene; by default what the checkpoint says, else black.
         screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
+        threads: Processor threads at most; by default as many as torch finds. The result does not depend on it.
         seed: Of the first repeat.
         picture: Draw tradeoff.png, which needs the extra `plot`.
         overwrite: Replace results that exist.
@@ -60,10 +61,11 @@ def tradeoff(
     from mipmap_plugin.evaluation.tradeoff.files import Folder, facts, refuse, table
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.evaluation.tradeoff.run import run
+    from mipmap_plugin.scenes import load_scene
 
     refuse(output, picture, overwrite)
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
-    model, scene = wrap(checkpoint, None, background, "auto", screen_filter), None if images is None else load_scene(images)
+    model, scene = wrap(checkpoint, None, background, "auto", screen_filter, threads), None if images is None else load_scene(images)
     model.target(viewer)
     for name, each in product(plan.recipes, scale):
         make_config(name, each)

@@ -132,4 +132,4 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
 def not_exposed(model: SplatModel) -> list[str]:
     """That photographs have exposures of their own, in a sentence, where the model knows of them; none is applied in judging."""
     exposures = model.traits.exposures
-    return [f"{exposures.found()}, which is not applied here: part of every difference from a photograph is exposure"] if exposures.changed else []
+    return [f"{exposures.summary()}, which is not applied here: part of every difference from a photograph is exposure"] if exposures.changed else []

@@ -1,4 +1,4 @@
-"""Outputs appear whole or not at all, and never in the place of what is not theirs to replace."""
+"""Atomic outputs: they appear completely or not at all, and never replace files that must not be replaced."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from typing import Any
 from mipmap_plugin.errors import MipmapPluginError, OutputError, OutputExists
 from mipmap_plugin.formats.staging import Staging, settle
 
-# What is being made at the moment, where something is.
+# The output that is being written, if any.
 _open: ContextVar[Staging | None] = ContextVar("_open", default=None)
 
 
 @contextlib.contextmanager
 def together(path: Path) -> Iterator[None]:
-    """What is written inside, to `path`, into it or beside it, takes its place when the block ends well: all of it or nothing.
+    """Make everything that the block writes to, into or beside `path` one atomic output: it appears if the block succeeds.
 
-    A process that is killed while several files take their places leaves a record, by which the next run that writes to `path`, or
-    loads it, finishes them (`staging`). Raises OutputError.
+    A process that is killed while several files are moved into place leaves a record, from which the next run that writes to `path` or
+    loads it completes the move (`staging`). Raises OutputError.
     """
-    with _telling(path):
+    with _as_output_error(path):
         place, holding = absolute(path), _open.get()
         if holding is not None and holding.inside(place) is not None:
             yield
@@ -50,7 +50,7 @@ def together(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def new_file(path: Path, overwrite: bool) -> Iterator[Path]:
-    """A temporary path to write to, which becomes `path` if the block ends well. Raises OutputExists, OutputError."""
+    """A temporary path to write to, which becomes `path` if the block succeeds. Raises OutputExists, OutputError."""
     refuse_output(path, overwrite, is_file=True)
     with _made(path) as temporary:
         yield temporary
@@ -58,7 +58,7 @@ def new_file(path: Path, overwrite: bool) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def new_folder(path: Path, overwrite: bool) -> Iterator[Path]:
-    """A temporary folder to fill, which becomes `path` if the block ends well; an old folder is taken away only then."""
+    """A temporary folder to fill, which becomes `path` if the block succeeds; an old folder is removed only then."""
     refuse_output(path, overwrite)
     with _made(path) as temporary:
         temporary.mkdir()
@@ -72,13 +72,13 @@ def _made(path: Path) -> Iterator[Path]:
         with together(path), _made(path) as temporary:
             yield temporary
         return
-    with _telling(path):
+    with _as_output_error(path):
         temporary.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
 
 
 @contextlib.contextmanager
-def _telling(path: Path) -> Iterator[None]:
+def _as_output_error(path: Path) -> Iterator[None]:
     try:
         yield
     except MipmapPluginError:
@@ -88,7 +88,7 @@ def _telling(path: Path) -> Iterator[None]:
 
 
 def absolute(path: Path) -> Path:
-    """`path` from the root, without links but in its last part, which is the one that is replaced. Raises OutputError for a root."""
+    """`path` as an absolute path with links resolved except in its last part, which is replaced. Raises OutputError for a root."""
     last = path.name not in ("", "..")
     real = Path(os.path.realpath(path.parent), path.name) if last else Path(os.path.realpath(path))
     if not real.name:
@@ -97,35 +97,35 @@ def absolute(path: Path) -> Path:
 
 
 def named(path: Path) -> Path:
-    """`path` with a last part of its own, which others can be put beside: of "." the folder's name. Raises OutputError for a root."""
+    """`path` with a name in its last part, such as the folder's name for ".". Raises OutputError for a root."""
     return path if path.name not in ("", "..") else absolute(path)
 
 
 def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_file: bool = False) -> None:
-    """Raise OutputExists for what may not be written to, or not without `overwrite`; OutputError for what no system takes.
+    """Raise OutputExists if `path` may not be written to, or not without `overwrite`; OutputError if the system does not accept it.
 
-    An output is a new name, or that of a regular file or a folder (`is_file`: of a file alone), and by no name (a link, a hard link,
-    another case) one of the files `base`, nor a folder around one. What dead runs left at `path` is put right first.
+    An output is a new path, a regular file or a folder (`is_file`: not a folder), and not one of the files `base` under any name (a
+    link, a hard link, another case), nor a folder around one. What killed runs left at `path` is completed or removed first.
     """
-    with _telling(path):
+    with _as_output_error(path):
         settle(absolute(path))
-        found = _stat(path)
-    if found is None:
+        status = _stat(path)
+    if status is None:
         return
-    if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):
-        raise OutputExists(f"{path} is {kind_of_node(found)}, which is never replaced; choose another path")
-    if any(os.path.samestat(found, each) for file in base for each in _around(file, stat.S_ISDIR(found.st_mode))):
-        told = "holds the base checkpoint itself" if stat.S_ISDIR(found.st_mode) else "is the base checkpoint itself, or a part of it"
-        raise OutputExists(f"{path} {told}, which is never replaced; choose another path")
-    if is_file and stat.S_ISDIR(found.st_mode):
+    if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
+        raise OutputExists(f"{path} is {kind_of_node(status)}, which is never replaced; choose another path")
+    if any(os.path.samestat(status, each) for file in base for each in _around(file, stat.S_ISDIR(status.st_mode))):
+        reason = "holds the base checkpoint itself" if stat.S_ISDIR(status.st_mode) else "is the base checkpoint itself, or a part of it"
+        raise OutputExists(f"{path} {reason}, which is never replaced; choose another path")
+    if is_file and stat.S_ISDIR(status.st_mode):
         raise OutputExists(f"{path} is a folder, which no file replaces; choose the path of a file")
     if not overwrite:
         raise OutputExists(f"{path} exists already; pass --overwrite (overwrite=True) to replace it, or choose another path")
 
 
 def refuse_unwritable(path: Path, room: int = 0) -> None:
-    """Raise OutputError where the system would refuse `path` at the end: no permission, a read-only disk, fewer than `room` bytes free."""
-    with _telling(path):
+    """Raise OutputError if `path` could not be written: no permission, a read-only disk, fewer than `room` bytes free."""
+    with _as_output_error(path):
         place = absolute(path)
         if place.parent.is_dir():
             Staging(place).close()
@@ -136,31 +136,31 @@ def refuse_unwritable(path: Path, room: int = 0) -> None:
             raise OSError(errno.EACCES, f"no permission to write to {there}")
         free = shutil.disk_usage(there).free
     if free < room:
-        told = f"its disk has {free:,} bytes free, and the base takes {room:,}"
-        raise OutputError(f"{path} cannot be written: {told}; free some, or choose another disk")
+        reason = f"its disk has {free:,} bytes free, and the base takes {room:,}"
+        raise OutputError(f"{path} cannot be written: {reason}; free some, or choose another disk")
 
 
 def settled(path: Path) -> Path:
-    """`path`, after what a dead run left there was put right, where that can be done."""
+    """`path`, after what a killed run left there was completed or removed, if possible."""
     with contextlib.suppress(OSError, ValueError):
         settle(absolute(path))
     return path
 
 
-def kind_of_node(found: os.stat_result) -> str:
-    """What a path leads to that is neither a regular file nor a folder."""
+def kind_of_node(status: os.stat_result) -> str:
+    """The kind of a path that is neither a regular file nor a folder."""
     kinds = {stat.S_ISFIFO: "a pipe", stat.S_ISCHR: "a device", stat.S_ISBLK: "a device", stat.S_ISSOCK: "a socket"}
-    return next((name for test, name in kinds.items() if test(found.st_mode)), "no regular file")
+    return next((name for test, name in kinds.items() if test(status.st_mode)), "no regular file")
 
 
 def no_file(path: Path) -> str:
-    """Why `path` is not read, "" if it is: a pipe or a device has no end, and may wait for ever."""
-    found = os.stat(path)
-    return "" if stat.S_ISREG(found.st_mode) else f"is {'a folder' if stat.S_ISDIR(found.st_mode) else kind_of_node(found)}, not a file"
+    """Why `path` cannot be read as a file, "" if it can: a pipe or a device may block forever."""
+    status = os.stat(path)
+    return "" if stat.S_ISREG(status.st_mode) else f"is {'a folder' if stat.S_ISDIR(status.st_mode) else kind_of_node(status)}, not a file"
 
 
 def _stat(path: Path) -> os.stat_result | None:
-    """What is at `path`, None for nothing. Raises OutputExists for a link that leads to nothing, OSError."""
+    """The status of `path`, None if nothing is there. Raises OutputExists for a broken link, OSError."""
     try:
         return os.stat(path)
     except FileNotFoundError:
@@ -174,9 +174,9 @@ def _stat(path: Path) -> os.stat_result | None:
 def _around(file: Path, folders: bool) -> Iterator[os.stat_result]:
     """The file itself, or the folders around it."""
     real = Path(os.path.realpath(file))
-    for each in real.parents if folders else [real]:
+    for place in real.parents if folders else [real]:
         with contextlib.suppress(OSError):
-            yield os.stat(each)
+            yield os.stat(place)
 
 
 def write_json(path: Path, facts: Any, overwrite: bool) -> None:
@@ -186,7 +186,7 @@ def write_json(path: Path, facts: Any, overwrite: bool) -> None:
 
 
 def json_text(facts: Any) -> str:
-    """`facts` as indented JSON that every parser takes: what JSON has no number for, such as the PSNR of equal images, is null."""
+    """`facts` as indented JSON that every parser accepts: infinity and NaN, such as the PSNR of equal images, become null."""
     return json.dumps(_without_infinities(facts), indent=2, allow_nan=False, default=str)
 
 
@@ -209,9 +209,9 @@ def sha256(*paths: Path) -> str:
 
 
 def refuse_to_lose(target: Path, source: Path | None, holds: str) -> None:
-    """Raise OutputExists when the folder `target` is the base checkpoint's, or no model: one has a folder named `holds`.
+    """Raise OutputExists if the folder `target` holds the base checkpoint, or is not a model folder, which has a subfolder `holds`.
 
-    Replacing a folder deletes what is in it.
+    Replacing a folder deletes its contents.
     """
     if source is not None and target.is_dir() and any(os.path.samestat(target.stat(), each) for each in _around(source / "x", folders=True)):
         raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")

@@ -14,12 +14,12 @@ MAX_SIZE = 64 * 1024
 
 
 def read_cfg_args(path: str | Path) -> dict[str, Any]:
-    """The options of `Namespace(key=literal, ...)`, without those whose values are none. Raises CheckpointError for any other text."""
+    """The options of `Namespace(key=literal, ...)`, without those whose values are not literals. Raises CheckpointError for other text."""
     return read_cfg_args_and_rest(path)[0]
 
 
 def read_cfg_args_and_rest(path: str | Path) -> tuple[dict[str, Any], list[str]]:
-    """The options, and the names of those that are left out since their values are no literals. Raises CheckpointError."""
+    """The options, and the names of those that are left out because their values are not literals. Raises CheckpointError."""
     path = Path(path)
     text = read_head(path, MAX_SIZE + 1)
     if len(text) > MAX_SIZE:
@@ -38,7 +38,7 @@ def format_cfg_args(options: dict[str, Any]) -> str:
 
 def _keywords(call: ast.expr) -> tuple[dict[str, Any], list[str]]:
     if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Namespace"):
-        raise ValueError("it is no call of Namespace")
+        raise ValueError("it is not a call of Namespace")
     if call.args or any(keyword.arg is None for keyword in call.keywords):
         raise ValueError("it has arguments without a name")
     options: dict[str, Any] = {}

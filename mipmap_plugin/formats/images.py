@@ -1,4 +1,4 @@
-"""Image files: read, put on a background, write; and arrays beside them. Pillow (which scikit-image brings along) is used nowhere else."""
+"""Reading, compositing and writing of image files, and of NumPy arrays. Pillow (a dependency of scikit-image) is used nowhere else."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from mipmap_plugin.errors import SceneError, SettingsError, ShapeError
 from mipmap_plugin.formats.atomic import new_file, no_file
 from mipmap_plugin.limits import check_image
 
-# What Pillow calls 16-bit gray; 16-bit color it reads to 8 bits by itself, keeping the high byte.
+# Pillow's modes for 16-bit gray. It reads 16-bit color as 8 bits, keeping the high byte.
 GRAY_16_BIT = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
-# What is read; Pillow knows formats whose pictures are programs (EPS), too.
+# Accepted formats; Pillow also supports formats whose images are programs (EPS).
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 
-# Pixels that every machine holds, and how many of them a byte of a file with more may stand for: in a photograph it is fewer than 20.
+# Pixels that fit any machine's memory, and the most pixels per byte of a larger image's file: photographs have fewer than 20.
 FEW_PIXELS = 2**24
 PIXELS_PER_BYTE = 50
 
-# Bytes of a pixel while it is read: 8 bits of four channels, and 32 of three.
+# Bytes per pixel while an image is read: four channels of 8 bits and three of 32.
 BYTES_PER_PIXEL = 4 + 12
 
-# Pixels that are put on a background together, in 64 bits each.
+# Pixels that are composited at a time, in 64 bits each.
 TOGETHER = 2**18
 
-# What Pillow raises for a file that is no image, a broken one, a broken PNG chunk and an absurd size.
+# What Pillow raises for a file that is not an image, a damaged one, a damaged PNG chunk and an absurd size.
 UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 
 
@@ -55,9 +55,9 @@ def read_image(path: str | Path, background: Sequence[float]) -> Tensor:
 
 
 def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
-    """8-bit straight-alpha RGBA [H, W, 4] over `background` (RGB in 0..1), as 8-bit RGB [H, W, 3].
+    """Composite 8-bit straight-alpha RGBA [H, W, 4] over `background` (RGB in 0..1) to 8-bit RGB [H, W, 3].
 
-    Fractions are cut off, not rounded, as graphdeco-inria's Blender reader does (scene/dataset_readers.py casts
+    Values are truncated, not rounded, as in graphdeco-inria's Blender reader (scene/dataset_readers.py casts
     0..255 floats to bytes): half-transparent pixels are up to one step darker, opaque ones and black or white background exact.
     The published protocols composite before any resizing, on these 8 bits.
     """
@@ -72,9 +72,9 @@ def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
 
 
 def pillow_bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """`image` [H, W, 3] in 0..1, rounded to 8 bits, as Pillow's bicubic makes it on bytes: [*size, 3] in 0..1, multiples of 1/255.
+    """Resize `image` [H, W, 3] in 0..1 with Pillow's bicubic filter on 8 bits: [*size, 3] in 0..1, multiples of 1/255.
 
-    Not what the same filter makes of floats: Pillow rounds and clamps to 8 bits between its two passes and after them.
+    Differs from the same filter on floats: Pillow rounds and clamps to 8 bits between its two passes and after them.
     """
     height, width = size
     small = Image.fromarray(_bytes(image)).resize((width, height), Image.Resampling.BICUBIC)
@@ -82,7 +82,7 @@ def pillow_bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file; False also for a name that the system does not take, which files that list images may hold."""
+    """Whether there is a file; False also for names that the system does not accept, which lists of images may contain."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -125,11 +125,11 @@ def _bytes(image: Tensor) -> np.ndarray:
 
 
 def read_array(path: str | Path) -> Tensor:
-    """The numbers of a NumPy file, float64. It is not unpickled, and as long as it says. Raises SceneError."""
+    """The numbers of a NumPy file, float64. Nothing is unpickled. Raises SceneError."""
     try:
         return torch.from_numpy(np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64))
     except (OSError, ValueError, TypeError, SyntaxError, OverflowError, RecursionError) as error:  # what NumPy raises for other files
-        raise SceneError(f"{path}: is no array that NumPy reads ({(str(error).splitlines() or [''])[0][:120]}); copy it again") from error
+        raise SceneError(f"{path}: is not an array that NumPy reads ({(str(error).splitlines() or [''])[0][:120]}); copy it again") from error
 
 
 def _refuse_bomb(path: Path, width: int, height: int) -> None:

@@ -1,4 +1,4 @@
-"""Checked reading of the JSON that cameras come in: every fault is one SceneError that says what, where and what to do."""
+"""Validated reading of JSON files of cameras: every error is a SceneError that says what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROTATION_TOLERANCE = 1e-2
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file. Raises SceneError when it is absent, a Git LFS pointer or not JSON."""
+    """The content of a JSON file. Raises SceneError if it is missing, a Git LFS pointer or not JSON."""
     try:
         if trouble := no_file(path):
             raise SceneError(f"{path}: {trouble}; check the path")
@@ -35,22 +35,22 @@ def read_json(path: Path) -> Any:
         raise SceneError(f"{path}: is a Git LFS pointer, not the file itself; run `git lfs pull` where it came from")
     try:
         return json.loads(content.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # also what a wrong encoding and brackets without end raise
+    except (ValueError, RecursionError) as error:  # wrong encodings and too deeply nested brackets included
         raise SceneError(f"{path}: is not JSON ({error}); export or download it again") from error
 
 
 def present(entry: Mapping[str, Any], key: str, where: str) -> Any:
-    """`entry[key]`. Raises SceneError, led by `where`, when the key is missing."""
+    """`entry[key]`. Raises SceneError, beginning with `where`, if the key is missing."""
     if key not in entry:
         raise SceneError(f"{where}: has no {key!r}; add it or export the file again")
     return entry[key]
 
 
 def numbers(value: Any, shape: tuple[int, ...], where: str) -> Tensor:
-    """`value` as a finite float64 tensor of `shape`. Raises SceneError, led by `where`, when it is none."""
+    """`value` as a finite float64 tensor of `shape`. Raises SceneError, beginning with `where`."""
     try:
         tensor = torch.tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # torch names ragged, textual and missing values differently
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # torch raises different exceptions for ragged, textual and missing values
         raise SceneError(f"{where}: is not made of numbers; export the file again") from error
     if tuple(tensor.shape) != shape:
         raise SceneError(f"{where}: has shape {list(tensor.shape)} instead of {list(shape)}; export the file again")
@@ -60,7 +60,7 @@ def numbers(value: Any, shape: tuple[int, ...], where: str) -> Tensor:
 
 
 def positive(value: Any, where: str) -> float:
-    """`value` as a float above 0. Raises SceneError, led by `where`."""
+    """`value` as a positive float. Raises SceneError, beginning with `where`."""
     number = numbers(value, (), where).item()
     if number <= 0:
         raise SceneError(f"{where}: is {number:g} but must be above 0; correct the file")
@@ -68,7 +68,7 @@ def positive(value: Any, where: str) -> float:
 
 
 def pixels(value: Any, where: str) -> int:
-    """`value` as a whole number of pixels, at least 1. Raises SceneError, led by `where`."""
+    """`value` as a whole number of pixels, at least 1. Raises SceneError, beginning with `where`."""
     number = positive(value, where)
     if number > MAX_SIDE:
         raise SceneError(f"{where}: is {number:g} px, more than any photograph has; correct the file")
@@ -78,10 +78,10 @@ def pixels(value: Any, where: str) -> int:
 
 
 def rotation(value: Any, where: str) -> Tensor:
-    """`value` as a rotation [3, 3] float64. Raises SceneError, led by `where`, when it is mirrored, scaled or sheared."""
+    """`value` as a rotation [3, 3] float64. Raises SceneError, beginning with `where`, if it is mirrored, scaled or sheared."""
     matrix = numbers(value, (3, 3), where)
     determinant = torch.linalg.det(matrix).item()
     skew = (matrix.T @ matrix - torch.eye(3, dtype=matrix.dtype)).abs().max().item()
     if abs(determinant - 1) > ROTATION_TOLERANCE or skew > ROTATION_TOLERANCE:
-        raise SceneError(f"{where}: is no rotation (determinant {determinant:.3g}, must be 1); export the poses without scale and mirroring")
+        raise SceneError(f"{where}: is not a rotation (determinant {determinant:.3g}, must be 1); export the poses without scale and mirroring")
     return matrix

@@ -1,4 +1,4 @@
-"""What a file is by its first bytes, whatever its name says; nothing in it is ever executed."""
+"""Types of files by their first bytes, whatever their names are. Nothing is executed."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import numpy as np
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.atomic import no_file
 
-# How a file begins that stands for one that Git LFS has not fetched.
+# Beginning of a placeholder for a file that Git LFS has not fetched.
 LFS_POINTER = b"version https://git-lfs"
 
-# Bytes that tell every format here apart; a .splat file has no magic and is judged by its first records.
+# Bytes that are read to recognize a format; a .splat file has no magic number and is recognized by its first records.
 HEAD = 64 * 1024
 
-# Bytes of a pickle that are looked at for names; the pickle of a gsplat or splatfacto checkpoint has a few kB.
+# Bytes of a pickle that are searched for names; that of a gsplat or splatfacto checkpoint has a few kB.
 MAX_PICKLE = 16 * 1024 * 1024
 
 # A splat in a .splat file (antimatter15/splat); its quaternion is wxyz around 128.
@@ -28,7 +28,7 @@ SPLAT_RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", 
 
 
 def read_head(path: Path, size: int = HEAD) -> bytes:
-    """The first `size` bytes. Raises CheckpointError when there are none, or when a placeholder stands for the data."""
+    """The first `size` bytes of a file. Raises CheckpointError if it is empty, or a placeholder for the data."""
     try:
         if trouble := no_file(path):
             raise CheckpointError(f"{path} {trouble}; give a file or a model folder")
@@ -46,8 +46,8 @@ def _refuse_placeholder(path: Path, head: bytes) -> None:
         raise CheckpointError(f"{path} is empty; download or export it again")
     if start.startswith(LFS_POINTER):
         size = re.search(rb"size (\d{1,20})\b", head)
-        told = f" of a file of {int(size[1]):,} bytes" if size else ""
-        raise CheckpointError(f"{path} is only the Git-LFS pointer{told}; run `git lfs pull` in its repository")
+        target = f" of a file of {int(size[1]):,} bytes" if size else ""
+        raise CheckpointError(f"{path} is only the Git-LFS pointer{target}; run `git lfs pull` in its repository")
     if start.startswith((b"<!doctype", b"<html", b"<?xml")):
         raise CheckpointError(f"{path} is a web page, so the download went wrong; download it again")
     if start.startswith((b'{"error', b'{"message', b'{"status')):
@@ -75,7 +75,7 @@ def kind_of(path: Path) -> str:
 
 
 def pickle_of(path: Path) -> bytes:
-    """The first bytes of a torch file's pickle, to be searched and never unpickled; none where there is none. Raises CheckpointError."""
+    """The first bytes of a torch file's pickle, for searching only; empty if it has none. Raises CheckpointError."""
     if not zipfile.is_zipfile(path):
         return read_head(path, MAX_PICKLE)
     with _archive(path) as archive:
@@ -94,7 +94,7 @@ def _inflated(head: bytes) -> bytes:
 
 
 def _kind_of_json(head: bytes) -> str:
-    """The meta.json of an unpacked SOG names its pictures, the lod-meta.json of a streamed one its parts; that of gsplat's pictures has shapes."""
+    """The type of a JSON file: an unpacked SOG lists images or parts, gsplat's PngCompression lists shapes, glTF names an extension."""
     if b"KHR_gaussian_splatting" in head:
         return "glb"
     if b".webp" in head or b"meta.json" in head:
@@ -104,11 +104,11 @@ def _kind_of_json(head: bytes) -> str:
 
 @contextmanager
 def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """An open zip archive. Raises CheckpointError for whatever zipfile raises on a damaged one, also inside the block."""
+    """An open zip archive. Raises CheckpointError for any error of a damaged archive, also inside the block."""
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive
-    except Exception as error:  # bad offsets, names, versions, sums and streams each fail in their own way
+    except Exception as error:  # bad offsets, names, versions, checksums and streams raise different exceptions
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise CheckpointError(f"{path} is a damaged zip archive ({reason}); download or copy it again") from error
 
@@ -124,7 +124,7 @@ def _kind_of_zip(path: Path) -> str:
 
 
 def _plausible_splat(head: bytes, size: int) -> bool:
-    """Whether the file is whole records of numbers that a splat can have."""
+    """Whether the file consists of complete records with values that are plausible for splats."""
     if size % SPLAT_RECORD.itemsize:
         return False
     rows = np.frombuffer(head[: len(head) // SPLAT_RECORD.itemsize * SPLAT_RECORD.itemsize], SPLAT_RECORD)

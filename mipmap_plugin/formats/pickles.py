@@ -1,4 +1,4 @@
-"""What a pickle would do, read from its instructions before any of them is carried out."""
+"""Checks of a pickle's instructions before any of them is executed."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import zipfile
 from pathlib import Path
 from typing import IO
 
-# Bytes of instructions. The pickles of all checkpoints that are read have a few kB, the state dict of a large network some hundred. So many
-# take 15 seconds at most.
+# Bytes of instructions. The pickles of checkpoints have a few kB, the state dict of a large network some hundred. This many take at most
+# 15 seconds to check.
 MAX_PICKLE = 8 * 1024 * 1024
 
-# How many times the bytes on disk the numbers of a file may take that somebody has packed: trained weights lose a tenth by it.
+# Limit of the unpacked size of a compressed file's numbers, relative to its size on disk: trained weights compress by a tenth.
 MOST_PACKED = 2
 
-# What the pickles of checkpoints ask for: tensors, dictionaries, numbers. Not everything that torch holds to be safe is: some of that
-# makes as much memory as a number in the pickle says, or changes objects that are there already.
+# Globals in the pickles of checkpoints: tensors, dictionaries, numbers. Some globals that torch considers safe are not: they allocate as
+# much memory as a number in the pickle says, or change existing objects.
 KNOWN = re.compile(
     r"collections (OrderedDict|Counter)|builtins (set|complex)|_codecs encode"
     r"|torch (\w+Storage|Size|device|float\d+|bfloat16|u?int\d+|bool|complex\d+|per_\w+|q\w+)"
@@ -26,15 +26,15 @@ KNOWN = re.compile(
     r"|numpy\.(_core|core)\.multiarray scalar|numpy dtype|numpy\.dtypes \w+DType"
 )
 
-# Instructions that no file of torch.save and no TorchScript has: objects by other ways, and bytes that may be changed.
+# Instructions that no file of torch.save and no TorchScript contains: other ways to create objects, and mutable buffers.
 REFUSED = {"INST", "OBJ", "NEWOBJ_EX", "STACK_GLOBAL", "EXT1", "EXT2", "EXT4", "BYTEARRAY8", "NEXT_BUFFER", "READONLY_BUFFER"}
 
-# Letters beyond which a text with other letters than Latin-1's may take long to encode.
+# Length beyond which a text with characters outside Latin-1 may take long to encode.
 LONG_TEXT = 1000
 
 
 def refuse_hostile(path: Path) -> None:
-    """Raise ValueError for a torch file whose pickle asks for other things than data, or that unpacks to more than it is on disk."""
+    """Raise ValueError for a torch file whose pickle needs more than data, or that unpacks to far more bytes than it has on disk."""
     if zipfile.is_zipfile(path):
         with zipfile.ZipFile(path) as archive:
             refuse_packed(archive, path)
@@ -43,19 +43,19 @@ def refuse_hostile(path: Path) -> None:
                     with archive.open(name) as file:
                         scan(file, KNOWN)
         return
-    with path.open("rb") as file:  # the older format: a magic number, a version, facts of the system, the content, and the names of storages
+    with path.open("rb") as file:  # the older format: a magic number, a version, system information, the content, and the keys of storages
         for _ in range(5):
             scan(file, KNOWN)
 
 
 def refuse_packed(archive: zipfile.ZipFile, path: Path) -> None:
-    """Raise ValueError for an archive whose numbers unpack to far more bytes than it has; torch packs programs and pickles only."""
+    """Raise ValueError for an archive whose numbers unpack to far more bytes than it has; torch compresses code and pickles only."""
     if sum(member.file_size for member in archive.infolist() if "/data/" in member.filename) > MOST_PACKED * path.stat().st_size:
         raise ValueError("its numbers unpack to more than it is on disk, which those of no torch file do; save it again")
 
 
 def scan(file: IO[bytes], known: re.Pattern[str] | None) -> None:
-    """Read one pickle up to its end. Raises ValueError for instructions that are not carried out, and for names that are not `known`."""
+    """Read one pickle up to its end. Raises ValueError for refused instructions, and for globals that do not match `known`."""
     encodes, long_text, began = False, False, file.tell()
     for operation, argument, at in pickletools.genops(file):
         if operation.name in REFUSED:

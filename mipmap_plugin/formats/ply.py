@@ -1,4 +1,4 @@
-"""PLY files: refused with a sentence before anything is allocated, read into columns, written atomically."""
+"""PLY files: validated before memory is allocated, read into columns, written atomically."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.formats.magic import read_head
 
-# Bytes. The header of a degree-3 splat has 1.5 kB; without a cap, a file without `end_header` would be searched to its end.
+# Bytes. The header of splats of SH degree 3 has 1.5 kB; without a limit, a file without `end_header` would be searched to its end.
 MAX_HEADER = 128 * 1024
 
 BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -46,7 +46,7 @@ class Element:
 
     @property
     def stride(self) -> int:
-        """Bytes of a binary row; a list counts as empty, which is the least that it can be."""
+        """Bytes of a binary row, at least: lists count as empty."""
         return sum(np.dtype(TYPES[kind.removeprefix("list ").split()[0]]).itemsize for _, kind in self.properties)
 
     def dtype(self, byte_order: str) -> np.dtype:
@@ -55,7 +55,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What a PLY declares, already compared with the size of the file."""
+    """The declarations of a PLY, checked against the size of the file."""
 
     format: str
     elements: tuple[Element, ...]
@@ -72,7 +72,7 @@ class Header:
         return self.elements[: self.elements.index(self.vertex)]
 
     def least_bytes(self, element: Element) -> int:
-        """What a row takes at least; in ascii, a digit and a blank per value."""
+        """The least number of bytes of a row; in ascii, a digit and a blank per value."""
         return 2 * len(element.properties) if self.format == "ascii" else element.stride
 
 
@@ -83,17 +83,17 @@ class PlyFile:
     columns: dict[str, np.ndarray]  # in file order, each [N], in the type and byte order of the file
     comments: tuple[str, ...]  # texts of `comment` and `obj_info` lines
     format: str  # a key of BYTE_ORDER
-    notes: tuple[str, ...] = ()  # what was tolerated, in sentences
+    notes: tuple[str, ...] = ()  # faults that were tolerated, in sentences
 
 
 def read_header(path: str | Path) -> Header:
-    """The header of a PLY whose rows are all there. Raises CheckpointError saying what is wrong and what to do."""
+    """The header of a complete PLY. Raises CheckpointError, saying what is wrong and what to do."""
     path = Path(path)
     head = read_head(path, MAX_HEADER)
     first = re.match(rb"ply[ \t]*(\r\n|\n|\r)", head)
     if first is None:
         raise CheckpointError(f"{path} is not a PLY file: it does not start with the line `ply`")
-    # The first line's ending holds for the whole header (plyfile): a body may well begin with a byte that looks like one.
+    # The first line's line break counts for the whole header (as in plyfile): the body may begin with a byte that looks like one.
     newline, blank = first[1], rb"[ \t\r]*" if first[1] == b"\n" else rb"[ \t]*"
     end = re.search(newline + rb"end_header" + blank + newline, head)
     if end is None:
@@ -103,7 +103,7 @@ def read_header(path: str | Path) -> Header:
 
 
 def read_ply(path: str | Path) -> PlyFile:
-    """The rows of a PLY. Takes ascii and both byte orders, extra elements and any column order. Raises CheckpointError."""
+    """The rows of a PLY in ascii or either byte order, with any extra elements and column order. Raises CheckpointError."""
     path = Path(path)
     header = read_header(path)
     vertex = header.vertex
@@ -118,7 +118,7 @@ def read_ply(path: str | Path) -> PlyFile:
 def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Iterable[str] = (), *, overwrite: bool = False) -> Path:
     """Write columns [N] as the `vertex` element, binary little endian, each in its own type. Atomic.
 
-    Raises OutputExists; OutputError when the disk refuses; SettingsError when the comments do not fit a header.
+    Raises OutputExists; OutputError if the file cannot be written; SettingsError if the comments do not fit a header.
     """
     path = Path(path)
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
@@ -154,7 +154,7 @@ def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
             raise CheckpointError(f"{path}: line {number} of the PLY header cannot be read: {line[:80].decode('ascii', 'replace')!r}") from error
     if not form:
         raise CheckpointError(f"{path}: the PLY header has no `format` line; export the file again")
-    # Rows of nothing may be of any number, and plyfile would count to it.
+    # An element without properties may declare any number of rows, and plyfile would iterate over them.
     return Header(form, tuple(element for element in elements if element.properties), tuple(comments), body)
 
 
@@ -216,7 +216,7 @@ def _with_surplus(path: Path, header: Header, surplus: int) -> Header:
 
 
 def _read_through_plyfile(path: Path, header: Header) -> np.ndarray:
-    """Rows of varying length, parsed by plyfile under a header that it is sure to accept."""
+    """Rows of varying length, parsed by plyfile with a normalized header."""
     declared = [f"ply\nformat {header.format} 1.0\n"]
     for element in header.elements:
         declared += [f"element {element.name} {element.count}\n", *(f"property {kind} {name}\n" for name, kind in element.properties)]

@@ -1,7 +1,7 @@
-"""Exchange formats of viewers and phones, read and written through PlayCanvas' splat-transform, in a process of its own.
+"""Exchange formats of viewers and phones, converted by PlayCanvas' splat-transform in a separate process.
 
-Where it is not installed, a sentence says the one command that installs it. Files get there by absolute paths with the endings that it
-knows formats by, for it does not look at bytes, and takes other endings for programs.
+If it is not installed, the error message gives the command that installs it. Files are passed by absolute paths with the suffix of their
+format, because splat-transform recognizes formats by suffix only, and executes files with some other suffixes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.atomic import new_file
 
-# By `magic.kind_of`: the format's name, and the ending by which splat-transform knows it.
+# `magic.kind_of` -> name of the format, and the suffix by which splat-transform recognizes it.
 EXCHANGE = {
     "spz": ("SPZ", ".spz"),
     "sog": ("SOG", ".sog"),
@@ -26,7 +26,7 @@ EXCHANGE = {
     "compressed": ("compressed PLY", ".compressed.ply"),
 }
 
-# What it writes of these.
+# Suffixes of the formats that it writes.
 WRITTEN = (".spz", ".sog", ".compressed.ply")
 READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
@@ -38,12 +38,12 @@ LONGEST = 1200
 
 
 def is_written(path: Path) -> bool:
-    """Whether a path's ending asks for an exchange format."""
+    """Whether a path has the suffix of an exchange format that can be written."""
     return path.name.lower().endswith(WRITTEN)
 
 
 def refuse_exchange(path: Path) -> list[str]:
-    """The command of splat-transform, which writes `path`, whose ending asks for an exchange format. Raises SettingsError where it is absent."""
+    """The command of splat-transform. Raises SettingsError, naming the output `path`, if it is not installed."""
     tool = _tool()
     if tool is None:
         raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}; or give a .ply")
@@ -51,7 +51,7 @@ def refuse_exchange(path: Path) -> list[str]:
 
 
 def refuse_as_folder(path: Path) -> None:
-    """Raise SettingsError for the name of a folder that ends as files of an exchange format do."""
+    """Raise SettingsError for a folder whose name has the suffix of an exchange format."""
     for name, ending in EXCHANGE.values():
         if path.name.lower().endswith(ending):
             raise SettingsError(f"{path}: this model is not written as {name}; give a .ply, or the path of a folder")
@@ -59,14 +59,17 @@ def refuse_as_folder(path: Path) -> None:
 
 @contextmanager
 def as_ply(path: Path, kind: str) -> Iterator[Path]:
-    """A PLY of the splats in an exchange file of this `kind` (a key of EXCHANGE), for as long as the block runs. Raises CheckpointError."""
+    """A temporary PLY, for the duration of the block, of the splats in an exchange file of this `kind` (a key of EXCHANGE).
+
+    Raises CheckpointError.
+    """
     name, ending = EXCHANGE[kind]
     tool = _tool()
     if tool is None:
-        raise CheckpointError(f"{path} is {name}, an exchange format, which {TOOL} reads, and that is not installed; run: {INSTALL}")
+        raise CheckpointError(f"{path} is {name}, an exchange format, which {TOOL} reads, but {TOOL} is not installed; run: {INSTALL}")
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
         source = path.absolute()
-        if not (path.suffix == ".json" or path.name.lower().endswith(ending)):  # an unpacked SOG is known by the name of its list
+        if not (path.suffix == ".json" or path.name.lower().endswith(ending)):  # an unpacked SOG is recognized by the name of its meta.json
             source = Path(folder, f"source{ending}")
             shutil.copyfile(path, source)
         plain = Path(folder, "plain.ply")
@@ -76,23 +79,23 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
 
 
 def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool) -> Path:
-    """Turn the PLY that `write` writes into the exchange format that the ending of `path` asks for, atomically; return `path`.
+    """Convert the PLY that `write` writes to the exchange format given by the suffix of `path`, atomically; return `path`.
 
     Raises SettingsError (`refuse_exchange`), OutputExists, OutputError.
     """
     tool = refuse_exchange(path)
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder, new_file(path, overwrite) as temporary:
-        ending = next(each for each in WRITTEN if path.name.lower().endswith(each))
-        plain, made = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
+        ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
+        plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
         write(plain)
-        if reason := _run(tool, plain, made):
+        if reason := _run(tool, plain, converted):
             raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
-        shutil.copyfile(made, temporary)
+        shutil.copyfile(converted, temporary)
     return path
 
 
 def _tool() -> list[str] | None:
-    """The command, or None: that on the path, or one that npx finds without downloading."""
+    """The command on the PATH, or the one that npx finds without downloading; None if there is neither."""
     if found := shutil.which(TOOL):
         return [found]
     npx = shutil.which("npx")
@@ -100,15 +103,15 @@ def _tool() -> list[str] | None:
         return None
     command = [npx, "--no-install", TOOL]
     try:
-        asked = subprocess.run([*command, "--version"], capture_output=True, timeout=60, check=False)
+        version = subprocess.run([*command, "--version"], capture_output=True, timeout=60, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return command if asked.returncode == 0 else None
+    return command if version.returncode == 0 else None
 
 
 def _run(tool: list[str], source: Path, target: Path) -> str:
-    """Why it failed, in its own words; empty where it did not."""
-    # SOG's palette is found on a GPU where there is one; on the processor the same file comes out everywhere.
+    """Run splat-transform. Returns its error message, empty on success."""
+    # On a GPU SOG's palette may differ; on the CPU the same file is written on every machine.
     command = [*tool, "--quiet", "--overwrite", "--gpu", "cpu", str(source), str(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
@@ -116,5 +119,5 @@ def _run(tool: list[str], source: Path, target: Path) -> str:
         return str(error)[:160]
     if done.returncode == 0 and target.is_file():
         return ""
-    told = [line.strip() for line in (done.stderr + done.stdout).splitlines() if line.strip()]
-    return (told[-1] if told else f"exit code {done.returncode}")[:160]
+    lines = [line.strip() for line in (done.stderr + done.stdout).splitlines() if line.strip()]
+    return (lines[-1] if lines else f"exit code {done.returncode}")[:160]

@@ -1,8 +1,8 @@
-"""Where outputs are made before they take their places: a hidden folder beside them, locked by the run that fills it.
+"""Staging of outputs: a hidden folder beside the output, locked by the run that fills it.
 
-`.NAME.<slot>.tmp` holds `new` while something is being made; that is worthless once its run is dead. One file takes its place by one rename,
-and one folder is exchanged with the old one, each in one step of the system. Where it takes several steps (a file and its companions, or a
-system that exchanges no folders), `new` is first renamed to `ready`: from then on it is whole, and whoever comes next finishes the moves.
+`.NAME.<slot>.tmp` contains `new` while an output is being written; `new` is discarded if its run is killed. A single file is moved into
+place by one rename, and a folder is exchanged with the old one, both atomically. If several steps are needed (a file and its companions,
+or a system that cannot exchange folders), `new` is first renamed to `ready`: from then on it is complete, and the next run finishes the moves.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ import sys
 import time
 from pathlib import Path
 
-# As many runs may write to one output at the same time.
+# The most runs that may write to one output at the same time.
 SLOTS = 8
 
-# Seconds after which a folder counts as a dead run's where the system has no locks to tell.
+# Seconds after which a folder counts as that of a killed run on systems without locks.
 STALE_S = 24 * 3600.0
 
 # Linux: renameat2 with paths relative to the working folder, and the flag that exchanges them (linux/fs.h).
 AT_FDCWD = -100
 RENAME_EXCHANGE = 2
 
-# What a system answers that has no such call, or none on this disk.
+# Errors of systems that have no such call, or do not support it on this disk.
 NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
 
 
 class Staging:
-    """The hidden folder of one output, from its first byte until it has taken its place."""
+    """The hidden folder of one output, until the output has been moved into place."""
 
     def __init__(self, path: Path) -> None:
-        """`path`: absolute. What dead runs left there is put right first. Raises OSError."""
+        """`path`: absolute. What killed runs left there is completed or removed first. Raises OSError."""
         self.path, self.place = path, path.parent
         settle(path)
         self._folder, self._lock = _free_slot(path)
@@ -41,7 +41,7 @@ class Staging:
         self.new.mkdir()
 
     def inside(self, path: Path) -> Path | None:
-        """Where what is to become `path` (absolute) is made: here, if it is the output, beside it, or in a folder that is being made."""
+        """The staging path of `path` (absolute): here, if it is the output, beside it, or in a folder that is being written."""
         if path.is_relative_to(self.new):
             return path
         made = self.new / os.path.relpath(path, self.place)
@@ -149,7 +149,7 @@ def _is_stale(folder: os.stat_result) -> bool:
 
 
 def _moved_at_once(made: Path, target: Path) -> bool:
-    """Whether one step of the system has put what was `made` into its place."""
+    """Move `made` into place in one step of the system; return whether that was possible."""
     if not made.is_dir():
         os.replace(made, target)
         return True
@@ -160,9 +160,9 @@ def _moved_at_once(made: Path, target: Path) -> bool:
 
 
 def _move_in(folder: Path) -> None:
-    """What is ready takes its place: companions first, the output that they belong to last. Raises OSError, the old one being back."""
+    """Move what is ready into place: companions first, the output itself last. Raises OSError after restoring the old one."""
     main = folder.name[1:].rsplit(".", 2)[0]
-    for made in sorted((folder / "ready").iterdir(), key=lambda each: each.name == main):
+    for made in sorted((folder / "ready").iterdir(), key=lambda entry: entry.name == main):
         target, aside = folder.parent / made.name, folder / "old"
         if not made.is_dir():
             os.replace(made, target)

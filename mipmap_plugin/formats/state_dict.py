@@ -1,4 +1,4 @@
-"""The weights of a network in a torch file, read as data: nothing in the file is executed."""
+"""Reading the weights of a network from a torch file as data; nothing in the file is executed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mipmap_plugin.formats.torch_file import load_torch
 
 
 def read_state_dict(path: Path) -> dict[str, Tensor]:
-    """The tensors of a `state_dict` by name, on the CPU. Raises CheckpointError for anything else, and for weights that are not finite."""
+    """The tensors of a `state_dict` by name, on the CPU. Raises CheckpointError for any other content, and for weights that are not finite."""
     state = load_torch(path)
     if not isinstance(state, Mapping) or not all(isinstance(name, str) and torch.is_tensor(tensor) for name, tensor in state.items()):
         raise CheckpointError(f"{path} holds other things than the weights of a network by name; give the file that the training saved")
@@ -24,14 +24,11 @@ def read_state_dict(path: Path) -> dict[str, Tensor]:
 
 
 def require(state: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
-    """Refuse a network that lacks one of these tensors or has it in another shape, of which -1 fits any size.
-
-    Raises CheckpointError, with `where` as its subject.
-    """
+    """Raise CheckpointError, beginning with `where`, if a tensor is missing or has another shape; -1 matches any size."""
     missing = [name for name in shapes if name not in state]
     if missing:
-        told = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
-        raise CheckpointError(f"{where}: it lacks {told}")
+        names = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
+        raise CheckpointError(f"{where}: it lacks {names}")
     for name, wanted in shapes.items():
         shape = tuple(state[name].shape)
         if len(shape) != len(wanted) or any(want not in (-1, size) for size, want in zip(shape, wanted, strict=True)):

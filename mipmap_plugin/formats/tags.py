@@ -1,4 +1,4 @@
-"""Header comments that say how a splat file was trained and where it comes from."""
+"""Header comments that name the screen filter and the provenance of a splat file."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _MODES = {"default": "classic", "0": "classic", "mip": "antialiased", "1": "anti
 
 
 def render_mode(comments: Iterable[str]) -> str | None:
-    """The screen filter ("classic", "antialiased"), or "2dgs", that the last tag names; None without a tag that is known."""
-    found = None
+    """The screen filter ("classic", "antialiased"), or "2dgs", that the last tag names; None without a known tag."""
+    mode = None
     for comment in comments:
         tag = _tag(comment)
-        found = _MODES.get(tag[1].lower(), found) if tag else found
-    return found
+        mode = _MODES.get(tag[1].lower(), mode) if tag else mode
+    return mode
 
 
 def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any]) -> list[str]:
-    """Foreign comments, then our own two lines in place of any older ones."""
+    """Foreign comments, followed by the two lines of this package, which replace older ones."""
     foreign = [text for text in comments if not _tag(text) and not text.startswith(PROVENANCE + " {")]
-    mode = {"classic": "default", "antialiased": "mip", "mip": "mip", "surfel": "2dgs"}.get(screen_filter)  # no tag stands for any other
+    mode = {"classic": "default", "antialiased": "mip", "mip": "mip", "surfel": "2dgs"}.get(screen_filter)  # others have no tag
     tags = [f"SplatRenderMode: {mode}"] if mode else []
     return [*foreign, *tags, f"{PROVENANCE} {json.dumps(provenance, default=str)}"]
 
 
 def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:
-    """The record of the adaptation that wrote a file, or None."""
+    """The provenance record of an adapted file; None if there is none."""
     for comment in comments:
         if comment.startswith(PROVENANCE + " {"):
             try:

@@ -1,4 +1,4 @@
-"""Files of torch.save, read and written as data: of what a pickle may name, only tensors, plain values and NumPy scalars are made."""
+"""Files of torch.save, read and written as data: only tensors, plain values and NumPy scalars are unpickled."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _SCALAR: Any = np.float64(0).__reduce__()[0]
 _KINDS = [np.dtype(kind) for kind in (np.float64, np.float32, np.int64, np.int32, np.bool_)]
 
 
-def _named(module: str, name: str, made: Callable[..., Any]) -> Any:
-    """`made` under a name of NumPy's; torch takes the names of what is safe from the functions themselves."""
+def _named(module: str, name: str, function: Callable[..., Any]) -> Any:
+    """`function` with a qualified name of NumPy's; torch takes the names of safe globals from the functions themselves."""
 
     def stand_in(*values: Any) -> Any:
-        return made(*values)
+        return function(*values)
 
     stand_in.__module__, stand_in.__qualname__ = module, name
     return stand_in
 
 
 def _number_type(name: str, *_: bool) -> np.dtype:
-    """Only numbers: other types of NumPy's are as large as their name says."""
+    """A NumPy type of numbers; other types are refused, because their names may request any size."""
     return next(kind for kind in _KINDS if kind.str[1:] == name)
 
 
@@ -45,7 +45,7 @@ _SAFE: list[Any] = [
 
 
 def load_torch(path: Path) -> Any:
-    """The content of a torch file, on the CPU. Raises CheckpointError for a damaged one, or one that would run code or fill the memory."""
+    """The content of a torch file, on the CPU. Raises CheckpointError if it is damaged, or would run code or exhaust the memory."""
     read_head(path, 512)
     try:
         refuse_hostile(path)
@@ -63,32 +63,32 @@ def load_torch(path: Path) -> Any:
 
 
 def _reason(error: Exception) -> str:
-    """The first line of what went wrong, without torch's advice to its users, which comes before and behind."""
+    """The first line of the error, without torch's advice before and after it."""
     text = str(error).rpartition("WeightsUnpickler error:")[2].strip()
     return (text.splitlines() or [type(error).__name__])[0].partition(". Please use")[0][:160]
 
 
 def _allowing_scalars() -> AbstractContextManager[None]:
-    """NumPy's scalars may be read inside; older torch can be told of no exceptions and refuses a file with some, by their name."""
+    """A context in which NumPy's scalars may be unpickled. Older versions of torch cannot allow them, and refuse such files by name."""
     return torch.serialization.safe_globals(_SAFE) if hasattr(torch.serialization, "safe_globals") else nullcontext()
 
 
 def _tensors(content: Any) -> Iterator[Tensor]:
-    """Every tensor in nested containers; of containers that hold themselves, each once."""
-    ahead, entered = [content], set()
-    while ahead:
-        value = ahead.pop()
+    """Every tensor in nested containers, which may be cyclic."""
+    pending, entered = [content], set()
+    while pending:
+        value = pending.pop()
         if isinstance(value, Tensor):
             yield value
         elif isinstance(value, (dict, list, tuple, set)) and id(value) not in entered:
             entered.add(id(value))
             if set(getattr(value, "__dict__", ())) - {"_metadata"}:  # torch's own; any other could stand for a method
                 raise ValueError("its dictionaries have attributes")
-            ahead += value.values() if isinstance(value, dict) else value
+            pending += value.values() if isinstance(value, dict) else value
 
 
 def _refuse_unusual(tensor: Tensor) -> None:
-    """Only numbers that lie in the file, one after the other, are known to compute as others do and to take no more room than the file."""
+    """Raise ValueError for tensors other than plain strided ones whose numbers are all in the file."""
     if tensor.layout != torch.strided or tensor.device.type != "cpu" or tensor.is_quantized or tensor.is_complex() or tensor.is_nested:
         raise ValueError("it holds a sparse, quantized, complex, nested or empty-shelled tensor")
     if vars(tensor):
@@ -98,7 +98,7 @@ def _refuse_unusual(tensor: Tensor) -> None:
 
 
 def step_and_comments(content: Mapping[str, Any], path: Path) -> tuple[int, tuple[str, ...]]:
-    """What a trainer, and this package, write beside the splats; a new file is named by the step. Raises CheckpointError for other things."""
+    """The training step, after which new files are named, and the comments of this package. Raises CheckpointError for other types."""
     step, comments = content.get("step", 0), content.get("comments", ())
     if not isinstance(step, int) or step < 0:
         raise CheckpointError(f"{path} is damaged: its step is no whole number; copy it again")
@@ -112,6 +112,6 @@ def save_torch(path: Path, content: Any, *, overwrite: bool) -> Path:
     with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
         try:
             torch.save(content, file)
-        except RuntimeError as error:  # how torch reports a disk that refuses, whose own reason it does not tell
+        except RuntimeError as error:  # torch does not pass on the system's reason
             raise OSError(errno.EIO, "the disk refuses; it may be full") from error
     return path

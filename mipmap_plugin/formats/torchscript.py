@@ -1,7 +1,7 @@
-"""The weights in a TorchScript archive, read without running it: `torch.jit.load` executes the program that the archive holds.
+"""Reading the weights of a TorchScript archive without executing it, as `torch.jit.load` would.
 
-The archive is a zip: `<root>/data.pkl` is a pickle of modules whose classes are programs under `<root>/code`, and `<root>/data/<key>` are
-the tensors' bytes. Here the programs are ignored, and a class becomes an inert record of its attributes.
+The archive is a zip: `<root>/data.pkl` is a pickle of modules, whose classes are code under `<root>/code`, and `<root>/data/<key>` are
+the bytes of the tensors. Here the code is ignored, and every class becomes a plain record of its attributes.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.magic import read_head
 from mipmap_plugin.formats.pickles import refuse_packed, scan
 
-# Bytes. The networks of an anchor model take 30 kB, an appearance for each of thousands of photographs a few MB.
+# Bytes. The networks of an anchor model take 30 kB, appearance embeddings for thousands of photographs a few MB.
 MAX_PICKLE = 1024 * 1024
 
-# Modules in one another, and letters of the names of all weights: both far beyond any network's.
+# Nesting of modules, and total length of the names of all weights: both far beyond any real network.
 MAX_DEPTH = 64
 MAX_LETTERS = MAX_PICKLE
 
-# Weights may share their numbers, and are given them each: as many times, together, as the file is large.
+# Weights may share storage, and each gets a copy: total size of the copies relative to the file.
 MOST_SHARED = 4
 
 # What a pickle calls the types of storages.
@@ -59,7 +59,7 @@ def read_torchscript(path: str | Path) -> dict[str, Tensor]:
 
 
 class _Module:
-    """Stands for any class of the archive's own; what it is given is kept and never called."""
+    """Replaces every class of the archive; keeps its state and calls nothing."""
 
     def __init__(self) -> None:
         self.attributes: Any = {}
@@ -70,7 +70,7 @@ class _Module:
 
 @dataclass(frozen=True)
 class _Storage:
-    """Where a tensor's numbers lie."""
+    """The location of a tensor's numbers in the archive."""
 
     dtype: torch.dtype
     key: str
@@ -78,10 +78,10 @@ class _Storage:
 
 
 class _Weights(pickle.Unpickler):
-    """An unpickler that knows tensors, dictionaries and records, and nothing that could act."""
+    """An unpickler that creates tensors, dictionaries and records only."""
 
     def __init__(self, program: bytes, archive: zipfile.ZipFile, root: str, most: int) -> None:
-        """`most`: bytes of weights."""
+        """`most`: limit of the bytes of all weights."""
         super().__init__(io.BytesIO(program))
         self._archive, self._root = archive, root
         self._left = most
@@ -102,7 +102,7 @@ class _Weights(pickle.Unpickler):
         return _Storage(dtype, str(key), int(count))
 
     def _tensor(self, storage: _Storage, offset: int, shape: tuple[int, ...], strides: tuple[int, ...], *_: Any) -> Tensor:
-        """A tensor of its own. The view is checked first, for a wrong stride would read other memory."""
+        """A tensor with its own storage. Offset and strides are checked first, since wrong ones would read other memory."""
         last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
         if min((offset, *shape, *strides)) < 0 or (math.prod(shape) > 0 and last >= storage.count):
             raise ValueError("a tensor lies outside its storage")
@@ -119,7 +119,7 @@ class _Weights(pickle.Unpickler):
 
 
 def _member(archive: zipfile.ZipFile, name: str, most: int, missing: bytes | None = None) -> bytes:
-    """The bytes of a member of at most `most` bytes; `missing` where there is none and that is allowed."""
+    """The bytes of a member, at most `most`; `missing`, if given, for a member that does not exist."""
     if missing is not None and name not in archive.namelist():
         return missing
     with archive.open(name) as file:
@@ -130,21 +130,21 @@ def _member(archive: zipfile.ZipFile, name: str, most: int, missing: bytes | Non
 
 
 def _tensors(root: Any) -> dict[str, Tensor]:
-    """The tensors under nested records, by dotted name. A record is entered once, so that a cycle ends."""
-    found: dict[str, Tensor] = {}
+    """The tensors in nested records, by dotted name. Every record is visited once, because records may be cyclic."""
+    tensors: dict[str, Tensor] = {}
     entered: set[int] = set()
     letters = 0
-    ahead: list[tuple[tuple[str, ...], Any]] = [((), root)]
-    while ahead:
-        names, value = ahead.pop()
+    pending: list[tuple[tuple[str, ...], Any]] = [((), root)]
+    while pending:
+        names, value = pending.pop()
         if len(names) > MAX_DEPTH or letters > MAX_LETTERS:
             raise ValueError("its modules are nested too deep, or their names too long")
         if isinstance(value, Tensor):
             letters += sum(map(len, names))
-            found[".".join(names)] = value
+            tensors[".".join(names)] = value
         if isinstance(value, _Module) and id(value) not in entered:
             entered.add(id(value))
-            ahead += [((*names, str(key)), each) for key, each in dict(value.attributes).items()]
-    if not found:
+            pending += [((*names, str(key)), child) for key, child in dict(value.attributes).items()]
+    if not tensors:
         raise ValueError("it holds no weights")
-    return found
+    return tensors

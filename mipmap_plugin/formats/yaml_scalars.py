@@ -1,4 +1,4 @@
-"""The plain settings of a YAML file that another program dumped with tags of Python objects: read line by line, nothing is constructed."""
+"""Plain settings of a YAML file that was dumped with tags of Python objects: read line by line; no object is constructed."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _WORDS = {"true": True, "false": False, "null": None, "~": None}
 
 
 def read_scalars(path: Path) -> dict[str, Any]:
-    """Every `key: scalar` of a YAML file. Of equal keys the one that is nested least counts, then the first.
+    """Every `key: scalar` of a YAML file. Of equal keys, the least nested counts, then the first.
 
-    Keys whose value is a list, a mapping, an object or a text of several lines are left out. Raises CheckpointError.
+    Keys whose value is a list, a mapping, an object or a multi-line text are left out. Raises CheckpointError.
     """
     text = read_head(path, MAX_SIZE).decode("utf-8", errors="replace")
     depths: dict[str, int] = {}
-    found: dict[str, Any] = {}
+    scalars: dict[str, Any] = {}
     for indent, key, value in _LINE.findall(text):
         if len(indent) < depths.get(key, len(indent) + 1):
-            depths[key], found[key] = len(indent), _scalar(value.strip())
-    return found
+            depths[key], scalars[key] = len(indent), _scalar(value.strip())
+    return scalars
 
 
 def with_scalar(text: str, key: str, value: str) -> str:
@@ -40,5 +40,5 @@ def _scalar(text: str) -> Any:
         return _WORDS[text.lower()]
     try:
         return ast.literal_eval(text)
-    except (ValueError, SyntaxError, RecursionError, MemoryError):  # the last two: brackets without end
+    except (ValueError, SyntaxError, RecursionError, MemoryError):  # the last two: too deeply nested brackets
         return text

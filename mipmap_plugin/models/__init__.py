@@ -1,4 +1,4 @@
-"""Models: checkpoints of any family, loaded by what they are."""
+"""Models: checkpoints of any family, recognized by their content."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ __all__ = [
 
 
 def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
-    """Load a checkpoint: a PLY, or a model folder (of its iterations the newest whole one, or `iteration`).
+    """Load a checkpoint: a PLY, or a model folder (its newest complete iteration, or `iteration`).
 
-    Raises CheckpointError for what is missing, damaged, no checkpoint, or of a family that is not loaded; PluginError where a
-    stranger's loader cannot be imported or returns what is no model.
+    Raises CheckpointError for a path that is missing, damaged, not a checkpoint, or of a family that is not loaded; PluginError if a
+    third-party loader cannot be imported, fails, or returns an object that is not a model.
     """
-    found = detect(path, iteration=iteration)
-    family = find_family(found.family)
+    checkpoint = detect(path, iteration=iteration)
+    family = find_family(checkpoint.family)
     if family.load is None:
-        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
+        raise CheckpointError(f"{checkpoint.path}: {not_loaded(checkpoint.family)}")
     load = load_target(family.name, family.load) if isinstance(family.load, str) else family.load
     try:
         model = load(path, iteration=iteration)
     except (MipmapPluginError, OSError, MemoryError):
         raise
-    except Exception as error:  # a stranger's code may fail in any way
+    except Exception as error:  # third-party code may fail in any way
         if family in BUILT_IN:
             raise
-        raise PluginError(f"family {family.name!r} cannot load {found.path}: {type(error).__name__}: {error}") from error
-    if lacks := lacking(model):
-        raise PluginError(f"family {family.name!r} loads {type(model).__name__}, which lacks {', '.join(lacks)}; see mipmap_plugin.models.base")
+        raise PluginError(f"family {family.name!r} cannot load {checkpoint.path}: {type(error).__name__}: {error}") from error
+    if missing := lacking(model):
+        raise PluginError(f"family {family.name!r} loads {type(model).__name__}, which lacks {', '.join(missing)}; see mipmap_plugin.models.base")
     return model
 
 
 def register_model(name: str, target: Any, replace: bool = False) -> None:
-    """Recognize and load the checkpoints of a family, a `Family` of that name or "package.module:FAMILY". Raises SettingsError."""
+    """Register a family: a `Family` with that name, or "package.module:FAMILY". Raises SettingsError if the name is taken."""
     FAMILIES.add(name, target, replace=replace)

@@ -1,4 +1,4 @@
-"""The contract of a model: a checkpoint of any family that answers a camera with Gaussians."""
+"""The contract of a model: a checkpoint of any family, which returns Gaussians for a camera."""
 
 from __future__ import annotations
 
@@ -14,134 +14,133 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effect
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 
-# The name, among a model's parameters, of columns that go with their rows when rows are removed, and that never move: an anchor's
-# level, for example.
+# Name, among a model's parameters, of values that are never optimized but removed with their rows, such as an anchor's level.
 CARRIED = "carried"
 
 
 @dataclass(frozen=True)
 class TrainedScale:
-    """The screen filter that a checkpoint was trained with, and how its cameras were sampled."""
+    """The screen filter and the sampling rate that a checkpoint was trained with."""
 
     screen_filter: str = "classic"  # a name of splatting/filters.py
     eps2d: float = DILATION  # px² of a training pixel
     resolution: float = -1  # INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px
     background: tuple[float, float, float] | None = None  # linear RGB; None: the checkpoint does not say
     near_plane: float = NEAR_PLANE  # world units
-    keeps_filter: bool = False  # an adapted file is for its own project, and keeps this filter; else it is classic, or for a viewer
+    keeps_filter: bool = False  # an adapted file needs this filter, so it is for the original project only; else it is classic, or for a viewer
 
 
 @dataclass(frozen=True)
 class Traits:
-    """What a model is, beyond answering a camera with Gaussians. Nobody asks for anything else about its family."""
+    """Properties of a model. No other code depends on its family."""
 
-    same_for_all_views: bool = False  # its rows are splats, which every camera sees alike: it offers `rebuild`, and they may be merged
-    moves: bool = False  # its Gaussians follow the camera's time
-    filtered: bool = False  # each of its splats has a 3D filter, which no viewer but its own project's knows: it offers `fused` and `bare`
-    placed: bool = False  # it was trained in a frame or at a size of its own: it offers `as_trained`
-    no_viewer: str = ""  # why no viewer (`viewers`) draws its splats, in a sentence without a full stop; empty where one does
-    exposures: Exposures = NO_EXPOSURES  # what training made of the colors for each photograph
-    effects: tuple[Effect, ...] = ()  # what it does for a camera before any splat is drawn, of `effects.OF_OTHER_MODELS`
+    same_for_all_views: bool = False  # rows are splats, the same for every camera: the model has `rebuild`, and splats may be merged
+    moves: bool = False  # Gaussians depend on the camera's time
+    filtered: bool = False  # each splat has a 3D filter, which only the original project's viewer applies: the model has `fused` and `bare`
+    placed: bool = False  # trained in a coordinate frame or at an image size of its own: the model has `as_trained`
+    no_viewer: str = ""  # why no viewer (`viewers`) can draw the splats, a sentence without a full stop; empty if one can
+    exposures: Exposures = NO_EXPOSURES  # the trained color transformation of each photograph
+    effects: tuple[Effect, ...] = ()  # those of `effects.OF_OTHER_MODELS` that the model simulates
 
 
-# The names that parameters may have, each with a learning rate of its own (`config.LearningRates`); the first has to be among them.
+# Allowed names of parameters, each with a learning rate of its own (`config.LearningRates`). The first is required.
 PARAMETERS = ("means", "scales", "quats", "opacities", "sh0", "shN", "offsets", "features", CARRIED)
 
 
 class SplatModel(Protocol):
-    """What any family offers to be rendered, adapted and saved. A Protocol: plug-ins need no base class.
+    """What every model provides to be rendered, adapted and saved. A Protocol: plug-ins need no base class.
 
     Raw parameters are as the family stores them (log scales, logits); `gaussians` activates them.
     """
 
     family: str  # "3dgs", "scaffold", ...
     trained: TrainedScale
-    notes: list[str]  # what a person should know about how it was read, in sentences
-    source: Path | None  # the file that was read; None: made in memory
+    notes: list[str]  # remarks for the user on how it was read, in sentences
+    source: Path | None  # the file that was read; None: created in memory
     folder: Path | None  # the model folder around it
-    digest: str  # sha256 of the file, hexadecimal; "" when made in memory, as a copy is
+    digest: str  # sha256 of the file, hexadecimal; "" for a model created in memory, such as a copy
 
     @property
     def traits(self) -> Traits:
-        """What the model is; it never changes."""
+        """The model's properties, which never change."""
 
     def gaussians(self, camera: Camera) -> Gaussians:
         """The splats that this camera sees, differentiable in `parameters()`."""
 
     def parameters(self) -> dict[str, Tensor]:
-        """What adaptation may move, by a name of PARAMETERS, "means" [N, 3] among them; row i of each belongs to the same splat (or anchor).
-        A deformation network is never among them."""
+        """The tensors that adaptation optimizes, by names of PARAMETERS, with "means" [N, 3] among them. Row i of each belongs to the same
+        splat (or anchor). Deformation networks are not included."""
 
     def copy(self) -> SplatModel:
-        """An independent model with leaf parameters of its own that require gradients; this one stays as it is."""
+        """An independent model whose parameters are leaves that require gradients; this one does not change."""
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
-        """Take these very tensors, all with the same number of rows, as the model's leaves. Only ever called on a copy."""
+        """Use these tensors themselves, all with the same number of rows, as the model's leaves. Only called on a copy."""
 
     def shared_parameters(self) -> dict[str, Tensor]:
-        """What adaptation may move besides and that belongs to no row, such as the networks of an anchor model; {} for most."""
+        """Further tensors that adaptation may optimize and that have no rows, such as the networks of an anchor model; {} for most."""
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera]) -> None:
-        """Give the model's splats the scales [M, 3] and opacities [M] that `form` finds for them, as far as the family can.
+        """Give the splats the scales [M, 3] and opacities [M] that `form` returns for them, as far as the family can.
 
-        `views` are there for families whose splats exist only for a camera. Only ever called on a copy.
+        Families whose splats exist only for a camera use `views`. Only called on a copy.
         """
 
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
-        """[N], 0..1, without gradient: how much each row of the parameters can show; rows that show nothing may be pruned."""
+        """The largest opacity of each row of the parameters, [N], 0..1, without gradient; rows of low opacity may be pruned."""
 
     def to(self, device: torch.device | str) -> SplatModel:
         """A copy on another device."""
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool) -> None:
-        """Raise what `save` would raise for that path, as far as it can be known, so that nobody works in vain."""
+        """Raise what `save` would raise for `path`, as far as it can be known before the work begins."""
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
-        """Write the model in the format it came in, atomically; return the file written. Raises OutputExists."""
+        """Write the model in the format that it was read from, atomically; return the file written. Raises OutputExists."""
 
 
 class Rebuilt(SplatModel, Protocol):
     """A model with the trait `same_for_all_views`."""
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
-        """Hold what `form` makes of its splats instead of them. Only ever called on a copy."""
+        """Replace the splats by those that `form` returns for them. Only called on a copy."""
 
 
 class Placed(SplatModel, Protocol):
     """A model with the trait `placed`."""
 
-    def as_trained(self, cameras: Sequence[Camera], taken: Taken) -> list[Camera]:
-        """Views of the photographs' scene in the frame and at the size that the model was trained in. Raises SceneError."""
+    def as_trained(self, cameras: Sequence[Camera], capture: Capture) -> list[Camera]:
+        """The cameras of a scene in the coordinate frame and at the image size of the training. Raises SceneError."""
 
 
 class Filtered(SplatModel, Protocol):
     """A model with the trait `filtered`."""
 
     def fused(self) -> SplatModel:
-        """Splats that look the same without the 3D filter; what a file for a viewer is made of."""
+        """Plain splats into which the 3D filter is baked, for a viewer's file."""
 
     def bare(self) -> SplatModel:
-        """What a viewer shows of the family's own file: the splats without their filter."""
+        """The splats without their 3D filter, as a viewer shows the family's own file."""
 
 
 def lacking(model: Any) -> list[str]:
-    """What an object lacks to be a SplatModel, by name; [] for one that is."""
-    asked = [*_members(SplatModel)]
+    """The names of the members that an object lacks to be a SplatModel; [] if none."""
+    required = [*_members(SplatModel)]
     if isinstance(traits := getattr(model, "traits", None), Traits):
-        asked += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed + ["fused", "bare"] * traits.filtered
-    missing = [name for name in asked if not hasattr(model, name)]
+        required += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed + ["fused", "bare"] * traits.filtered
+    missing = [name for name in required if not hasattr(model, name)]
     return missing if "traits" in missing or isinstance(traits, Traits) else [*missing, "traits of the type Traits"]
 
 
 def _members(protocol: type) -> list[str]:
-    """The attributes and methods that a protocol asks for."""
+    """The attributes and methods of a protocol."""
     return [*protocol.__annotations__, *(name for name in vars(protocol) if not name.startswith("_"))]
 
 
 def why_no_viewer(model: SplatModel) -> str:
-    """Why no viewer (`viewers`) draws what a model shows, in a sentence without a full stop; empty where a file can be made for one."""
+    """Why no viewer (`viewers`) can draw the model, a sentence without a full stop; empty if a file can be written for one."""
     traits = model.traits
     if traits.no_viewer or traits.filtered:
         return traits.no_viewer
@@ -151,5 +150,5 @@ def why_no_viewer(model: SplatModel) -> str:
 
 
 def effects_of(model: SplatModel) -> list[Effect]:
-    """What a model does for a camera before any splat is drawn, its exposures among them."""
+    """The effects that the model itself simulates, including exposure."""
     return [model.traits.exposures.effect(), *model.traits.effects]

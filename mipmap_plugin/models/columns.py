@@ -1,4 +1,4 @@
-"""The columns of a 3DGS PLY, as raw parameters and back. The names and their order are the original project's."""
+"""Conversion between the columns of a 3DGS PLY and raw parameters. Names and order of the columns are the original project's."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from torch import Tensor
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.splatting.harmonics import C0
 
-# Columns of f_rest, and the SH degree that they make.
+# Number of f_rest columns -> SH degree.
 SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 
-# Rows that are transposed together: 1 to 2 MB of a file's rows, which stay in the cache while each column is picked out.
+# Rows that are transposed together: 1 to 2 MB of a file, which stay in the cache while columns are copied.
 CHUNK = 8192
 
 POSITION = ("x", "y", "z")
-NORMAL = ("nx", "ny", "nz")  # always 0 in 3DGS, and read by nobody
+NORMAL = ("nx", "ny", "nz")  # always 0 in 3DGS, and never read
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -28,7 +28,7 @@ RGB = ("red", "green", "blue")
 
 
 def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Tensor]:
-    """Raw float32 parameters, named and shaped as gsplat does.
+    """Raw float32 parameters, with gsplat's names and shapes.
 
     means [N, 3], scales [N, 3] log, quats [N, 4] wxyz, opacities [N] logit, sh0 [N, 1, 3], shN [N, K, 3] basis-major.
     Raises CheckpointError for missing columns and for a number of f_rest columns that fits no SH degree.
@@ -70,24 +70,25 @@ def to_columns(parameters: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
 
 
 def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Copies of the columns that 3DGS does not know, such as a confidence or a segment id."""
+    """Copies of the columns that 3DGS does not define, such as a confidence or a segment id."""
     known = {*POSITION, *NORMAL, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
     known |= set() if DC[0] in columns else set(RGB)
     return {name: column.copy() for name, column in columns.items() if name not in known}
 
 
 def rest_names(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """The names of the f_rest columns in the order of their numbers."""
     return numbered(columns, "f_rest_")
 
 
 def numbered(columns: Iterable[str], prefix: str) -> tuple[str, ...]:
-    """`prefix`0, `prefix`1, ... by their number, since neither the file's order nor the alphabet's is theirs."""
+    """The columns `prefix`0, `prefix`1, ... sorted by number, which neither the file nor the alphabet guarantees."""
     names = [name for name in columns if re.fullmatch(re.escape(prefix) + r"\d+", name)]
     return tuple(sorted(names, key=lambda name: int(name.removeprefix(prefix))))
 
 
 def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-    """Red, green and blue stand in for f_dc: integers of their full range, or floats of 0..1."""
+    """The columns with f_dc computed from red, green and blue if it is missing: integers of full range, or floats in 0..1."""
     if DC[0] in columns or not all(name in columns for name in RGB):
         return columns
     return {**columns, **{dc: (_unit(columns[name]) - 0.5) / C0 for dc, name in zip(DC, RGB, strict=True)}}
@@ -99,7 +100,7 @@ def _unit(column: np.ndarray) -> np.ndarray:
 
 
 def stacked(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> Tensor:
-    """[N, len(names)] float32. What float32 cannot hold becomes infinite, and is found by `health`."""
+    """The columns `names` as [N, len(names)] float32. Values that overflow become infinite, and are reported by `health`."""
     block = np.empty((len(columns["x"]), len(names)), np.float32)
     with np.errstate(over="ignore"):
         for start in range(0, len(block), CHUNK):

@@ -1,4 +1,4 @@
-"""A pytest suite for the authors of families: what a checkpoint goes through here. This module alone needs pytest."""
+"""A pytest suite for the authors of families. Only this module needs pytest."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from mipmap_plugin.models.base import PARAMETERS, SplatModel, lacking
 from mipmap_plugin.scenes.trajectories import orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
-# What formats round off, in steps of an image.
+# Allowed difference of images, because formats round.
 SAME = 1 / 255
 
 
 class ModelSuite:
-    """Subclass it in a test file, with a fixture that makes a checkpoint of your family, and pytest checks the family::
+    """Subclass it in a test file, with a fixture that writes a checkpoint of your family, and pytest checks the family::
 
         class TestMine(ModelSuite):
             family = "mine"
@@ -35,11 +35,11 @@ class ModelSuite:
     """
 
     family: str
-    cameras: Sequence[Camera] = ()  # none: small views of an orbit
-    saved_as = "saved"  # the file or folder that an adapted model is saved to
+    cameras: Sequence[Camera] = ()  # empty: small views of an orbit
+    saved_as = "saved"  # name of the file or folder that an adapted model is saved to
     scale = 1 / 2
-    device = "cpu"  # where it is taken to
-    settings: dict[str, Any] = dict(steps=2, extra_views=2, merge_to=1.0)  # of adapting  # noqa: RUF012
+    device = "cpu"  # second device of the test that moves the model
+    settings: dict[str, Any] = dict(steps=2, extra_views=2, merge_to=1.0)  # of the adaptation  # noqa: RUF012
 
     @pytest.fixture
     def base(self, checkpoint: Path) -> Wrapped:
@@ -58,8 +58,8 @@ class ModelSuite:
 
     def test_shows_something_finite(self, base):
         with torch.no_grad():
-            shown = base.render(base.cameras[0])
-        assert shown.image.isfinite().all() and shown.alpha.max() > 0
+            rendered = base.render(base.cameras[0])
+        assert rendered.image.isfinite().all() and rendered.alpha.max() > 0
 
     def test_a_copy_learns_and_the_base_does_not(self, base):
         before, copied, view = _tensors(base.model), base.model.copy(), base.cameras[0]
@@ -82,15 +82,15 @@ class ModelSuite:
 
     def test_keeps_what_its_traits_promise(self, base):
         view, traits = base.cameras[0], base.model.traits
-        shown = base.render(view).image
-        others = [base.model.fused()] if traits.filtered else []  # type: ignore[attr-defined]
+        image = base.render(view).image
+        models = [base.model.fused()] if traits.filtered else []  # type: ignore[attr-defined]
         if traits.same_for_all_views:
             copied = base.model.copy()
             copied.rebuild(lambda gaussians: gaussians[torch.arange(len(gaussians))])  # type: ignore[attr-defined]
-            others.append(copied)
-        for other in others:
-            same = Wrapped(other, base.cameras, "reference", base.trained).render(view).image
-            assert (shown - same).abs().max() <= SAME
+            models.append(copied)
+        for model in models:
+            same = Wrapped(model, base.cameras, "reference", base.trained).render(view).image
+            assert (image - same).abs().max() <= SAME
 
     def test_the_base_is_never_an_output(self, base):
         for path in {base.model.source, base.model.folder} - {None}:
@@ -104,14 +104,14 @@ class ModelSuite:
         assert saved.is_file()
         again = load_model(tmp_path / self.saved_as)
         view = base.cameras[0].zoomed(self.scale)
-        shown = [adapted.render(view).image, wrap_model(again, cameras=base.cameras, backend="reference").render(view).image]
-        assert (shown[0] - shown[1]).abs().max() <= SAME
+        images = [adapted.render(view).image, wrap_model(again, cameras=base.cameras, backend="reference").render(view).image]
+        assert (images[0] - images[1]).abs().max() <= SAME
 
     def test_goes_to_another_device(self, base):
-        there = base.model.to(self.device)
-        assert {tensor.device.type for tensor in there.parameters().values()} == {torch.device(self.device).type}
+        moved = base.model.to(self.device)
+        assert {tensor.device.type for tensor in moved.parameters().values()} == {torch.device(self.device).type}
         with torch.no_grad():
-            for tensor in there.parameters().values():
+            for tensor in moved.parameters().values():
                 tensor.zero_()
         assert any(tensor.abs().sum() > 0 for tensor in base.model.parameters().values())
 

@@ -1,4 +1,4 @@
-"""Which family a checkpoint belongs to: each is asked, and the surest is believed."""
+"""Detection of a checkpoint's family: every family may claim it, and the most certain claim wins."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from mipmap_plugin.models.family import Family, Files, Match
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint that was found."""
+    """A detected checkpoint."""
 
     family: str  # a name in `families.FAMILIES`
     path: Path  # the file that holds the splats
     folder: Path | None = None  # the model folder around it
     iteration: int | None = None
-    notes: tuple[str, ...] = ()  # what was passed over, in sentences
+    notes: tuple[str, ...] = ()  # iterations that were skipped, and why, in sentences
 
 
 def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
-    """Find the splats at `path`, a file or a model folder, and name their family.
+    """Find the splats at `path`, a file or a model folder, and their family.
 
-    Of a folder, the newest `iteration_<N>` whose PLY is whole is taken, or the one asked for.
-    Raises CheckpointError for what is missing, damaged, or not a checkpoint.
+    In a folder, the newest `iteration_<N>` whose PLY is complete is used, or `iteration`.
+    Raises CheckpointError for a path that is missing, damaged, or not a checkpoint.
     """
     path = settled(Path(path))
     if path.is_dir():
@@ -39,29 +39,29 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
 
 
 def detect_as(path: str | Path, families: tuple[str, ...], *, iteration: int | None = None) -> Checkpoint:
-    """As `detect`, where only these families will do. Raises CheckpointError for others."""
-    found = detect(path, iteration=iteration)
-    if found.family in families:
-        return found
-    family = find_family(found.family)
+    """As `detect`, but raises CheckpointError for any family not in `families`."""
+    checkpoint = detect(path, iteration=iteration)
+    if checkpoint.family in families:
+        return checkpoint
+    family = find_family(checkpoint.family)
     if family.load is None:
-        raise CheckpointError(f"{found.path}: {not_loaded(found.family)}")
-    raise CheckpointError(f"{found.path} is a checkpoint of {family.title}, which is read in another way; load it with load_model")
+        raise CheckpointError(f"{checkpoint.path}: {not_loaded(checkpoint.family)}")
+    raise CheckpointError(f"{checkpoint.path} is a checkpoint of {family.title}, which is read in another way; load it with load_model")
 
 
 def _recognize(path: Path) -> tuple[Checkpoint, Match]:
     if not path.exists():
         raise CheckpointError(f"{path} does not exist; give a PLY file or a model folder")
     files = Files(path)
-    claims, notes = _ask_all(files)
-    family, match = _surest(files, claims, notes)
+    claims, notes = _claims(files)
+    family, match = _most_certain(files, claims, notes)
     if match.trouble:
         raise CheckpointError(match.trouble)
     return Checkpoint(family.name, path, files.folder, files.iteration, tuple(notes)), match
 
 
-def _ask_all(files: Files) -> tuple[dict[str, tuple[Family, Match]], list[str]]:
-    """The families that claim a file, and why some could not be asked: one that is broken breaks nothing."""
+def _claims(files: Files) -> tuple[dict[str, tuple[Family, Match]], list[str]]:
+    """The families that claim a file, and notes on families that fail, which must not break the others."""
     claims, notes = {}, []
     for name in FAMILIES.names():
         try:
@@ -73,13 +73,13 @@ def _ask_all(files: Files) -> tuple[dict[str, tuple[Family, Match]], list[str]]:
                 claims[name] = family, match
         except CheckpointError:
             raise
-        except Exception as error:  # a stranger's code may fail in any way
-            notes.append(f"the family {name!r} could not be asked: {error}")
+        except Exception as error:  # third-party code may fail in any way
+            notes.append(f"the family {name!r} failed: {error}")
     return claims, notes
 
 
-def _surest(files: Files, claims: dict[str, tuple[Family, Match]], notes: list[str]) -> tuple[Family, Match]:
-    """The surest of those that no other comes before."""
+def _most_certain(files: Files, claims: dict[str, tuple[Family, Match]], notes: list[str]) -> tuple[Family, Match]:
+    """The most certain claim over which no other takes precedence."""
     passed_over = {name for family, _ in claims.values() for name in family.before}
     left = [claim for name, claim in claims.items() if name not in passed_over]
     best = [(family, match) for family, match in left if match.sure == max(match.sure for _, match in left)]
@@ -124,12 +124,12 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         clouds = [folder / "point_cloud.ply"]
     if len(clouds) == 1:
         return detect(clouds[0])
-    told = f"{len(clouds)} PLY files ({', '.join(c.name for c in clouds[:5])})" if clouds else "no point_cloud folder and no PLY file"
-    raise CheckpointError(f"{folder} holds {told}; give one PLY file, or a model folder with point_cloud/iteration_<N>")
+    content = f"{len(clouds)} PLY files ({', '.join(c.name for c in clouds[:5])})" if clouds else "no point_cloud folder and no PLY file"
+    raise CheckpointError(f"{folder} holds {content}; give one PLY file, or a model folder with point_cloud/iteration_<N>")
 
 
 def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
-    """The newest iteration that is whole. What is passed over on the way is noted."""
+    """The newest complete iteration, or the `wanted` one, with notes on those that were skipped."""
     entries = {int(m[1]): entry for entry in (folder / "point_cloud").iterdir() if (m := re.fullmatch(r"iteration_(\d+)", entry.name))}
     if not entries:
         raise CheckpointError(f"{folder / 'point_cloud'} holds no iteration_<N> folder; give the PLY file itself")
@@ -141,17 +141,17 @@ def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
         try:
             if not ply.exists() and (scene := ply.with_name("scene_point_cloud.ply")).exists():
                 raise CheckpointError(f"{entries[number]} is of SAGA; give the PLY of its scene itself: {scene}")
-            found, match = _recognize(settled(ply))
+            checkpoint, match = _recognize(settled(ply))
             if match.lacks:
                 raise CheckpointError(f"{entries[number]} is an incomplete checkpoint, without {', '.join(match.lacks)}")
-            return Checkpoint(found.family, ply, folder, number, tuple(f"iteration_{number} is taken, since {trouble}" for trouble in troubles))
+            return Checkpoint(checkpoint.family, ply, folder, number, tuple(f"iteration_{number} is used, since {trouble}" for trouble in troubles))
         except CheckpointError as error:
             troubles.append(str(error))
     raise CheckpointError(f"{folder} has no whole checkpoint: {'; '.join(troubles)}")
 
 
 def _placed(folder: Path) -> Iterator[tuple[Family, dict[int, Path]]]:
-    """The families that find files of theirs in a folder of results; a broken one finds none, as `_ask_all` tells of the files themselves."""
+    """The families that have checkpoints in a result folder. Families that fail are skipped here; `_claims` reports them."""
     for name in FAMILIES.names():
         try:
             family = find_family(name)
@@ -159,12 +159,12 @@ def _placed(folder: Path) -> Iterator[tuple[Family, dict[int, Path]]]:
                 yield family, steps
         except CheckpointError:
             raise
-        except Exception:  # a stranger's code may fail in any way
+        except Exception:  # third-party code may fail in any way
             continue
 
 
 def _steps(folder: Path, family: Family) -> dict[int, Path]:
-    """The checkpoints of a training by their steps, 0 where a name has none; of several ranks the first."""
+    """The checkpoints of a family in a result folder by step, 0 for a name without one; of several ranks the first."""
     if family.place is None:
         return {}
     below, pattern = family.place
@@ -173,7 +173,7 @@ def _steps(folder: Path, family: Family) -> dict[int, Path]:
     named = {int(name.groupdict().get("step") or 0): file for file in files if (name := re.fullmatch(pattern, file.name))}
     if below:
         return named
-    # A file of any project may have such a name.
+    # Files of other projects may have such names, too.
     return {step: file for step, file in named.items() if family.recognize(Files(file))}
 
 
@@ -181,5 +181,5 @@ def _detect_step(family: Family, folder: Path, steps: dict[int, Path], wanted: i
     step = max(steps) if wanted is None else wanted
     if step not in steps:
         raise CheckpointError(f"{folder} has no checkpoint of step {step}; it has {', '.join(map(str, sorted(steps)))}")
-    found = detect(steps[step])  # a place may be another family's too, so that all are asked
-    return replace(found, folder=folder, iteration=step) if family.place and family.place[0] else found
+    checkpoint = detect(steps[step])  # other families may use the same place
+    return replace(checkpoint, folder=folder, iteration=step) if family.place and family.place[0] else checkpoint

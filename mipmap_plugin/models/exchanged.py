@@ -1,4 +1,4 @@
-"""Splats that come in an exchange format: read as the PLY that splat-transform makes of it, and written back through it."""
+"""Splats in an exchange format: converted to PLY by splat-transform when read, and back when written."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def load_exchanged(path: str | Path, *, iteration: int | None = None) -> Vanilla
     if kind not in EXCHANGE:
         raise CheckpointError(f"{file} is in no exchange format; give an SPZ, SOG, KSPLAT, SPLAT or compressed PLY")
     with as_ply(file, kind) as ply:
-        found = detect(ply)
-        if found.family != "3dgs":
-            raise CheckpointError(f"{file}: its splats are of {find_family(found.family).title}, not read from this format; give its own file")
-        model = read_vanilla(replace(found, folder=None)).coming_from(file)
-    certain = torch.tensor(OPACITY_MARGIN).logit().abs().item()
-    model.parameters()["opacities"].clamp_(-certain, certain)  # 8 bits hold 0 and 1, whose logits are infinite
-    told = f"{EXCHANGE[kind][0]} rounds off what was trained: the base is what its viewers show"
-    model.notes = [f"read through splat-transform; {told}", *(note for note in model.notes if ply.name not in note)]
+        checkpoint = detect(ply)
+        if checkpoint.family != "3dgs":
+            raise CheckpointError(f"{file}: its splats are of {find_family(checkpoint.family).title}, not read from this format; give its own file")
+        model = read_vanilla(replace(checkpoint, folder=None)).with_source(file)
+    largest = torch.tensor(OPACITY_MARGIN).logit().abs().item()
+    model.parameters()["opacities"].clamp_(-largest, largest)  # 8-bit opacities may be 0 or 1, whose logits are infinite
+    rounding = f"{EXCHANGE[kind][0]} rounds the trained values: the base is what its viewers show"
+    model.notes = [f"read through splat-transform; {rounding}", *(note for note in model.notes if ply.name not in note)]
     return model

@@ -1,7 +1,7 @@
-"""exposure.json of 3DGS (since 2024-08): what training made of the colors for each photograph, by the name of its image.
+"""exposure.json of 3DGS (since 2024-08): a trained affine transformation of colors for each photograph, by image name.
 
-The file is written by every training; only `--train_test_exp` makes it other than identities. As in the original, a view has the
-exposure of its name, also a test view, of which that option trains on a half.
+Every training writes the file; without `--train_test_exp` it holds identities. As in the original, a view gets the exposure of its
+name, test views included, since that option trains on half of each.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from mipmap_plugin.errors import SettingsError
 
 FILE = "exposure.json"
 
-# What json and torch raise for text, values and shapes that are no matrices.
+# What json and torch raise for text, values and shapes that are not matrices.
 UNREADABLE = (OSError, ValueError, TypeError, AttributeError, RuntimeError, RecursionError, OverflowError)
 
 
 @dataclass(frozen=True, eq=False)
 class Exposures:
-    """Those of one checkpoint."""
+    """The exposures of one checkpoint."""
 
     matrices: Mapping[str, Tensor] = field(default_factory=dict)  # [3, 4] float64 by image name
     why_none: str = EXPOSURE.reason
 
     @property
     def changed(self) -> int:
-        """How many are not the identity."""
+        """The number of matrices that are not the identity."""
         return sum(not torch.equal(matrix, torch.eye(3, 4, dtype=matrix.dtype)) for matrix in self.matrices.values())
 
     def effect(self) -> Effect:
-        """What there is, where it was not asked for."""
-        return replace(EXPOSURE, reason=self.found() + ", not asked for" * bool(self.changed))
+        """The effect `exposure` for a request without it."""
+        return replace(EXPOSURE, reason=self.summary() + ", not asked for" * bool(self.changed))
 
     def of(self, camera: Camera) -> Tensor:
-        """[3, 4] float64, of the image that `camera` is named after, with or without its suffix. Raises SettingsError where there is none."""
+        """The matrix [3, 4] float64 of the image with the name of `camera`, with or without suffix. Raises SettingsError if there is none."""
         if not self.matrices:
-            raise SettingsError(f"exposure: {self.found()}; leave it out")
+            raise SettingsError(f"exposure: {self.summary()}; leave it out")
         without_suffix = {splitext(name)[0]: matrix for name, matrix in self.matrices.items()}
         matrix = self.matrices.get(camera.name, without_suffix.get(camera.name))
         if matrix is None:
@@ -53,8 +53,8 @@ class Exposures:
             raise SettingsError(f"view {camera.name!r} has no exposure; the first of {len(self.matrices)} that have one are {some}")
         return matrix
 
-    def found(self) -> str:
-        """What there is, as the beginning of a sentence."""
+    def summary(self) -> str:
+        """A summary, as the beginning of a sentence."""
         if not self.matrices:
             return self.why_none
         if not self.changed:
@@ -66,18 +66,18 @@ NO_EXPOSURES = Exposures()
 
 
 def read_exposures(folder: Path | None) -> Exposures:
-    """The exposures of a model folder; none, with the reason, where its file is missing or cannot be read."""
+    """The exposures of a model folder; empty, with the reason, if the file is missing or cannot be read."""
     if folder is None or not (folder / FILE).is_file():
         return NO_EXPOSURES
     try:
-        held = json.loads((folder / FILE).read_text(encoding="utf-8"))
-        return Exposures({name: _matrix(name, rows) for name, rows in held.items()}, f"{FILE} names no image")
+        content = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        return Exposures({name: _matrix(name, rows) for name, rows in content.items()}, f"{FILE} names no image")
     except UNREADABLE as error:
         return Exposures(why_none=f"{FILE} cannot be read ({error})")
 
 
 def exposed(image: Tensor, matrix: Tensor) -> Tensor:
-    """`image` [H, W, 3] as its photograph has it: each color as a row times E[:, :3], plus E[:, 3] (gaussian_renderer of 3DGS). Not clamped."""
+    """Apply an exposure E to `image` [H, W, 3]: each color as a row times E[:, :3], plus E[:, 3] (gaussian_renderer of 3DGS). Not clamped."""
     matrix = matrix.to(image)
     return image @ matrix[:, :3] + matrix[:, 3]
 

@@ -1,4 +1,4 @@
-"""The built-in families: how each is recognized, and what loads it. Whoever adds one writes such a record, here or in a package of their own."""
+"""The built-in families: how each is recognized and loaded. A new family is one more record, here or in a package of its own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mipmap_plugin.registry import Registry
 
 Recognize = Callable[[Files], Match | None]
 
-# What the optimizer of fudan-zvg's 4D Gaussian Splatting names, and no other's; that project saves no PLY.
+# Names that only the optimizer of fudan-zvg's 4D Gaussian Splatting has; that project saves no PLY.
 FUDAN = ("scaling_t", "rotation_r")
 
 ANCHOR_COLUMNS = {"f_offset_0", "f_anchor_feat_0"}
@@ -24,25 +24,27 @@ FLAT_OR_FILTERED = (*FILTERED, "2dgs")
 
 
 def plain(files: Files) -> Match | None:
+    """Recognize a PLY with the columns of 3DGS."""
     return Match(PLAIN, "columns of splats") if files.holds_splats else None
 
 
 def certain(test: Callable[[Files], bool], why: str, trouble: str = "") -> Recognize:
-    """A family whose files no other has. `trouble` is formatted with the path."""
+    """Recognize files that pass `test`, which those of no other family do. `trouble` is formatted with the path."""
     return lambda files: Match(CERTAIN, why, trouble.format(path=files.path)) if test(files) else None
 
 
 def has(*columns: str) -> Recognize:
-    """A PLY with these columns, which no other family has."""
+    """Recognize a PLY with these columns, which no other family has."""
     return certain(lambda files: files.columns >= set(columns), f"columns {', '.join(columns)}")
 
 
 def anchors(name: str) -> Recognize:
+    """Recognize a PLY with the anchors of the family `name`."""
     return lambda files: Match(CERTAIN, "columns of anchors", lacks=_networks(files, name)) if _kind_of_anchors(files.columns) == name else None
 
 
 def _kind_of_anchors(columns: frozenset[str]) -> str | None:
-    """HAC and what follows it have masks. Octree-AnyGS has explicit anchors too, and keeps its constants in the header, not in `info`."""
+    """The family of an anchor PLY. HAC and its successors have masks. Octree-AnyGS has explicit anchors too, and its constants in the header."""
     if not ANCHOR_COLUMNS & columns:
         return None
     if "f_mask_0" in columns:
@@ -57,14 +59,14 @@ def _networks(files: Files, name: str) -> tuple[str, ...]:
 
 
 def filtered(name: str) -> Recognize:
-    """A PLY with a 3D filter, by the options that each project saves; a bare file that was written here tells its family."""
+    """Recognize a PLY with a 3D filter by the options that its project saves, or by the provenance in a file written by this package."""
 
     def recognize(files: Files) -> Match | None:
         if "filter_3D" not in files.columns:
             return None
-        told, options = files.provenance.get("family"), files.options
-        if not options and told in FILTERED:
-            project = told
+        written_as, options = files.provenance.get("family"), files.options
+        if not options and written_as in FILTERED:
+            project = written_as
         elif "use_decoupled_appearance" in options:
             project = "gof"
         else:
@@ -79,31 +81,34 @@ def _is_flat(files: Files) -> bool:
 
 
 def hexplane(files: Files) -> Match | None:
+    """Recognize 4D Gaussians."""
     if files.holds_splats and (is_coarse(files.path) or network_of(files.path, "4dgs").exists()):
         return Match(BY_COMPANIONS, "a deformation.pth beside it")
     return _lost_network(files, "4dgs")
 
 
 def deformable(files: Files) -> Match | None:
+    """Recognize Deformable 3D Gaussians."""
     if (nodes := _nodes_of_network(files)) is None:
         return _lost_network(files, "deformable")
     return None if nodes else Match(BY_COMPANIONS, "a deform.pth of its iteration")
 
 
 def controlled(files: Files) -> Match | None:
+    """Recognize SC-GS, whose network has control nodes."""
     if "fea_0" in files.columns:
         return Match(CERTAIN, "column fea_0")
     return Match(BY_COMPANIONS, "a deform.pth of its iteration, with nodes") if _nodes_of_network(files) else None
 
 
 def _nodes_of_network(files: Files) -> bool | None:
-    """Whether the deform.pth of the splats' iteration has the nodes of SC-GS; None: there is no such file."""
+    """Whether the deform.pth of the splats' iteration has the nodes of SC-GS; None if there is no such file."""
     network = network_of(files.path, "deformable")
     return bool(Files(network).words("nodes")) if files.holds_splats and files.folder and network.is_file() else None
 
 
 def _lost_network(files: Files, family: str) -> Match | None:
-    """Splats in a folder where others of its iterations are moved by a network."""
+    """Recognize splats without a network in a folder whose other iterations have one."""
     if not files.holds_splats or files.folder is None or not any(files.folder.glob(NETWORKS[family])):
         return None
     trouble = f"{files.path} lacks the network that moves its splats; copy it to {network_of(files.path, family)}, or choose another iteration"
@@ -111,15 +116,17 @@ def _lost_network(files: Files, family: str) -> Match | None:
 
 
 def exchange(files: Files) -> Match | None:
+    """Recognize the exchange formats of viewers."""
     return Match(CERTAIN, "its first bytes") if files.kind in EXCHANGE or files.compressed else None
 
 
 def torch_file(*words: str, sure: float = CERTAIN, trouble: str = "") -> Recognize:
-    """A torch file in which one of these words stands."""
+    """Recognize a torch file that contains one of these words."""
     return lambda files: Match(sure, f"holds {words[0]}", trouble.format(path=files.path)) if files.words(*words) else None
 
 
 def fudan(files: Files) -> Match | None:
+    """Recognize 4D Gaussian Splatting of fudan-zvg."""
     trouble = f"{files.path} is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here"
     return Match(BY_COMPANIONS, "its optimizer's names", trouble) if files.words(*FUDAN) == set(FUDAN) else None
 
@@ -147,7 +154,7 @@ BUILT_IN = (
         "exchange", "exchange format (SPZ, SOG, KSPLAT, SPLAT, compressed PLY)", exchange,
         load=f"{LOADERS}.exchanged:load_exchanged", place=("", r"(lod-)?meta\.json"),
     ),
-    # Recognized, so that nobody takes them for what they are not; not read.
+    # Recognized in order to be refused with a clear message.
     family(
         "anygs", "Octree-AnyGS", anchors("anygs"), before=FLAT_OR_FILTERED,
         not_loaded=": its anchors are drawn at offsets, in sizes and at levels of their own"
@@ -202,26 +209,26 @@ BUILT_IN = (
     ),
 )  # fmt: skip
 
-# By name; others come by `register_model` and by the entry-point group.
-FAMILIES = Registry("mipmap_plugin.models", {each.name: each for each in BUILT_IN})
+# All families by name; others are added by `register_model` and by the entry-point group.
+FAMILIES = Registry("mipmap_plugin.models", {record.name: record for record in BUILT_IN})
 
 
 def find_family(name: str) -> Family:
-    """The family of that name. Raises SettingsError for an unknown one, PluginError for what is no family of this version."""
-    found = FAMILIES.get(name)
-    if not isinstance(found, Family):
-        raise PluginError(f"family {name!r} is of type {type(found).__name__}; make it a mipmap_plugin.models.Family")
-    if found.name != name:
-        raise PluginError(f"family {name!r} calls itself {found.name!r}; register it under its own name")
-    if not isinstance(found.before, tuple):
-        raise PluginError(f"family {name!r} names {found.before!r} as what it comes before; give a tuple of names")
-    if found.api_version != API_VERSION:
-        raise PluginError(f"family {name!r} is written for API version {found.api_version}, this package has {API_VERSION}")
-    return found
+    """The family `name`. Raises SettingsError if it is unknown, PluginError if its target is not a valid Family of this API version."""
+    record = FAMILIES.get(name)
+    if not isinstance(record, Family):
+        raise PluginError(f"family {name!r} is of type {type(record).__name__}; make it a mipmap_plugin.models.Family")
+    if record.name != name:
+        raise PluginError(f"family {name!r} calls itself {record.name!r}; register it under its own name")
+    if not isinstance(record.before, tuple):
+        raise PluginError(f"family {name!r}: `before` must be a tuple of names, got {record.before!r}")
+    if record.api_version != API_VERSION:
+        raise PluginError(f"family {name!r} is written for API version {record.api_version}, but this package has API version {API_VERSION}")
+    return record
 
 
 def not_loaded(name: str) -> str:
-    """The sentence for a family that is recognized, but that nothing loads."""
-    known = find_family(name)
-    told = f"this is a {known.title} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
-    return told + known.not_loaded
+    """The message for a family that is recognized but not loaded."""
+    record = find_family(name)
+    message = f"this is a {record.title} checkpoint, a family that is recognized but not loaded by this version of mipmap_plugin"
+    return message + record.not_loaded

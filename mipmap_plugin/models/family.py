@@ -1,4 +1,4 @@
-"""The contract of a family: what tells its checkpoints from those of others, and what loads them."""
+"""The contract of a family: how its checkpoints are recognized and loaded."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mipmap_plugin.formats.ply import Header, read_header
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.places import around
 
-# Raised by one when a family that was written for the old contract no longer works.
+# Incremented when families that were written for the old contract no longer work.
 API_VERSION = 1
 
-# How sure a family can be: by what no other's files have; by files that lie beside the splats; by what many have.
+# Degrees of certainty: by features that only this family's files have; by files beside the splats; by features that many families share.
 CERTAIN, BY_COMPANIONS, PLAIN = 1.0, 0.8, 0.5
 
 # The columns without which a PLY holds no splats.
@@ -26,18 +26,18 @@ OF_SPLATS = frozenset({"opacity", "scale_0", "rot_0"})
 
 @dataclass(frozen=True)
 class Match:
-    """A family's answer to whether a file is its own."""
+    """A family's claim that a file is its own."""
 
-    sure: float  # 0..1
-    why: str  # what tells it
-    trouble: str = ""  # a sentence: why it cannot be loaded all the same
-    lacks: tuple[str, ...] = ()  # files that should lie beside it; of a model folder an older iteration that has them is taken
+    sure: float  # certainty, 0..1
+    why: str  # the feature by which it was recognized
+    trouble: str = ""  # a sentence: why it cannot be loaded nevertheless
+    lacks: tuple[str, ...] = ()  # files missing beside it; of a model folder, an older iteration that has them is loaded instead
 
 
 class Files:
-    """The file that holds the splats and what lies around it; each part is read once, when a family first looks at it.
+    """The file that holds the splats, and the files around it. Each part is read once, on first access.
 
-    Raises CheckpointError for what cannot be read.
+    Raises CheckpointError for files that cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -46,27 +46,27 @@ class Files:
 
     @cached_property
     def kind(self) -> str:
-        """What the file is by its first bytes (`magic.kind_of`): "ply", "torch", "zip", ..., "unknown"."""
+        """The file's type by its first bytes (`magic.kind_of`): "ply", "torch", "zip", ..., "unknown"."""
         return kind_of(self.path)
 
     @cached_property
     def header(self) -> Header | None:
-        """Of a PLY."""
+        """The header of a PLY; None for other files."""
         return read_header(self.path) if self.kind == "ply" else None
 
     @cached_property
     def columns(self) -> frozenset[str]:
-        """The names of a PLY's columns of vertices; none for another file."""
+        """The names of a PLY's vertex columns; empty for other files."""
         return frozenset(self.header.vertex.names) if self.header and not self.compressed else frozenset()
 
     @property
     def comments(self) -> tuple[str, ...]:
-        """Of a PLY's header."""
+        """The comments in a PLY's header."""
         return self.header.comments if self.header else ()
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """What this package wrote into the header of an adapted PLY."""
+        """The provenance that this package wrote into the header of an adapted PLY."""
         return provenance_of(self.comments) or {}
 
     @property
@@ -81,11 +81,11 @@ class Files:
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """The cfg_args of the model folder; none where there is no such file."""
+        """The cfg_args of the model folder; {} if there is no such file."""
         return read_cfg_args(self.folder / "cfg_args") if self.folder and (self.folder / "cfg_args").is_file() else {}
 
     def words(self, *wanted: str) -> set[str]:
-        """Which of these words stand in a torch file's pickle, which is searched as bytes and never unpickled."""
+        """Which of these words occur in a torch file's pickle, which is searched as bytes and never unpickled."""
         return {word for word in wanted if word.encode() in self._pickle}
 
     @cached_property
@@ -95,15 +95,15 @@ class Files:
 
 @dataclass(frozen=True)
 class Family:
-    """One kind of checkpoint. Built-in ones are such records (`families`), and a stranger's is no other."""
+    """One kind of checkpoint. Built-in (`families`) and third-party families are such records."""
 
-    name: str  # short, as reports name it
-    title: str  # as its authors write it
-    recognize: Callable[[Files], Match | None]  # None: the file is not its own
+    name: str  # short name, used in reports
+    title: str  # the name its authors use
+    recognize: Callable[[Files], Match | None]  # None: the file is not of this family
     api_version: int
-    # (path, *, iteration) -> SplatModel, or "package.module:function"; the path is what a user gave, a file or a folder, in which `detect`
-    # finds the file. None: it is not read.
+    # (path, *, iteration) -> SplatModel, or "package.module:function". The path is the user's, a file or a folder, in which `detect`
+    # finds the file. None: recognized, but not loaded.
     load: str | Callable[..., Any] | None = None
-    before: tuple[str, ...] = ()  # families whose claim to the same file counts for nothing
-    place: tuple[str, str] | None = None  # below a folder of results: a folder, and the pattern of a file's name, perhaps with a group `step`
-    not_loaded: str = ""  # what more is to be said of a family that is not read
+    before: tuple[str, ...] = ()  # families over which this one takes precedence when both claim a file
+    place: tuple[str, str] | None = None  # in a result folder: the subfolder and the pattern of file names, which may have a group `step`
+    not_loaded: str = ""  # addition to the message for a family that is not loaded

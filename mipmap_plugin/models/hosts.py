@@ -1,4 +1,4 @@
-"""Other projects whose files hold the splats of 3DGS: what such a file has that a PLY has not."""
+"""Host projects: other projects whose files contain the splats of 3DGS, and what such a file has beyond a PLY."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from mipmap_plugin.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)
-class Taken:
-    """What a scene knows of its photographs besides their cameras."""
+class Capture:
+    """Facts about a captured scene besides its cameras."""
 
     points: Tensor | None = None  # [P, 3] of structure from motion
     smaller: Callable[[int], tuple[int, int] | None] | None = None  # (width, height) px of the copies in images_<factor>; None: no photographs
-    applied_scale: float = 1.0  # by which nerfstudio had sized COLMAP's world before it wrote the file
+    applied_scale: float = 1.0  # scale that nerfstudio applied to COLMAP's world before it wrote the file
 
 
 class Host(Protocol):
-    """The project that a `VanillaModel` was read from, and into whose file it is written back."""
+    """The project that a `VanillaModel` was read from, and in whose format it is written back."""
 
     @property
     def family(self) -> str:
@@ -31,14 +31,14 @@ class Host(Protocol):
     def write(self, path: Path, parameters: dict[str, Tensor], comments: Sequence[str], *, overwrite: bool) -> Path:
         """Write raw `parameters`, named as VanillaModel's, to a file or a result folder, atomically; return the file with the splats.
 
-        `comments` (`tags.with_tags`) tell the screen filter and the provenance. Raises OutputExists.
+        `comments` (`tags.with_tags`) name the screen filter and the provenance. Raises OutputExists.
         """
 
     def holds(self, path: Path) -> str | None:
-        """The folder that every result folder written by `write` to `path` has; None where `path` is that of a file. Raises OutputError."""
+        """The subfolder that `write` creates in a result folder at `path`; None if `path` is a file. Raises OutputError."""
 
-    def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
-        """Views of the photographs' scene in the frame and at the size of the training.
+    def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
+        """The cameras of a scene in the coordinate frame and at the image size of the training.
 
         `means` [N, 3] are those of the splats. Raises SceneError.
         """

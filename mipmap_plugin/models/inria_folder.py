@@ -1,4 +1,4 @@
-"""The model folder of 3DGS around a PLY: what its companions tell, and how a new one is laid out."""
+"""The model folder of 3DGS around a PLY: reading its companion files, and writing a new folder."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mipmap_plugin.formats.cfg_args import format_cfg_args, read_cfg_args_and_re
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 
-# Copied byte for byte: the cameras, and what SIBR's viewer and `load_ply` of 3DGS look for.
+# Copied byte for byte: the cameras, and the files that SIBR's viewer and `load_ply` of 3DGS read.
 COMPANIONS = ("cameras.json", "input.ply", "exposure.json")
 
 # Pipeline options are not in cfg_args.
@@ -22,15 +22,15 @@ ANTIALIASING = (
     " if it was on, say so (--screen-filter antialiased)"
 )
 
-# Options that tell a screen filter (`_screen_filter`).
+# Options that determine the screen filter (`_screen_filter`).
 FILTER_OPTIONS = ("kernel_size", "load_allres")
 
-# 3DGS takes iteration 0 for "nothing loaded" (scene/__init__.py), so a model that came without one gets the usual last one.
+# 3DGS interprets iteration 0 as "nothing loaded" (scene/__init__.py), so a model without an iteration gets the usual last one.
 DEFAULT_ITERATION = 30_000
 
 
 def read_options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
-    """The options of the folder's cfg_args, {} where there are none, and a note when they cannot be read."""
+    """The options of the folder's cfg_args, {} if there are none, and a note if some cannot be read."""
     if folder is None or not (folder / "cfg_args").is_file():
         return {}, []
     try:
@@ -41,7 +41,7 @@ def read_options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
 
 
 def trained_scale(options: dict[str, Any], screen_filter: str | None) -> TrainedScale:
-    """How the checkpoint was trained, as far as its options and its header tag say so."""
+    """How the checkpoint was trained, from its options and the screen filter that its header names, if any."""
     resolution, white = options.get("resolution"), options.get("white_background")
     if not _is_number(resolution):
         resolution = TrainedScale.resolution
@@ -55,12 +55,12 @@ def trained_scale(options: dict[str, Any], screen_filter: str | None) -> Trained
 
 
 def _is_number(value: Any) -> TypeGuard[float]:
-    """Whether an option is a finite number that float32 holds; a literal may have any number of digits."""
+    """Whether an option is a number within the range of float32; a literal may have any number of digits."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e38
 
 
 def _screen_filter(options: dict[str, Any], tag: str | None) -> tuple[str, float]:
-    """Mip-Splatting and what follows it save their kernel_size; Analytic-Splatting has its multi-scale option without one."""
+    """Name and dilation of the screen filter. Mip-Splatting and its successors save a kernel_size; Analytic-Splatting has load_allres only."""
     kernel_size = options.get("kernel_size")
     if tag != "classic" and _is_number(kernel_size) and kernel_size >= 0:
         return "mip", float(kernel_size)
@@ -70,21 +70,21 @@ def _screen_filter(options: dict[str, Any], tag: str | None) -> tuple[str, float
 
 
 def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposures, tag: str | None = None) -> list[str]:
-    """What differs from the plain case, in sentences; `tag`: the screen filter that the header tells, if any."""
+    """Remarks on unusual options, in sentences. `tag`: the screen filter that the header names, if any."""
     notes = []
     if options.get("sh_degree", sh_degree) != sh_degree:
         notes.append(f"cfg_args says SH degree {options['sh_degree']}, but the PLY holds degree {sh_degree}; the PLY is trusted")
     if options.get("train_test_exp"):
         notes.append("trained with train_test_exp: the original shows each view by its exposure, which is done here only where asked for")
     if exposures is not NO_EXPOSURES:
-        notes.append(exposures.found())
+        notes.append(exposures.summary())
     if "train_test_exp" in options and tag is None:
         notes.append(ANTIALIASING)
     return notes
 
 
 def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: int | None, overwrite: bool, write_ply: Callable[[Path], Any]) -> Path:
-    """Lay out a model folder around the PLY that `write_ply` writes, all or nothing; return that PLY's path. Raises OutputExists."""
+    """Write a model folder around the PLY that `write_ply` writes, atomically; return that PLY's path. Raises OutputExists."""
     within = Path("point_cloud", f"iteration_{iteration or DEFAULT_ITERATION}", "point_cloud.ply")
     with new_folder(target, overwrite) as fresh:
         (fresh / within).parent.mkdir(parents=True)
@@ -97,9 +97,9 @@ def write_folder(target: Path, source: Path | None, cfg_args: str, iteration: in
 
 
 def cfg_args_for(source: Path | None, target: Path, trained: TrainedScale, sh_degree: int) -> str:
-    """The source's own text where its SH degree and screen filter fit; else its options, or the defaults of 3DGS, with the degree set.
+    """The text of the new cfg_args: the source's own if SH degree and screen filter agree, else its options, or the defaults of 3DGS.
 
-    Options that tell another screen filter are left out, for whoever reads the folder would draw with it.
+    Options that determine another screen filter are left out, because readers of the folder would use it.
     """
     options, _ = read_options(source)
     fits = not any(name in options for name in FILTER_OPTIONS) or _screen_filter(options, None) == (trained.screen_filter, trained.eps2d)

@@ -1,4 +1,4 @@
-"""Live models of other projects, recognized by their attributes: their tensors are copied, and nothing of theirs is imported or changed."""
+"""Live models of other projects, recognized by their attributes: tensors are copied; nothing is imported from these projects or changed."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
 from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, lacking
 from mipmap_plugin.models.gsplat import model as gsplat
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
-from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
+from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_invalid
 
-# INRIA's GaussianModel and its descendants: attribute by our name.
+# INRIA's GaussianModel and its descendants: name of the parameter here -> attribute.
 INRIA = {
     "means": "_xyz",
     "scales": "_scaling",
@@ -27,7 +27,7 @@ INRIA = {
     "shN": "_features_rest",
 }
 
-# Scaffold-GS's GaussianModel: attribute by our name, and how the shape of each goes on after N; 0 is any number.
+# Scaffold-GS's GaussianModel: name here -> attribute, and its shape after N; 0 is any number.
 ANCHORS = {
     "means": ("_anchor", (3,)),
     "offsets": ("_offset", (0, 3)),
@@ -37,19 +37,19 @@ ANCHORS = {
     "quats": ("_rotation", (4,)),
 }
 
-# Its networks; those of the second line are None or missing where they are not used.
+# Its networks; those of the second line are None or missing if they are not used.
 NETWORKS = {
     **{"opacity_mlp": "mlp_opacity", "cov_mlp": "mlp_cov", "color_mlp": "mlp_color"},
     **{"feature_bank_mlp": "mlp_feature_bank", "appearance": "embedding_appearance"},
 }
 
-# Deformable 3D Gaussians keeps its network in another object; of the classes with these tensors only its own has no `capture`.
-STILL = (
-    "this {name} has no capture(), as that of Deformable 3D Gaussians: if a network moves its splats, these are what they are before it does;"
+# Deformable 3D Gaussians keeps its network in another object; among the classes with these tensors only its own has no `capture`.
+MAY_MOVE = (
+    "this {name} has no capture(), like that of Deformable 3D Gaussians: if a network moves its splats, these are the splats before they move;"
     " give the path of the model folder to adapt a moving scene"
 )
 
-# Attributes of descendants that hold more than these tensors, and what they are.
+# Attributes of descendants with further parts, and what these are.
 MORE = {
     "_level": "anchors with levels (Octree-GS)",
     "_anchor": "anchors with networks other than those of Scaffold-GS",
@@ -60,23 +60,23 @@ MORE = {
 
 
 def adopt(model: Any) -> SplatModel:
-    """A model of this package as it is, or a copy of another project's live one.
+    """A model of this package itself, or a copy of another project's live model.
 
-    Taken are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it otherwise, Scaffold-GS's
-    `GaussianModel`, gsplat's `splats` (a dict or a ParameterDict), and splatfacto's model or its `gauss_params`. The copy stays on
-    the original's device. Splats that are not finite are dropped, as those of a file are.
+    Accepted are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it differently, Scaffold-GS's
+    `GaussianModel`, gsplat's `splats` (a dict or a ParameterDict), and splatfacto's model or its `gauss_params`. The copy is on
+    the original's device. Splats that are not finite are dropped, as when a file is loaded.
     Raises SettingsError for another object, ShapeError for tensors that do not fit together, CheckpointError
     for networks that do not fit their anchors.
     """
     if callable(getattr(model, "gaussians", None)):
-        if lacks := lacking(model):
-            raise SettingsError(f"this {_name(model)} has gaussians() as a model has, but lacks {', '.join(lacks)}; see mipmap_plugin.models.base")
-        return _sound(model)
-    found = [what for name, what in MORE.items() if hasattr(model, name)]
-    if found == [MORE["_anchor"]] and _is_scaffold(model):
+        if members := lacking(model):
+            raise SettingsError(f"this {_name(model)} has gaussians() as a model has, but lacks {', '.join(members)}; see mipmap_plugin.models.base")
+        return _checked(model)
+    parts = [what for name, what in MORE.items() if hasattr(model, name)]
+    if parts == [MORE["_anchor"]] and _is_scaffold(model):
         return scaffold_in_memory(_anchors(model), _networks(model), _name(model))
-    if found:
-        raise SettingsError(f"this {_name(model)} has {found[0]}, which are read from files only; save it, and give the path")
+    if parts:
+        raise SettingsError(f"this {_name(model)} has {parts[0]}, which are read from files only; save it, and give the path")
     if all(hasattr(model, name) for name in INRIA.values()):
         raw = _copied(model, {name: getattr(model, attribute) for name, attribute in INRIA.items()})
         raw["opacities"] = raw["opacities"].reshape(-1)
@@ -84,7 +84,7 @@ def adopt(model: Any) -> SplatModel:
             raw["scales"] = torch.cat([raw["scales"], torch.full_like(raw["scales"][:, :1], FLAT)], dim=1)
             return _adopted(model, raw, flat_trained(TrainedScale()), Origin(), SurfelModel)
         adopted = _adopted(model, raw, TrainedScale(), Origin())
-        adopted.notes += [] if hasattr(model, "capture") else [STILL.format(name=_name(model))]
+        adopted.notes += [] if hasattr(model, "capture") else [MAY_MOVE.format(name=_name(model))]
         return adopted
     tensors = _mapping(getattr(model, "gauss_params", model))
     if set(splatfacto.NAMES) <= set(tensors):
@@ -92,14 +92,14 @@ def adopt(model: Any) -> SplatModel:
         return _adopted(model, raw, TrainedScale(near_plane=splatfacto.NEAR_PLANE), Origin())
     if set(gsplat.NAMES) == set(tensors):
         return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE), Origin(host=gsplat.GsplatHost()))
-    told = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
-    raise SettingsError(f"a {_name(model)}{told} is no model that is known; give a path, a GaussianModel, or gsplat's dictionary of splats")
+    content = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
+    raise SettingsError(f"a {_name(model)}{content} is not a known kind of model; give a path, a GaussianModel, or gsplat's dictionary of splats")
 
 
-def _sound(model: SplatModel) -> SplatModel:
-    """The model, without the splats that a file's would be read without. Raises SettingsError where a family of its own holds a NaN."""
+def _checked(model: SplatModel) -> SplatModel:
+    """The model without splats that are not finite. Raises SettingsError for NaN in a model of another class, whose rows cannot be dropped."""
     if isinstance(model, VanillaModel):
-        return without_poison(model)
+        return without_invalid(model)
     for name, tensor in model.parameters().items():
         if rows := int(tensor.detach().isnan().flatten(1).any(1).sum() if tensor.dim() > 1 else tensor.detach().isnan().sum()):
             raise SettingsError(f"this {_name(model)} holds a NaN in {name} of {rows:,} of its {len(tensor):,} rows; drop these first")
@@ -108,7 +108,7 @@ def _sound(model: SplatModel) -> SplatModel:
 
 def _is_scaffold(model: Any) -> bool:
     networks = [getattr(model, NETWORKS[name], None) for name in NEEDED]
-    return all(hasattr(model, name) for name, _ in ANCHORS.values()) and all(isinstance(each, torch.nn.Module) for each in networks)
+    return all(hasattr(model, name) for name, _ in ANCHORS.values()) and all(isinstance(network, torch.nn.Module) for network in networks)
 
 
 def _anchors(model: Any) -> dict[str, Tensor]:
@@ -132,16 +132,16 @@ def _mapping(model: Any) -> dict[str, Any]:
 
 
 def _copied(model: Any, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Contiguous float32 copies. Raises SettingsError for what is no tensor, or still empty."""
-    if bare := [name for name, tensor in tensors.items() if not torch.is_tensor(tensor)]:
-        raise SettingsError(f"this {_name(model)} holds no tensor for {', '.join(bare)}; load or train it first")
+    """Contiguous float32 copies. Raises SettingsError for values that are not tensors, and for empty ones."""
+    if missing := [name for name, tensor in tensors.items() if not torch.is_tensor(tensor)]:
+        raise SettingsError(f"this {_name(model)} holds no tensor for {', '.join(missing)}; load or train it first")
     if any(len(tensor) == 0 for tensor in tensors.values()):
         raise SettingsError(f"this {_name(model)} has no splats yet; load or train it first")
     return {name: tensor.detach().to(torch.float32, copy=True, memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
 
 
 def _adopted(model: Any, raw: dict[str, Tensor], trained: TrainedScale, origin: Origin, kind: type[VanillaModel] = VanillaModel) -> VanillaModel:
-    return without_poison(kind(raw, trained, origin, [f"copied from a live {_name(model)}"]))
+    return without_invalid(kind(raw, trained, origin, [f"copied from a live {_name(model)}"]))
 
 
 def _name(model: Any) -> str:

@@ -1,8 +1,8 @@
 """Families whose PLY has a column `filter_3D`: Mip-Splatting, Gaussian Opacity Fields and Analytic-Splatting.
 
-Everything else is stored as 3DGS does. The 3D filter keeps a splat from being thinner than what the training cameras resolved.
-It stays with its row: scales and opacities were fitted with it, so that another value would change the image. It has to be
-recomputed (`MipModel.refilter`) only for the original project to go on training after centers moved, and that project does so itself.
+Everything else is stored as in 3DGS. The 3D filter keeps splats from being thinner than the training cameras resolved. It is a constant
+of each row: scales and opacities were optimized with it, so another value would change the image. It is recomputed
+(`MipModel.refilter`) only before further training in the original project, which does so itself.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 
 COLUMN = "filter_3D"
 
-# How each family renders: the screen filter, and the dilation in px² where no cfg_args tells the kernel_size.
+# Screen filter of each family, and its dilation in px² if no cfg_args gives the kernel_size.
 SCREEN_FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
 
 NOTES = {
@@ -36,22 +36,22 @@ NOTES = {
     "analytic": [f"{COLUMN} is kept but not applied: Analytic-Splatting uses it only with its flag --filter3d, which no file records"],
 }
 
-# Mip-Splatting's compute_3D_filter: the variance in px² at the finest sampling, and how far beyond the image's edge a center may lie.
+# Mip-Splatting's compute_3D_filter: the variance in px² at the finest sampling, and how far outside the image a center may lie.
 FILTER_VARIANCE = 0.2
 FRAME_MARGIN = 0.15  # of the width and the height
 
-# No splat can be thinner than its filter; one that should be keeps this share of it, for a logarithm has to be finite.
+# No splat can be thinner than its filter; one that should be gets this fraction of it as raw scale, so that its logarithm is finite.
 THINNEST_SHARE = 0.1
 
 
 class MipModel:
     """Splats of 3DGS, each smoothed by its own 3D filter.
 
-    Parameters: those of `VanillaModel`, and the filters [N] in world units, which are carried along with their rows and never move.
+    Parameters: those of `VanillaModel`, and the filters [N] in world units, which are never optimized.
     """
 
     def __init__(self, family: str, splats: VanillaModel, filter_3d: Tensor) -> None:
-        """Take the tensors as they are. Raises ShapeError."""
+        """A model over these tensors, which are not copied. Raises ShapeError."""
         if filter_3d.shape != (len(splats),):
             raise ShapeError(f"{COLUMN}: expected shape [{len(splats)}], got {list(filter_3d.shape)}")
         self.family, self.splats, self.filter_3d = family, splats, filter_3d
@@ -70,12 +70,12 @@ class MipModel:
 
     @property
     def traits(self) -> Traits:
-        told = f"the file gives one for each of {len(self):,} splats" if self._smooths else "the file gives one, but its project does not apply it"
-        effect = Effect("3D filter", self._smooths, told, "three roots a splat")
+        reason = f"the file gives one for each of {len(self):,} splats" if self._smooths else "the file gives one, but its project does not apply it"
+        effect = Effect("3D filter", self._smooths, reason, "three roots a splat")
         return Traits(filtered=True, exposures=self.splats.traits.exposures, effects=(effect,))
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
-        """All splats, activated and smoothed. `camera` is not looked at."""
+        """All splats, activated and smoothed. `camera` is ignored."""
         raw = self.splats.gaussians(camera)
         if not self._smooths:
             return raw
@@ -100,7 +100,7 @@ class MipModel:
         self.filter_3d = parameters[CARRIED]
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
-        """Give the smoothed splats the scales [N, 3] and opacities [N] that `form` finds, as far as the filter allows."""
+        """Give the smoothed splats the scales [N, 3] and opacities [N] that `form` returns, as far as the filter allows."""
         scales, opacities = form(self.gaussians().detach())
         if self._smooths:
             scales, opacities = sharpen_3d(scales, opacities, self.filter_3d.detach())
@@ -111,27 +111,27 @@ class MipModel:
 
     @torch.no_grad()
     def refilter(self, cameras: Sequence[Camera]) -> None:
-        """Recompute the 3D filter from the training cameras, and the raw scales and opacities so that the splats look as before."""
-        shown = self.gaussians()
-        self.filter_3d.copy_(filter_3d_of(shown.means, cameras))
-        self.reshape(lambda _: (shown.scales, shown.opacities))
+        """Recompute the 3D filter from the training cameras, and the raw scales and opacities such that the smoothed splats do not change."""
+        smoothed = self.gaussians()
+        self.filter_3d.copy_(filter_3d_of(smoothed.means, cameras))
+        self.reshape(lambda _: (smoothed.scales, smoothed.opacities))
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """As `VanillaModel.refuse_output`."""
         self.splats.refuse_output(path, overwrite=overwrite)
 
     def bare(self) -> VanillaModel:
-        """The splats, over the same tensors, as a viewer that knows no column filter_3D reads them."""
+        """The splats, sharing tensors, as a viewer reads them that ignores the column filter_3D."""
         plain = self.splats.with_extras(self.splats.extras)
         plain.trained = replace(self.trained, keeps_filter=False)
         return plain
 
     def fused(self) -> VanillaModel:
-        """The splats of 3DGS that look, drawn with the filter of training, as these do: smoothed once and for all."""
+        """Splats of 3DGS into which the 3D filter is baked: under the screen filter of training they render the same."""
         plain = self.bare().copy()
         if self._smooths:
-            shown = self.gaussians().detach()
-            plain.reshape(lambda _: (shown.scales, shown.opacities))
+            smoothed = self.gaussians().detach()
+            plain.reshape(lambda _: (smoothed.scales, smoothed.opacities))
         for tensor in plain.parameters().values():
             tensor.requires_grad_(False)
         plain.digest = self.digest  # a report names the file that its base was read from
@@ -141,8 +141,8 @@ class MipModel:
         """Write a PLY or a model folder as `VanillaModel.save` does, with filter_3D as the last column. Raises OutputExists."""
         finite({**self.splats.parameters(), CARRIED: self.filter_3d}, LARGEST)
         filter_3d = self.filter_3d.detach().to("cpu", torch.float32).numpy()
-        told = {**provenance, "family": self.family, "kernel_size": self.trained.eps2d}  # a bare PLY has no cfg_args
-        return self.splats.with_extras({**self.splats.extras, COLUMN: filter_3d}).save(path, provenance=told, overwrite=overwrite)
+        provenance = {**provenance, "family": self.family, "kernel_size": self.trained.eps2d}  # a bare PLY has no cfg_args
+        return self.splats.with_extras({**self.splats.extras, COLUMN: filter_3d}).save(path, provenance=provenance, overwrite=overwrite)
 
     @property
     def _smooths(self) -> bool:
@@ -152,46 +152,46 @@ class MipModel:
 def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
     """Load a PLY with `filter_3D`, or the model folder around one. Splats that are not finite are dropped, with a note.
 
-    Raises CheckpointError for what is damaged, of another family, or no checkpoint.
+    Raises CheckpointError for a path that is damaged, of another family, or not a checkpoint.
     """
-    found = detect_as(path, tuple(SCREEN_FILTERS), iteration=iteration)
-    splats = read_vanilla(found)
-    unsound = torch.from_numpy(~(splats.extras[COLUMN] >= 0) | (splats.extras[COLUMN] == torch.inf))
-    if unsound.all():
-        raise CheckpointError(f"{found.path}: none of its {len(splats):,} splats has a {COLUMN} that is a length; export it again")
-    if unsound.any():
-        splats = drop(splats, unsound)
-        splats.notes.append(f"these had a {COLUMN} that is no length")
+    checkpoint = detect_as(path, tuple(SCREEN_FILTERS), iteration=iteration)
+    splats = read_vanilla(checkpoint)
+    invalid = torch.from_numpy(~(splats.extras[COLUMN] >= 0) | (splats.extras[COLUMN] == torch.inf))
+    if invalid.all():
+        raise CheckpointError(f"{checkpoint.path}: none of its {len(splats):,} splats has a valid {COLUMN}; export it again")
+    if invalid.any():
+        splats = drop(splats, invalid)
+        splats.notes.append(f"these had an invalid {COLUMN}")
     filter_3d = torch.from_numpy(splats.extras[COLUMN]).float()
     splats = splats.with_extras({name: column for name, column in splats.extras.items() if name != COLUMN})
-    splats.trained = _trained(found.family, splats.trained)
-    splats.notes += NOTES[found.family]
-    return MipModel(found.family, splats, filter_3d)
+    splats.trained = _trained(checkpoint.family, splats.trained)
+    splats.notes += NOTES[checkpoint.family]
+    return MipModel(checkpoint.family, splats, filter_3d)
 
 
 def smooth_3d(scales: Tensor, opacities: Tensor, filter_3d: Tensor) -> tuple[Tensor, Tensor]:
-    """Scales [N, 3] and opacities [N] after the 3D filter [N] of Mip-Splatting: every splat convolved with a ball, its mass kept.
+    """Scales [N, 3] and opacities [N] after the 3D filter [N] of Mip-Splatting: splats convolved with an isotropic Gaussian, mass preserved.
 
-    s' = sqrt(s² + f²) and o' = o · Π s / s'; a product of ratios, since Πs² / Πs'² under- and overflows.
+    s' = sqrt(s² + f²) and o' = o · Π s / s', as a product of ratios, since Πs² / Πs'² may under- or overflow.
     """
-    scales = scales.clamp_min(torch.finfo(scales.dtype).tiny)  # the root of 0² + 0² has no gradient
+    scales = scales.clamp_min(torch.finfo(scales.dtype).tiny)  # the root's gradient at 0² + 0² is infinite
     smoothed = torch.hypot(scales, filter_3d[:, None])
     return smoothed, opacities * (scales / smoothed).prod(dim=1)
 
 
 def sharpen_3d(scales: Tensor, opacities: Tensor, filter_3d: Tensor) -> tuple[Tensor, Tensor]:
-    """The inverse of `smooth_3d`, as near as scales above the filter and opacities up to 1 allow."""
-    ball = filter_3d[:, None]
-    sharp = ((scales - ball).clamp_min(0) * (scales + ball)).sqrt().maximum(THINNEST_SHARE * ball)
-    light = smooth_3d(sharp, torch.ones_like(opacities), filter_3d)[1]
-    return sharp, (opacities / light).clamp_max(1)
+    """The inverse of `smooth_3d`; exact for scales above the filter and resulting opacities up to 1, else the nearest possible."""
+    filters = filter_3d[:, None]
+    sharp = ((scales - filters).clamp_min(0) * (scales + filters)).sqrt().maximum(THINNEST_SHARE * filters)
+    compensation = smooth_3d(sharp, torch.ones_like(opacities), filter_3d)[1]
+    return sharp, (opacities / compensation).clamp_max(1)
 
 
 def filter_3d_of(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
-    """[N] world units, the filter that Mip-Splatting gives to splats at `means` [N, 3] for its training `cameras` (compute_3D_filter).
+    """Mip-Splatting's 3D filter [N], world units, for splats at `means` [N, 3] and the training `cameras` (compute_3D_filter).
 
-    z/f·sqrt(0.2) with z the least depth among the cameras that see a center, and f the longest focal length of all cameras;
-    a center that none sees takes the largest z. Raises CheckpointError without a camera that sees one.
+    z/f·sqrt(0.2), where z is the least depth among the cameras that see the center, and f the longest focal length of all cameras;
+    a center that no camera sees gets the largest z. Raises CheckpointError if no camera sees any center.
     """
     nearest = torch.full_like(means[:, 0], torch.inf)
     for camera in cameras:
@@ -201,12 +201,12 @@ def filter_3d_of(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
         nearest = torch.where((z > NEAR_PLANE) & inside, torch.minimum(nearest, z), nearest)
     seen = nearest.isfinite()
     if not seen.any():
-        raise CheckpointError("no training camera sees a splat, so that there is no 3D filter for them; give the cameras that it was trained with")
+        raise CheckpointError("no training camera sees a splat, so the 3D filter is undefined; give the cameras that it was trained with")
     return torch.where(seen, nearest, nearest[seen].max()) / max(camera.fx for camera in cameras) * FILTER_VARIANCE**0.5
 
 
-def _trained(family: str, told: TrainedScale) -> TrainedScale:
-    """The family's filter, which a file with the column keeps: only its own project renders it right."""
+def _trained(family: str, trained: TrainedScale) -> TrainedScale:
+    """`trained` with the family's screen filter, which a file with the column keeps: only its own project renders it right."""
     screen_filter, eps2d = SCREEN_FILTERS[family]
-    eps2d = told.eps2d if told.screen_filter == screen_filter else eps2d
-    return replace(told, screen_filter=screen_filter, eps2d=eps2d, keeps_filter=True)
+    eps2d = trained.eps2d if trained.screen_filter == screen_filter else eps2d
+    return replace(trained, screen_filter=screen_filter, eps2d=eps2d, keeps_filter=True)

@@ -1,4 +1,4 @@
-"""What a model may not be saved as: a part of the checkpoint that it came from, and numbers that nobody can read."""
+"""Checks before a model is saved: it must not replace the checkpoint that it was read from, and its numbers must be finite."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from mipmap_plugin.formats.atomic import refuse_output, refuse_to_lose
 from mipmap_plugin.formats.splat_transform import refuse_as_folder
 from mipmap_plugin.models.base import TrainedScale
 
-# Where the projects that are read keep the parts of a checkpoint, in their folders.
+# Subfolders in which the supported projects keep parts of a checkpoint.
 PARTS = ("point_cloud", "deform", "ckpts", "nerfstudio_models")
 
 REPORT = ".adaptation.json"
 
-# Finite numbers that activate, in float32, to what an infinite logit and an infinite logarithm do: opacity 1 or 0, and a length of almost 0.
+# Finite numbers that in float32 activate as an infinite logit and logarithm do: to an opacity of 1 or 0, and a length of almost 0.
 LOGIT, LOG_SCALE = 80.0, -87.0
 
 
 def parts_of(source: Path | None, folder: Path | None) -> list[Path]:
-    """The files of the checkpoint that was read from the file `source`, in `folder`, as far as these are known.
+    """The files of the checkpoint that was read from the file `source` in `folder`, as far as these are known.
 
-    What an adaptation has put among them is known by the report beside it, and is no part.
+    Outputs of adaptations in the same place, which have a report beside them, are not included.
     """
-    found = [] if source is None else [file for file in source.absolute().parent.iterdir() if _belongs(file.name, source.name)]
+    files = [] if source is None else [file for file in source.absolute().parent.iterdir() if _belongs(file.name, source.name)]
     if folder is not None:
-        found += [*folder.iterdir(), *(file for part in PARTS for file in (folder / part).rglob("*"))]
-    return [*([source] if source else []), *(file for file in found if file.is_file() and not _is_adapted(file))]
+        files += [*folder.iterdir(), *(file for part in PARTS for file in (folder / part).rglob("*"))]
+    return [*([source] if source else []), *(file for file in files if file.is_file() and not _is_adapted(file))]
 
 
 def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path | None, holds: str | None) -> None:
-    """Raise OutputExists for a path that a model of that checkpoint may not be saved to; `holds` names what is in a folder, None: a file.
+    """Raise OutputExists for a path that a model of that checkpoint may not be saved to. `holds`: subfolder of model folders; None for a file.
 
-    Raises SettingsError for a folder with the ending of a file.
+    Raises SettingsError for a folder with the suffix of a file.
     """
     refuse_output(path, overwrite, parts_of(source, folder), is_file=holds is None)
     if holds is not None:
@@ -46,29 +46,29 @@ def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path 
 
 
 def refuse_own_filter(path: Path, trained: TrainedScale) -> None:
-    """Raise SettingsError where an exchange format is asked for, at `path`, and splats need the filter of their training."""
+    """Raise SettingsError for an exchange format at `path` if the splats need the screen filter of their training."""
     if trained.keeps_filter:
         own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
 
 
 def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
-    """The raw parameters, without infinities: a log scale of -infinity and a logit of infinity are the longest finite way there.
+    """The raw parameters, with infinite logits and log scales of -infinity replaced by finite numbers that activate alike.
 
-    Raises SettingsError where a row holds a NaN, or is infinite or above `most` once activated.
+    Raises SettingsError if a row contains NaN, or is infinite or above `most` once activated.
     """
-    sound = {name: tensor.detach() for name, tensor in parameters.items()}
+    cleaned = {name: tensor.detach() for name, tensor in parameters.items()}
     for name, low, high in (("opacities", -LOGIT, LOGIT), ("scales", LOG_SCALE, torch.inf)):
-        if name in sound:
-            sound[name] = sound[name].nan_to_num(nan=torch.nan, posinf=high, neginf=low)
-    for name, value in {**sound, "lengths": sound["scales"].exp()}.items():
-        wrong = ~value.isfinite() if name in ("opacities", "quats") else ~(value.abs() <= most)  # also of a NaN
+        if name in cleaned:
+            cleaned[name] = cleaned[name].nan_to_num(nan=torch.nan, posinf=high, neginf=low)
+    for name, value in {**cleaned, "lengths": cleaned["scales"].exp()}.items():
+        wrong = ~value.isfinite() if name in ("opacities", "quats") else ~(value.abs() <= most)  # True for NaN
         if rows := int(wrong.flatten(1).any(1).sum() if wrong.dim() > 1 else wrong.sum()):
             raise SettingsError(
                 f"{rows:,} of {len(value):,} rows hold a NaN, an infinity or more than {most:g} in {name}, so nothing is saved;"
                 " adapt less boldly, or to another scale"
             )
-    return sound
+    return cleaned
 
 
 def _belongs(name: str, source: str) -> bool:

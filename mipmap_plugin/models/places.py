@@ -1,11 +1,11 @@
-"""Where the projects keep their files: below a model folder, and beside the file that holds the splats."""
+"""Where the supported projects keep their files, in a model folder and beside the file that holds the splats."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-# The files in the result folders of projects that save with torch: the folder they lie in, and their names.
+# Checkpoints in the result folders of projects that save with torch: subfolder, and pattern of the file names.
 GSPLAT = ("ckpts", r"ckpt_(?P<step>\d+)(?:_rank(?P<rank>\d+))?\.pt")
 SPLATFACTO = ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")
 
@@ -14,8 +14,8 @@ NETWORKS = {"4dgs": "point_cloud/*iteration_*/deformation.pth", "deformable": "d
 
 
 def around(file: Path) -> tuple[Path | None, int | None]:
-    """The model folder and the iteration of a file: of INRIA's `<folder>/point_cloud/iteration_<N>/point_cloud.ply`, and of results below
-    a folder of a known name; else a folder with cfg_args is one."""
+    """The model folder and the iteration of a file: `<folder>` and N in INRIA's `<folder>/point_cloud/iteration_<N>/point_cloud.ply`; the
+    parent of a subfolder with a known name; or the file's own folder if it has a cfg_args."""
     place = file.absolute().parent
     number = re.fullmatch(r"(?:coarse_)?iteration_(\d+)", place.name)
     if number and place.parent.name == "point_cloud":
@@ -26,11 +26,11 @@ def around(file: Path) -> tuple[Path | None, int | None]:
 
 
 def network_of(ply: Path, family: str) -> Path:
-    """Where the network of a moving scene lies: the one of the same iteration, for any other moves other splats."""
+    """The network of a moving scene: that of the same iteration as the splats, the only one that fits them."""
     place = ply.absolute().parent
     return place / "deformation.pth" if family == "4dgs" else place.parent.parent / "deform" / place.name / "deform.pth"
 
 
 def is_coarse(ply: Path) -> bool:
-    """Whether it is of the first stage of 4D Gaussians, in which nothing moves yet."""
+    """Whether the PLY is of the first (coarse) stage of 4D Gaussians, in which nothing moves."""
     return ply.absolute().parent.name.startswith("coarse_iteration_")

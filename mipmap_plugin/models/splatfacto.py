@@ -1,4 +1,4 @@
-"""splatfacto of nerfstudio: the step-*.ckpt of its trainer, alone or in the folder of a run. Its config is read, never constructed."""
+"""splatfacto of nerfstudio: the step-*.ckpt of its trainer, alone or in the folder of a run. Its config is read as text, never executed."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from mipmap_plugin.formats.torch_file import load_torch, save_torch, step_and_co
 from mipmap_plugin.formats.yaml_scalars import read_scalars, with_scalar
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import detect
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.places import SPLATFACTO
-from mipmap_plugin.models.vanilla import OPACITY_MARGIN, Origin, VanillaModel, without_poison
+from mipmap_plugin.models.vanilla import OPACITY_MARGIN, Origin, VanillaModel, without_invalid
 from mipmap_plugin.splatting.harmonics import C0
 
 PLACE, FILE = SPLATFACTO
 
-# Where a state dict keeps the splats: with gauss_params since version 1.1, with `module` after a training on several GPUs.
+# Keys of the splats in a state dict: with gauss_params since version 1.1, with `module` after training on several GPUs.
 KEY = r"(?:module\.)?_model\.(?:module\.)?(?:gauss_params\.)?(means|scales|quats|features_dc|features_rest|opacities)"
 NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 
-# World units (models/splatfacto.py hands it to gsplat).
+# World units (models/splatfacto.py passes it to gsplat).
 NEAR_PLANE = 0.01
 
-# What `background_color` shows when it renders; a training with "random" colors renders on the last.
+# Background of renders by option `background_color`; after training on "random" colors it is the last one.
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.1490, 0.1647, 0.2157)}
 
 # px: larger photographs are halved until they fit (data/dataparsers/nerfstudio_dataparser.py).
@@ -43,7 +43,7 @@ MAX_SIDE = 1600
 
 @dataclass(frozen=True, eq=False)
 class SplatfactoHost:
-    """What a splatfacto checkpoint has besides its splats; the file itself is read again when a new one is written."""
+    """What a splatfacto checkpoint has besides its splats. The file is read again when a new one is written."""
 
     source: Path
     folder: Path | None = None  # of the run
@@ -54,8 +54,8 @@ class SplatfactoHost:
     def write(self, path: Path, parameters: dict[str, Tensor], comments: Sequence[str], *, overwrite: bool) -> Path:
         """Write one .ckpt file, or the folder of a run; return the .ckpt file.
 
-        Only the splats are exchanged in the original file, and the comments are added; the optimizers' moments stay, so that a
-        training cannot go on from it after splats were removed. Raises OutputExists, OutputError.
+        A copy of the original file in which the splats are replaced and comments are added. The optimizers' moments do not change, so
+        training cannot be resumed from it after splats were removed. Raises OutputExists, OutputError.
         """
         if path.suffix == ".ckpt":
             return save_torch(path, self._content(parameters, comments), overwrite=overwrite)
@@ -68,14 +68,14 @@ class SplatfactoHost:
     def holds(self, path: Path) -> str | None:
         if path.suffix != ".ckpt":
             return PLACE
-        _refuse_to_confuse(path)
+        _refuse_unreadable_name(path)
         return None
 
-    def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
-        """Moved by dataparser_transforms.json, and at the size that nerfstudio shrinks large photographs to. Raises SceneError."""
+    def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
+        """Transform the cameras by dataparser_transforms.json, and shrink large images as nerfstudio does. Raises SceneError."""
         frame = self._frame()
-        frame[:3] /= taken.applied_scale  # the file's scale has it, but the poses of the file were not sized by it again
-        factor = _factor(cameras, self.options.get("downscale_factor"), taken)
+        frame[:3] /= capture.applied_scale  # contained in the file's scale, but already applied to the poses
+        factor = _factor(cameras, self.options.get("downscale_factor"), capture)
         return [_shrunk(camera, factor).moved(frame) for camera in cameras]
 
     def _content(self, parameters: dict[str, Tensor], comments: Sequence[str]) -> dict[str, Any]:
@@ -85,7 +85,7 @@ class SplatfactoHost:
         return {**content, "pipeline": pipeline, "comments": list(comments)}
 
     def _frame(self) -> Tensor:
-        """[4, 4] float64 similarity from the world of the photographs to the checkpoint's. Raises SceneError."""
+        """The similarity [4, 4] float64 from the world of the photographs to that of the checkpoint. Raises SceneError."""
         file = (self.folder or self.source.parent) / "dataparser_transforms.json"
         try:
             facts = json.loads(file.read_text(encoding="utf-8"))
@@ -100,7 +100,7 @@ class SplatfactoHost:
         return frame
 
     def _write_companions(self, folder: Path, name: str, screen_filter: str) -> None:
-        """The config finds its checkpoint by the name of the folder, which nerfstudio calls a timestamp."""
+        """Copy the config and the transforms. The config refers to its folder by name, as `timestamp`."""
         if self.folder is None:
             return
         for file in (self.folder / "config.yml", self.folder / "dataparser_transforms.json"):
@@ -113,26 +113,26 @@ class SplatfactoHost:
 
 def load_splatfacto(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     """Load a .ckpt file, or the newest step (or step `iteration`) of a run's folder. Raises CheckpointError."""
-    found = detect(path, iteration=iteration)
-    content = load_torch(found.path)
-    stored = _stored(content, found.path)
-    config = found.folder / "config.yml" if found.folder else None
+    checkpoint = detect(path, iteration=iteration)
+    content = load_torch(checkpoint.path)
+    stored = _stored(content, checkpoint.path)
+    config = checkpoint.folder / "config.yml" if checkpoint.folder else None
     options = read_scalars(config) if config and config.is_file() else {}
-    step, comments = step_and_comments(content, found.path)
-    host = SplatfactoHost(found.path, found.folder, step, options)
-    origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, comments, host=host)
+    step, comments = step_and_comments(content, checkpoint.path)
+    host = SplatfactoHost(checkpoint.path, checkpoint.folder, step, options)
+    origin = Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, comments, host=host)
     antialiased = "antialiased" if options.get("rasterize_mode") == "antialiased" else "classic"
     background = BACKGROUNDS.get(str(options.get("background_color")))
     trained = TrainedScale(render_mode(comments) or antialiased, background=background, near_plane=NEAR_PLANE)
     try:
-        model = VanillaModel(to_parameters(stored), trained, origin, _oddities(content["pipeline"], options))
+        model = VanillaModel(to_parameters(stored), trained, origin, _unusual_options(content["pipeline"], options))
     except (ShapeError, RuntimeError, IndexError) as error:  # what torch raises for a tensor with too few axes
-        raise CheckpointError(f"{found.path} holds tensors that do not fit together: {error}; copy it again") from error
-    return without_poison(model)
+        raise CheckpointError(f"{checkpoint.path} holds tensors that do not fit together: {error}; copy it again") from error
+    return without_invalid(model)
 
 
 def to_parameters(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Parameters as VanillaModel names them. At SH degree 0 splatfacto stores logits of colors, which are no SH."""
+    """Parameters with VanillaModel's names. At SH degree 0 splatfacto stores logits of colors instead of coefficients."""
     raw = {name: tensor.detach().float() for name, tensor in stored.items()}
     dc, rest = raw["features_dc"], raw["features_rest"]
     sh0 = dc if rest.shape[1] else ((dc.double().sigmoid() - 0.5) / C0).float()
@@ -141,7 +141,7 @@ def to_parameters(stored: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def to_stored(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The inverse of `to_parameters`; colors that no logit gives are brought just inside 0..1."""
+    """The inverse of `to_parameters`; colors are clamped to just inside 0..1, where logits are finite."""
     raw = {name: tensor.detach().cpu() for name, tensor in parameters.items()}
     dc, rest = raw["sh0"].squeeze(1), raw["shN"]
     features_dc = dc if rest.shape[1] else (dc.double() * C0 + 0.5).logit(eps=OPACITY_MARGIN).float()
@@ -161,7 +161,7 @@ def _stored(content: Any, path: Path) -> dict[str, Tensor]:
     return stored
 
 
-def _oddities(pipeline: Mapping[str, Any], options: dict[str, Any]) -> list[str]:
+def _unusual_options(pipeline: Mapping[str, Any], options: dict[str, Any]) -> list[str]:
     notes = []
     if not options:
         notes.append("config.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter")
@@ -172,24 +172,24 @@ def _oddities(pipeline: Mapping[str, Any], options: dict[str, Any]) -> list[str]
     return notes
 
 
-def _factor(cameras: Sequence[Camera], told: Any, taken: Taken) -> float:
-    """What nerfstudio divides all sizes by: `downscale_factor`, or the power of 2 by which the first photograph fits, as far as there are
-    copies of it in images_2, images_4, ...; where there are no photographs at all, they are taken to have been there."""
-    if isinstance(told, (int, float)) and told > 0:
-        return told
+def _factor(cameras: Sequence[Camera], downscale_factor: Any, capture: Capture) -> float:
+    """The factor by which nerfstudio divides all sizes: `downscale_factor`, or the least power of 2 that makes the first photograph fit, as
+    far as images_2, images_4, ... exist. Without photographs, these folders are assumed to have existed."""
+    if isinstance(downscale_factor, (int, float)) and downscale_factor > 0:
+        return downscale_factor
     factor = 1
-    while cameras and max(cameras[0].size) / factor > MAX_SIDE and (taken.smaller is None or taken.smaller(2 * factor)):
+    while cameras and max(cameras[0].size) / factor > MAX_SIDE and (capture.smaller is None or capture.smaller(2 * factor)):
         factor *= 2
     return factor
 
 
 def _shrunk(camera: Camera, factor: float) -> Camera:
-    """Sizes are cut off to whole pixels, intrinsics are not (cameras/cameras.py, rescale_output_resolution)."""
+    """The camera at 1/`factor` of its size. Sizes are truncated to whole pixels, intrinsics are not (cameras.py, rescale_output_resolution)."""
     size = dict(width=max(1, int(camera.width / factor)), height=max(1, int(camera.height / factor)))
     lens = {name: getattr(camera, name) / factor for name in ("fx", "fy", "cx", "cy")}
     return replace(camera, **size, **lens)  # type: ignore[arg-type]
 
 
-def _refuse_to_confuse(path: Path) -> None:
+def _refuse_unreadable_name(path: Path) -> None:
     if path.parent.name == PLACE and not re.fullmatch(FILE, path.name):
         raise OutputError(f"{path}: nerfstudio reads the step from every name in {PLACE}, and would stop at this one; choose another folder")

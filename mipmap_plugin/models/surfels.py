@@ -1,6 +1,6 @@
-"""2D Gaussian Splatting (Huang et al. 2024) and its descendants: splats without thickness, which rays meet (`splatting.surfels`).
+"""2D Gaussian Splatting (Huang et al. 2024) and its descendants: flat splats that rays intersect (`splatting.surfels`).
 
-Everything but the third scale is stored as 3DGS does. An adapted file is for the project that it came from, and keeps its filter.
+Everything but the third scale is stored as in 3DGS. An adapted file is for the original project, and keeps its screen filter.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.vanilla import MIN_SCALE, VanillaModel, read_splats
 from mipmap_plugin.splatting.rotations import quaternion_product
 
-# The log scale that stands for no thickness, which no file holds.
+# Stands for the log of a third scale of 0; files do not contain it.
 FLAT = float(torch.tensor(MIN_SCALE).log())
 
-NOTE = "its splats are flat and met by rays (2DGS): only the reference backend draws them so, and only viewers of 2DGS show the adapted file right"
+NOTE = "its splats are flat (2DGS): only the reference backend draws them so, and only viewers of 2DGS show the adapted file right"
 
-# Quaternions that turn an axis into the third: the first, the second, the third itself. They exchange axes in a circle.
+# Quaternions that rotate the first, second or third axis to the third; the axes are permuted cyclically.
 TO_THIRD = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
 
 
 class SurfelModel(VanillaModel):
-    """N flat splats. Parameters are `VanillaModel`'s; the third log scale is carried and means nothing."""
+    """N flat splats. Parameters are those of `VanillaModel`; the third log scale is kept but has no effect."""
 
     family = "2dgs"
-    _no_viewer = "its splats are flat and met by rays (2DGS), which no viewer of the list does"
+    _no_viewer = "its splats are flat (2DGS), which none of the viewers draws"
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
-        """All splats, activated, with third scales of 0. `camera` is not looked at."""
-        held = super().gaussians(camera)
-        return replace(held, scales=held.scales * held.scales.new_tensor([1.0, 1.0, 0.0]))
+        """All splats, activated, with third scales of 0. `camera` is ignored."""
+        thick = super().gaussians(camera)
+        return replace(thick, scales=thick.scales * thick.scales.new_tensor([1.0, 1.0, 0.0]))
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
-        """Set the first two scales and the opacities that `form` finds, in place. Raises ShapeError."""
+        """Set the first two scales and the opacities that `form` returns, in place. Raises ShapeError."""
         third = self._parameters["scales"][:, 2].detach().clone()
         super().reshape(form, views)
         with torch.no_grad():
             self._parameters["scales"][:, 2] = third
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
-        """Hold the splats that `form` makes of these, without their shortest axes."""
-        super().rebuild(lambda held: flattened(form(held)))
+        """Replace the splats by those that `form` returns for them, flattened along their shortest axes."""
+        super().rebuild(lambda gaussians: flattened(form(gaussians)))
 
     @staticmethod
     def parameters_of(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Tensor]:
@@ -69,7 +69,7 @@ class SurfelModel(VanillaModel):
 def load_surfels(path: str | Path, *, iteration: int | None = None) -> SurfelModel:
     """Load a PLY or model folder of 2DGS. Splats that are not finite once activated are dropped, with a note.
 
-    Raises CheckpointError for what is damaged, of another family, or no checkpoint.
+    Raises CheckpointError for a path that is damaged, of another family, or not a checkpoint.
     """
     model = read_splats(detect_as(path, ("2dgs",), iteration=iteration), SurfelModel)
     model.trained = flat_trained(model.trained)
@@ -77,13 +77,13 @@ def load_surfels(path: str | Path, *, iteration: int | None = None) -> SurfelMod
     return model
 
 
-def flat_trained(told: TrainedScale, **changes: Any) -> TrainedScale:
-    """How a training of surfels sees: as `told`, but for the filter, which is always that of the family."""
-    return replace(told, screen_filter=SURFEL, eps2d=LOW_PASS, keeps_filter=True, **changes)
+def flat_trained(trained: TrainedScale, **changes: Any) -> TrainedScale:
+    """`trained` with the screen filter of surfels, and `changes`."""
+    return replace(trained, screen_filter=SURFEL, eps2d=LOW_PASS, keeps_filter=True, **changes)
 
 
 def flattened(gaussians: Gaussians) -> Gaussians:
-    """The splats turned so that their shortest axes are the third, and without it; those that have none stay bit by bit."""
+    """The splats with axes permuted so that the shortest is the third, whose scale becomes 0. Splats that are flat already do not change."""
     thick = gaussians.scales[:, 2] != 0
     if not thick.any():
         return gaussians

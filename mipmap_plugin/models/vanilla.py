@@ -1,4 +1,4 @@
-"""Plain 3D Gaussian splatting: a PLY, alone or in a model folder, of 3DGS or of anything that writes the same columns."""
+"""Plain 3D Gaussian splatting: a PLY of 3DGS, or of any program that writes the same columns, with or without a model folder."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, 
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
-from mipmap_plugin.models.hosts import Host, Taken
+from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
-Splats = TypeVar("Splats", bound="VanillaModel")
+Model = TypeVar("Model", bound="VanillaModel")
 
-# World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so that it can grow again.
+# World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so it can be optimized.
 MIN_SCALE = 1e-18
 
-# An opacity is kept this far from 0 and 1, where its logit is infinite: a thousandth of what 8 bits show, and exact in float32.
+# Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
 OPACITY_MARGIN = 1e-6
 
 # A fused file of Mip-Splatting has the columns of 3DGS; only its usual name tells it apart.
@@ -43,14 +43,14 @@ FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting train
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where a model came from, and what of its file is carried along unchanged."""
+    """Where a model was read from, and the contents of its file that are kept unchanged."""
 
-    source: Path | None = None  # the PLY; None: made in memory
+    source: Path | None = None  # the PLY; None: created in memory
     digest: str = ""  # sha256 of its bytes, hexadecimal
     folder: Path | None = None  # the model folder around it
     iteration: int | None = None
     comments: tuple[str, ...] = ()
-    extras: dict[str, np.ndarray] = field(default_factory=dict)  # columns that 3DGS does not know, [N] each
+    extras: dict[str, np.ndarray] = field(default_factory=dict)  # columns that 3DGS does not define, [N] each
     exposures: Exposures = NO_EXPOSURES
     host: Host | None = None  # the other project whose file holds the splats; None: a PLY of 3DGS
 
@@ -59,7 +59,7 @@ class VanillaModel:
     """N splats that look the same to every camera.
 
     Raw parameters, named and shaped as gsplat's: means [N, 3], scales [N, 3] log, quats [N, 4] wxyz, opacities [N]
-    logit, sh0 [N, 1, 3], shN [N, (degree + 1)**2 - 1, 3]. Those of a loaded model require no gradient, a copy's do.
+    logit, sh0 [N, 1, 3], shN [N, (degree + 1)**2 - 1, 3]. Only those of a copy require gradients.
     """
 
     family = "3dgs"
@@ -68,7 +68,7 @@ class VanillaModel:
     def __init__(
         self, parameters: dict[str, Tensor], trained: TrainedScale = TrainedScale(), origin: Origin = Origin(), notes: Iterable[str] = ()  # noqa: B008
     ) -> None:
-        """Take the tensors as they are. Raises ShapeError."""
+        """A model over these tensors, which are not copied. Raises ShapeError."""
         _check(parameters)
         self._parameters = dict(parameters)
         self._origin = origin
@@ -81,9 +81,9 @@ class VanillaModel:
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians, trained: TrainedScale = TrainedScale()) -> VanillaModel:  # noqa: B008
-        """The model that activates to `gaussians`, but for scales and opacities at their ends (`MIN_SCALE`, `OPACITY_MARGIN`)."""
+        """A model whose activated splats are `gaussians`, with scales and opacities clamped by `MIN_SCALE` and `OPACITY_MARGIN`."""
         if gaussians.covariances is not None:
-            raise SettingsError("Gaussians with covariances of their own have no 3DGS parameters; give quaternions and scales")
+            raise SettingsError("Gaussians with covariances cannot be stored as 3DGS parameters; give quaternions and scales")
         return cls(_raw(gaussians), trained)
 
     @property
@@ -95,43 +95,44 @@ class VanillaModel:
 
     @property
     def extras(self) -> dict[str, np.ndarray]:
-        """The columns [N] of its file that 3DGS does not know."""
+        """The columns [N] of its file that 3DGS does not define."""
         return dict(self._origin.extras)
 
-    def with_extras(self: Splats, extras: dict[str, np.ndarray]) -> Splats:
-        """The same splats, over the same tensors, with these columns [N] behind those of 3DGS."""
+    def with_extras(self: Model, extras: dict[str, np.ndarray]) -> Model:
+        """The same splats, sharing tensors, with these columns [N] after those of 3DGS."""
         return self._with(self._parameters, replace(self._origin, extras=extras))
 
-    def coming_from(self: Splats, file: Path) -> Splats:
-        """The same splats, over the same tensors, told to be this file's."""
+    def with_source(self: Model, file: Path) -> Model:
+        """The same splats, sharing tensors, with `file` as their source."""
         return self._with(self._parameters, replace(self._origin, source=file, digest=sha256(file)))
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
-        """All splats, activated: exp, sigmoid, unit quaternions. `camera` is not looked at."""
+        """All splats, activated: exp, sigmoid, unit quaternions. `camera` is ignored."""
         raw = self._parameters
         sh = torch.cat([raw["sh0"], raw["shN"]], dim=1)
         return Gaussians(raw["means"], unit_quaternions(raw["quats"]), raw["scales"].exp(), raw["opacities"].sigmoid(), sh)
 
     def parameters(self) -> dict[str, Tensor]:
+        """The raw parameters by name, without copying them."""
         return dict(self._parameters)
 
-    def copy(self: Splats) -> Splats:
-        """An independent model whose leaves require gradients; as it may change, it has no digest of a file."""
+    def copy(self: Model) -> Model:
+        """An independent model whose parameters are leaves that require gradients; it has no digest, because it may change."""
         leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()}
         return self._with(leaves, replace(self._origin, digest=""))
 
-    def to(self: Splats, device: torch.device | str) -> Splats:
+    def to(self: Model, device: torch.device | str) -> Model:
         """A copy on another device, which requires gradients where this one does."""
         return self._with({name: _moved(tensor, device) for name, tensor in self._parameters.items()})
 
-    def keep_rows(self: Splats, keep: Tensor) -> Splats:
+    def keep_rows(self: Model, keep: Tensor) -> Model:
         """A new model of the rows where `keep` [N] is True, extra columns included."""
         extras = {name: column[keep.cpu().numpy()] for name, column in self._origin.extras.items()}
         kept = {name: tensor.detach()[keep].requires_grad_(tensor.requires_grad) for name, tensor in self._parameters.items()}
         return self._with(kept, replace(self._origin, extras=extras))
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
-        """Take these very tensors as leaves, as an optimizer does. Rows are no longer known, so extra columns go. Raises ShapeError."""
+        """Use these tensors themselves as leaves, as an optimizer requires. Extra columns are dropped, since rows may differ. Raises ShapeError."""
         _check(parameters)
         leaves = {name: tensor if tensor.is_leaf else tensor.detach() for name, tensor in parameters.items()}
         self._parameters = {name: leaf.requires_grad_() for name, leaf in leaves.items()}
@@ -144,30 +145,30 @@ class VanillaModel:
         return {}
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
-        """Set the scales [N, 3] and opacities [N] that `form` finds, in place, so that an optimizer keeps its leaves. Raises ShapeError."""
+        """Set the scales [N, 3] and opacities [N] that `form` returns, in place, so that an optimizer keeps its leaves. Raises ShapeError."""
         scales, opacities = form(self.gaussians().detach())
-        for name, wanted in {"scales": _log(scales), "opacities": _logit(opacities)}.items():
-            held = self._parameters[name]
-            if wanted.shape != held.shape:
-                raise ShapeError(f"{name}: expected shape {list(held.shape)}, got {list(wanted.shape)}")
+        for name, values in {"scales": _log(scales), "opacities": _logit(opacities)}.items():
+            leaf = self._parameters[name]
+            if values.shape != leaf.shape:
+                raise ShapeError(f"{name}: expected shape {list(leaf.shape)}, got {list(values.shape)}")
             with torch.no_grad():
-                held.copy_(wanted)
+                leaf.copy_(values)
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
-        """Hold the splats that `form` makes of these, fewer or more, instead of them."""
-        held = self.gaussians().detach()
-        made = form(held)
-        if made is not held:
-            self.replace_parameters(_raw(made))
+        """Replace the splats by those that `form` returns for them, of any number."""
+        before = self.gaussians().detach()
+        after = form(before)
+        if after is not before:
+            self.replace_parameters(_raw(after))
 
     def save(
         self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False, companions: Callable[[Path], Any] = lambda ply: None
     ) -> Path:
-        """Write a PLY where `path` ends in .ply, an exchange format (`exchange.WRITTEN`), else what the model came in, atomically; return the file.
+        """Write a PLY if `path` ends in .ply, an exchange format (`splat_transform.WRITTEN`), or else a folder, atomically; return the file.
 
-        A model from another project's file goes back into one (`Host.write`). A folder of 3DGS repeats the iteration, cfg_args,
-        cameras and exposures that the model came with; `companions` adds to it what else a family keeps around the PLY that
-        it is given. Raises OutputExists, OutputError when the disk refuses, and SettingsError for splats that are not finite.
+        A model from another project's file is written in its format (`Host.write`). A folder of 3DGS gets the model's iteration,
+        cfg_args, cameras and exposures; `companions` is called with the PLY's path to write further files of a family.
+        Raises OutputExists, OutputError if the file cannot be written, SettingsError for splats that are not finite.
         """
         path = Path(path)
         self.refuse_output(path, overwrite=overwrite)
@@ -190,24 +191,24 @@ class VanillaModel:
         return write_folder(path, self.folder, cfg_args, self._origin.iteration, overwrite, write)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
-        """What `save` would refuse about `path`, before anything is done for it. Raises OutputExists, OutputError, SettingsError."""
+        """Check `path` as `save` would. Raises OutputExists, OutputError, SettingsError."""
         if is_written(path):
             refuse_own_filter(path, self.trained)
             refuse_exchange(path)
-        a_file = path.suffix.lower() == ".ply" or is_written(path)
-        host = None if a_file else self._origin.host
-        holds = host.holds(path) if host else None if a_file else "point_cloud"
+        is_file = path.suffix.lower() == ".ply" or is_written(path)
+        host = None if is_file else self._origin.host
+        holds = host.holds(path) if host else None if is_file else "point_cloud"
         refuse_parts(path, overwrite, self.source, self.folder, holds)
 
     def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
-        """[N], 0..1, without gradient; the same for all views."""
+        """The opacities [N], 0..1, without gradient; the same for all views."""
         return self._parameters["opacities"].detach().sigmoid()
 
-    def as_trained(self, cameras: Sequence[Camera], taken: Taken) -> list[Camera]:
-        """Views of the photographs' scene in the frame and at the size that the model was trained in."""
+    def as_trained(self, cameras: Sequence[Camera], capture: Capture) -> list[Camera]:
+        """The cameras of a scene in the coordinate frame and at the image size of the training."""
         if self._origin.host is None:
             return list(cameras)
-        return self._origin.host.as_trained(cameras, taken, self._parameters["means"].detach())
+        return self._origin.host.as_trained(cameras, capture, self._parameters["means"].detach())
 
     @staticmethod
     def parameters_of(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Tensor]:
@@ -215,53 +216,53 @@ class VanillaModel:
         return to_parameters(columns, path)
 
     def _columns(self, parameters: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        """What the family's PLY holds of `parameters`."""
+        """The columns of the family's PLY for `parameters`."""
         return to_columns(parameters)
 
-    def _with(self: Splats, parameters: dict[str, Tensor], origin: Origin | None = None) -> Splats:
+    def _with(self: Model, parameters: dict[str, Tensor], origin: Origin | None = None) -> Model:
         return type(self)(parameters, self.trained, origin or self._origin, self.notes)
 
 
 def load_vanilla(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     """Load a 3DGS PLY or model folder. Splats that are not finite once activated are dropped, with a note.
 
-    Raises CheckpointError for what is damaged, of another family, or no checkpoint.
+    Raises CheckpointError for a path that is damaged, of another family, or not a checkpoint.
     """
     return read_vanilla(detect_as(path, ("3dgs",), iteration=iteration))
 
 
-def read_vanilla(found: Checkpoint) -> VanillaModel:
+def read_vanilla(checkpoint: Checkpoint) -> VanillaModel:
     """The splats of a checkpoint of 3DGS, or of a family that keeps them in the same columns. Raises CheckpointError."""
-    return read_splats(found, VanillaModel)
+    return read_splats(checkpoint, VanillaModel)
 
 
-def read_splats(found: Checkpoint, kind: type[Splats]) -> Splats:
-    """As `read_vanilla`, as a model of this `kind`."""
-    ply = read_ply(found.path)
-    parameters, extras = kind.parameters_of(ply.columns, found.path), extra_columns(ply.columns)
-    options, notes = read_options(found.folder)
+def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
+    """As `read_vanilla`, but as a model of class `kind`."""
+    path, folder = checkpoint.path, checkpoint.folder
+    ply = read_ply(path)
+    parameters, extras = kind.parameters_of(ply.columns, path), extra_columns(ply.columns)
+    options, notes = read_options(folder)
     screen_filter = render_mode(ply.comments)
-    origin = Origin(found.path, sha256(found.path), found.folder, found.iteration, ply.comments, extras, read_exposures(found.folder))
-    model = kind(parameters, trained_scale(options, screen_filter), origin, [*found.notes, *ply.notes, *notes])
-    del ply  # as large as the model, and no longer needed by what follows
+    origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
+    model = kind(parameters, trained_scale(options, screen_filter), origin, [*checkpoint.notes, *ply.notes, *notes])
+    del ply  # as large as the model, and no longer needed
     model.notes += companion_notes(options, model.sh_degree, model.traits.exposures, screen_filter)
     if screen_filter:
         model.notes.append(f"the header says that the splats were trained {screen_filter}, so they are rendered so")
-    if extras:
-        model.notes.append(f"extra columns are carried along: {', '.join(extras)}")
-    if "fused" in found.path.stem and model.trained.screen_filter == "classic" and screen_filter is None:
+    model.notes += [f"extra columns are carried along: {', '.join(extras)}"] if extras else []
+    if "fused" in path.stem and model.trained.screen_filter == "classic" and screen_filter is None:
         model.notes.append(FUSED)
-    return without_poison(model)
+    return without_invalid(model)
 
 
-def without_poison(model: Splats) -> Splats:
-    """The model without the splats that are not finite once activated, with a note. Raises CheckpointError when none is left."""
+def without_invalid(model: Model) -> Model:
+    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none is left."""
     health = examine(model)
-    if not health.poisonous.any():
+    if not health.invalid.any():
         return model
-    if health.poisonous.all():
+    if health.invalid.all():
         raise CheckpointError(f"{model.source or 'this model'}: none of its {health.splats:,} splats is finite; the training or the export failed")
-    model = drop(model, health.poisonous)
+    model = drop(model, health.invalid)
     reasons = health.non_finite() or [f"they were not finite once activated, or above {LARGEST:g}"]
     model.notes.append("found while loading: " + "; ".join(reasons))
     return model
@@ -272,8 +273,8 @@ def _check(parameters: dict[str, Tensor]) -> None:
         raise ShapeError(f"parameters: expected means, scales, quats, opacities, sh0 and shN, got {', '.join(parameters)}")
     n = len(parameters["means"])
     bands = parameters["shN"].shape[1] if parameters["shN"].dim() == 3 else 0
-    want = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, bands, 3)}
-    for name, shape in want.items():
+    expected = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, bands, 3)}
+    for name, shape in expected.items():
         if tuple(parameters[name].shape) != shape:
             raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(parameters[name].shape)}")
     if 3 * bands not in SH_DEGREES:
@@ -281,10 +282,10 @@ def _check(parameters: dict[str, Tensor]) -> None:
 
 
 def _raw(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Copies of what `VanillaModel` stores of splats."""
-    held = gaussians.detach()
-    named = {"means": held.means, "scales": _log(held.scales), "quats": held.quats, "opacities": _logit(held.opacities)}
-    return {name: tensor.clone() for name, tensor in {**named, "sh0": held.sh[:, :1], "shN": held.sh[:, 1:]}.items()}
+    """The raw parameters of splats, as copies."""
+    g = gaussians.detach()
+    named = {"means": g.means, "scales": _log(g.scales), "quats": g.quats, "opacities": _logit(g.opacities)}
+    return {name: tensor.clone() for name, tensor in {**named, "sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}.items()}
 
 
 def _log(scales: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Scenes: cameras and images from the files that people have, and generated views where they have none."""
+"""Scenes: cameras and images read from files, and generated views where there are none."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file or its folder, a COLMAP scene,
     or one of DyNeRF or HyperNeRF as 4DGaussians reads them.
 
-    `cfg` is the checkpoint's cfg_args, which tell the test split and training size (`read_cameras`, `read_colmap`). A folder with
-    both COLMAP's `sparse` and transforms files is read as graphdeco-inria does, from `sparse`.
+    `cfg` is the checkpoint's cfg_args, which determine the test split and training size (`read_cameras`, `read_colmap`). A folder
+    with both COLMAP's `sparse` and transforms files is read from `sparse`, as graphdeco-inria does.
     Raises SceneError.
     """
     path = Path(path)
@@ -46,7 +46,7 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
 
 
 def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) -> list[Camera]:
-    """The cameras beside a checkpoint, at their training size; empty where it came without any. Raises SceneError for a broken file."""
+    """The cameras beside a checkpoint, at their training size; empty if there are none. Raises SceneError for a damaged file."""
     if folder is None or not (Path(folder) / "cameras.json").is_file():
         return []
     return read_cameras(Path(folder) / "cameras.json", cfg)

@@ -1,4 +1,4 @@
-"""Scene: the cameras of a place, and the photographs that belong to some of them."""
+"""Scene: cameras, and photographs for some of them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from mipmap_plugin.scenes.lenses import Lens
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What one path holds. Cameras without an image are usable views: adaptation needs no photographs."""
+    """The scene at one path. Cameras without an image are usable views: adaptation needs no photographs."""
 
     cameras: tuple[Camera, ...]
     images: dict[Camera, Path]  # may be empty
     source: Path
     notes: list[str] = field(default_factory=list)  # what was assumed or left out, one sentence each
     points: Tensor | None = None  # [P, 3] float64, the points of structure from motion, where the files hold them
-    applied: Tensor | None = None  # [4, 4] float64, how nerfstudio had turned COLMAP's world before it wrote the file
-    applied_scale: float = 1.0  # and by how much it had sized it
-    lenses: dict[Path, Lens] = field(default_factory=dict)  # of the photographs that have to be undistorted
+    applied: Tensor | None = None  # [4, 4] float64, transform that nerfstudio applied to COLMAP's world before it wrote the file
+    applied_scale: float = 1.0  # and its scale
+    lenses: dict[Path, Lens] = field(default_factory=dict)  # of photographs that have to be undistorted
 
     def split(self, name: str) -> list[Camera]:
         """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""
@@ -36,30 +36,30 @@ class Scene:
         return [camera for camera in self.cameras if camera.split == name]
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Scene:
-        """The scene seen by other cameras, one for each of its own; the photographs go with them."""
+        """The scene with its cameras replaced one by one; the photographs are kept."""
         images = {new: self.images[old] for old, new in zip(self.cameras, cameras, strict=True) if old in self.images}
         return replace(self, cameras=tuple(cameras), images=images)
 
     def original(self) -> Scene:
-        """The scene in the world that COLMAP had given it."""
+        """The scene in COLMAP's original world."""
         if self.applied is None:
             return self
         back = torch.linalg.inv(self.applied)
         return replace(self.with_cameras([camera.moved(back) for camera in self.cameras]), applied=None)
 
     def numbered_as_upstream(self) -> Scene:
-        """The scene whose test views have numbers (`Camera.index`), each its own among the test views by name.
+        """The scene with each test view numbered (`Camera.index`) by its position among the test views sorted by name.
 
-        Scaffold-GS and Octree-GS take by it the appearance of a training view, which has nothing to do with the test view but the number.
+        Scaffold-GS and Octree-GS give it the appearance of the training view with that number, which is otherwise unrelated.
         """
         tests = sorted(self.split("test"), key=lambda camera: camera.name)
-        place = {camera: number for number, camera in enumerate(tests)}
-        return self.with_cameras([replace(camera, index=place.get(camera, camera.index)) for camera in self.cameras])
+        numbers = {camera: number for number, camera in enumerate(tests)}
+        return self.with_cameras([replace(camera, index=numbers.get(camera, camera.index)) for camera in self.cameras])
 
     def smaller(self, factor: int) -> tuple[int, int] | None:
-        """(width, height) px of the copies of the photographs that lie in images_<factor> beside them; None where there are none.
+        """(width, height) px of the downscaled copies of the photographs in images_<factor>; None if there are none.
 
-        Of photographs that have to be undistorted, what is left of the copies then.
+        For photographs that have to be undistorted, the size of the undistorted copies.
         """
         camera = next((camera for camera in self.cameras if camera in self.images), None)
         first = Path() if camera is None else self.images[camera]
@@ -70,13 +70,13 @@ class Scene:
             within = folder.with_name(name) / first.relative_to(folder)
             for copy in (within, within.with_suffix(".png"), within.with_name(first.name)):
                 if is_file(copy):
-                    return _left(image_size(copy), first, camera) if first in self.lenses else image_size(copy)
+                    return _undistorted_size(image_size(copy), first, camera) if first in self.lenses else image_size(copy)
         return None
 
     def image(self, camera: Camera, background: Sequence[float]) -> Tensor:
         """The photograph of `camera` on `background` (RGB in 0..1), [H, W, 3] float32 at the file's full resolution, undistorted.
 
-        Raises SceneError when there is none: cameras are compared by identity, so a zoomed copy has none.
+        Raises SceneError if there is none: cameras are compared by identity, so a zoomed copy has none.
         """
         if camera not in self.images:
             raise SceneError(f"{self.source}: camera {camera.name!r} has no image; ask with a camera that is a key of `images`")
@@ -84,7 +84,7 @@ class Scene:
         return image if lens is None else lens.undistorted(image)
 
 
-def _left(size: tuple[int, int], whole: Path, camera: Camera) -> tuple[int, int]:
-    """The share of a copy's `size` that `camera`, undistorted, has of the `whole` photograph."""
+def _undistorted_size(size: tuple[int, int], whole: Path, camera: Camera) -> tuple[int, int]:
+    """`size` of a copy, scaled by the ratio of the undistorted `camera` to the `whole` photograph."""
     across, down = (kept / side for kept, side in zip((camera.width, camera.height), image_size(whole), strict=True))
     return max(1, round(size[0] * across)), max(1, round(size[1] * down))

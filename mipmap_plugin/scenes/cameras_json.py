@@ -1,4 +1,4 @@
-"""cameras.json, as graphdeco-inria's 3DGS and its many descendants write it beside a checkpoint."""
+"""cameras.json, which graphdeco-inria's 3DGS and its descendants write beside a checkpoint."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ WIDTH_CAP = 1600  # px
 
 
 def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Camera]:
-    """The cameras of a cameras.json, at the size that they were trained at.
+    """The cameras of a cameras.json, at their training size.
 
     Args:
         path: the file.
-        cfg: the checkpoint's cfg_args; `eval` tells whether there is a test split, `resolution` and `images` the
+        cfg: the checkpoint's cfg_args; `eval` determines whether there is a test split, `resolution` and `images` the
             training size. Without it every camera is for training and has the size in the file.
 
     Raises:
-        SceneError: a file or an entry that cannot be read, or a `resolution` that is none.
+        SceneError: a file or an entry that cannot be read, or an invalid `resolution`.
     """
     path, cfg = Path(path), cfg or {}
     entries = read_json(path)
@@ -52,7 +52,7 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
 def write_cameras(path: str | Path, cameras: Sequence[Camera], *, overwrite: bool = False) -> Path:
     """Write `cameras` as INRIA does, test views first; return the path. Raises OutputExists.
 
-    The format has no principal point: every view's is taken to be its center.
+    The format has no principal point: it is taken to be the image center.
     """
     ordered = sorted(cameras, key=lambda camera: camera.split != "test")
     write_json(Path(path), [_entry(index, camera) for index, camera in enumerate(ordered)], overwrite)
@@ -66,10 +66,10 @@ def _entry(index: int, camera: Camera) -> dict[str, Any]:
 
 
 def count_test_cameras(names: list[str]) -> int:
-    """How many of the leading cameras are for testing; the file lists them first but does not say how many.
+    """The number of test cameras; the file lists them first but does not state their number.
 
-    A Blender scene names its test and its training views alike (r_0, r_1, ...), so that the first repeated name
-    starts the training views. A COLMAP scene names each view once, and one in eight is for testing.
+    A Blender scene uses the same names for test and training views (r_0, r_1, ...), so the first repeated name
+    starts the training views. In a COLMAP scene names are unique, and one view in eight is for testing.
     """
     seen: set[str] = set()
     for index, name in enumerate(names):
@@ -80,7 +80,7 @@ def count_test_cameras(names: list[str]) -> int:
 
 
 def photographs_folder(cfg: dict[str, Any]) -> str:
-    """The name of the folder that was trained on. Octree-GS, which has levels (`fork`), goes by `ds` and looks at no `images`."""
+    """The name of the folder of training photographs. Octree-GS, which has the option `fork`, uses `ds` instead of `images`."""
     ds = cfg.get("ds", 1)
     if "fork" in cfg and isinstance(ds, int):
         return f"images_{ds}" if ds > 1 else "images"
@@ -90,9 +90,9 @@ def photographs_folder(cfg: dict[str, Any]) -> str:
 def trained_size(width: int, height: int, cfg: dict[str, Any]) -> tuple[int, int]:
     """(width, height) in px after INRIA's `-i images_N` and `-r`, from the size in cameras.json.
 
-    COLMAP scenes store the full resolution there, however small the photographs were that trained on. The folders
-    images_2, images_4 and images_8 hold photographs shrunk by that factor. Rounding is `loadCam`'s: the divisors
-    round, the cap and the target width cut off.
+    For COLMAP scenes the file states the full resolution, whatever the size of the training photographs. The folders
+    images_2, images_4 and images_8 contain photographs shrunk by that factor. Rounding is that of `loadCam`: divisors
+    round, the cap and the target width truncate.
     """
     shrunk = re.fullmatch(r"images_(\d{1,9})", photographs_folder(cfg))
     if shrunk and int(shrunk[1]) > 0:

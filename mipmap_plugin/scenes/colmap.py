@@ -1,4 +1,4 @@
-"""COLMAP scenes, read by pycolmap: cameras in the order of their names, every eighth for testing, as mip-NeRF 360 has it."""
+"""COLMAP scenes, read by pycolmap: cameras sorted by name, every eighth for testing, as in mip-NeRF 360."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
 if TYPE_CHECKING:
     import pycolmap
 
-# Where the parts of a model lie, in the order that graphdeco-inria and gsplat look for them.
+# Folders of a model, in the order in which graphdeco-inria and gsplat search them.
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 
 
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene of a folder with `sparse/0` and images, or of the folder of the model itself.
 
-    `cfg` is the checkpoint's cfg_args: its `images` names the folder of photographs and its `resolution` the training size; a
-    project that has cfg_args puts the principal point in the middle, and so is it done here. Without it the photographs of
-    `images` count at their full size. A camera whose photograph is absent stays a usable view; `notes` count them.
+    `cfg` is the checkpoint's cfg_args: `images` names the folder of photographs and `resolution` the training size; the principal
+    point is moved to the center, as projects with cfg_args do. Without it, the photographs in `images` are used at their full
+    size. A camera whose photograph is missing stays a usable view; `notes` count them.
 
     Raises:
-        SceneError: no pycolmap, no readable model, a lens that cannot be undistorted, or a `resolution` that is none.
+        SceneError: no pycolmap, no readable model, a lens that cannot be undistorted, or an invalid `resolution`.
     """
     path, cfg = Path(path), cfg or {}
     model = _read(path)
@@ -49,15 +49,15 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     for index, image in enumerate(images):
         camera = _camera(model, image, "train" if index % TEST_EVERY else "test", centered=bool(cfg))
         photograph, lens = folder / image.name, _lens(model.cameras[image.camera_id])
-        there, asked = is_file(photograph), cfg
-        if there:
-            size, asked = image_size(photograph), {**cfg, "images": "images", "ds": 1}
+        exists, options = is_file(photograph), cfg
+        if exists:
+            size, options = image_size(photograph), {**cfg, "images": "images", "ds": 1}
             camera, lens = camera.resized(*size), lens and lens.at(size)
         if lens is not None:
             camera, lenses[photograph] = lens.straightened(camera), lens
-        camera = camera.resized(*trained_size(camera.width, camera.height, asked))
+        camera = camera.resized(*trained_size(camera.width, camera.height, options))
         cameras.append(camera)
-        if there:
+        if exists:
             photographs[camera] = photograph
     notes = _notes(cameras, photographs, folder, cfg) + ([note(lenses.values(), len(lenses))] if lenses else [])
     return Scene(tuple(cameras), photographs, path, notes, points=_points(model), lenses=lenses)
@@ -74,7 +74,7 @@ def _model_folder(path: Path) -> Path | None:
 
 
 def _root(path: Path) -> Path:
-    """The folder that the photographs lie in, also where the model's own folder was given."""
+    """The folder that contains the photographs' folder, also if the model's own folder was given."""
     here = path.absolute()
     return next((place.parent for place in (here, here.parent) if place.name == "sparse"), path)
 
@@ -90,21 +90,21 @@ def _read(path: Path) -> pycolmap.Reconstruction:
     refuse_truncated(folder)
     try:
         return pycolmap.Reconstruction(folder)
-    except Exception as error:  # pycolmap raises what its C++ does for a damaged file
+    except Exception as error:  # pycolmap passes on any C++ exception for a damaged file
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise SceneError(f"{folder}: is not a COLMAP model that pycolmap reads ({reason}); copy or export it again") from error
 
 
 def _lens(camera: pycolmap.Camera) -> Lens | None:
-    """The lens, where it bends."""
-    bent = any(camera.params[i] != 0 for i in camera.extra_params_idxs())
-    if not bent and "FISHEYE" not in camera.model.name and camera.model.name != "FOV":
+    """The lens of a camera with distortion; None for a pinhole."""
+    distorted = any(camera.params[i] != 0 for i in camera.extra_params_idxs())
+    if not distorted and "FISHEYE" not in camera.model.name and camera.model.name != "FOV":
         return None
     return Lens(camera.model.name, camera.width, camera.height, tuple(camera.params))
 
 
 def _camera(model: pycolmap.Reconstruction, image: pycolmap.Image, split: Literal["train", "test"], *, centered: bool) -> Camera:
-    """The camera at COLMAP's size. `centered`: the principal point is taken to be the middle."""
+    """The camera at COLMAP's size. `centered`: the principal point is moved to the center."""
     lens = model.cameras[image.camera_id]
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3] = torch.as_tensor(image.cam_from_world().matrix())

@@ -1,4 +1,4 @@
-"""Whether COLMAP's binary files are as long as their own counts say. pycolmap reads on behind the end of one that is not, for hours."""
+"""Check that COLMAP's binary files are as long as their counts say: pycolmap reads beyond the end of truncated ones, for hours."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from mipmap_plugin.errors import SceneError
 
 @dataclass(frozen=True)
 class Rows:
-    """What a file consists of after the number of its rows, in bytes (COLMAP, src/colmap/scene/reconstruction_io_binary.cc)."""
+    """Layout of a file's rows, in bytes (COLMAP, src/colmap/scene/reconstruction_io_binary.cc)."""
 
-    fixed: int  # of a row, before its name and its list
-    has_name: bool = False  # a text that ends with a zero
-    count: str = ""  # how the length of the row's list is packed; empty: there is no list
-    each: int = 0  # of the list
+    fixed: int  # size of a row before its name and its list
+    has_name: bool = False  # whether a zero-terminated text follows
+    count: str = ""  # struct format of the length of the row's list; empty: there is no list
+    each: int = 0  # size of an item of the list
 
 
 FILES = {
-    "cameras.bin": Rows(24),  # and parameters, whose number the model of the lens tells
+    "cameras.bin": Rows(24),  # followed by parameters, whose number depends on the camera model
     "images.bin": Rows(64, has_name=True, count="<Q", each=24),
     "points3D.bin": Rows(43, count="<Q", each=8),
     "rigs.bin": Rows(4, count="<I", each=8),
@@ -30,7 +30,7 @@ FILES = {
 
 
 def refuse_truncated(folder: Path) -> None:
-    """Raise SceneError when a file of the binary model in `folder` is shorter than it says."""
+    """Raise SceneError if a file of the binary model in `folder` is shorter than its counts say."""
     for name, rows in FILES.items():
         path = folder / name
         if path.is_file() and not _is_whole(path, rows):
@@ -49,7 +49,7 @@ def _is_whole(path: Path, rows: Rows) -> bool:
 
 
 def _end(content: mmap.mmap, rows: Rows, declared: int) -> int:
-    """Where the last row ends, or a place behind the content where it is cut off."""
+    """The end of the last row, or a position beyond the content if it is truncated."""
     at, beyond = 8, len(content) + 1
     length = struct.Struct(rows.count)
     for _ in range(declared):

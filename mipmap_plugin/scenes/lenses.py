@@ -1,9 +1,10 @@
-"""Lenses that bend: the pinhole that is left once an image is undistorted, and the undistorting, both pycolmap's."""
+"""Lens distortion: the pinhole camera of an undistorted image, and undistortion, both by pycolmap."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ INSTALL = "install it with `pip install 'mipmap-plugin[colmap]'`"
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera model of COLMAP with its parameters, in px of an image of this size."""
+    """A COLMAP camera model with its parameters, for an image of this size in px."""
 
     model: str
     width: int
@@ -27,13 +28,13 @@ class Lens:
     params: tuple[float, ...]
 
     def at(self, size: tuple[int, int]) -> Lens:
-        """The lens of the same photograph at another `size` (width, height) px."""
+        """The same lens for an image of another `size` (width, height) px."""
         camera = self._camera()
         camera.rescale(*size)
         return replace(self, width=camera.width, height=camera.height, params=tuple(camera.params))
 
     def straightened(self, camera: Camera) -> Camera:
-        """`camera` with the intrinsics, and the size, of the undistorted image. Raises SceneError where the lens has none."""
+        """`camera` with the intrinsics and the size of the undistorted image. Raises SceneError if the lens cannot be undistorted."""
         import pycolmap
 
         try:
@@ -44,7 +45,7 @@ class Lens:
         return replace(camera, width=flat.width, height=flat.height, fx=fx, fy=fy, cx=cx, cy=cy)
 
     def undistorted(self, image: Tensor) -> Tensor:
-        """`image` [H, W, 3] float32 of 8-bit levels, taken through this lens, as a pinhole sees it. Raises SceneError without pycolmap."""
+        """Undistort `image` [H, W, 3], float32 of 8-bit values, that was taken through this lens. Raises SceneError without pycolmap."""
         try:
             import pycolmap
         except ImportError as error:
@@ -60,14 +61,14 @@ class Lens:
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
 
-def note(lenses: Any, seen: int) -> str:
-    """That `lenses` (some of `Lens`) were made pinholes, in a sentence; `seen`: how many cameras have one."""
+def note(lenses: Iterable[Lens], count: int) -> str:
+    """A note that the images of `lenses` are undistorted; `count`: how many cameras have such a lens."""
     models = ", ".join(sorted({lens.model for lens in lenses}))
-    return f"{seen} cameras have lenses that bend ({models}): they are taken as pinholes, and their photographs are undistorted to be looked at"
+    return f"{count} cameras have lenses that bend ({models}): they are taken as pinholes, and their photographs are undistorted to be looked at"
 
 
 def can_undistort() -> bool:
-    """Whether pycolmap is there."""
+    """Whether pycolmap is installed."""
     try:
         import pycolmap  # noqa: F401
     except ImportError:

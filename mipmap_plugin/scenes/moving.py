@@ -1,6 +1,6 @@
-"""Scenes of 4DGaussians that come without transforms: DyNeRF's videos (poses_bounds.npy) and HyperNeRF's captures (dataset.json).
+"""Scenes of 4DGaussians without transforms files: DyNeRF's videos (poses_bounds.npy) and HyperNeRF's captures (dataset.json).
 
-Poses, lenses, sizes, times and splits are those that scene/neural_3D_dataset_NDC.py and scene/hyper_loader.py of that project train on.
+Poses, intrinsics, sizes, times and splits are those of that project's scene/neural_3D_dataset_NDC.py and scene/hyper_loader.py.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, 
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.transforms import viewmat_from_opengl
 
-# DyNeRF: px of the video's width, which its focal lengths are stated at, and of what is trained on; and the frames of a video.
+# DyNeRF: px of the recorded width, to which focal lengths refer, and of the training size; and the number of frames of a video.
 RECORDED, WIDTH, HEIGHT, FRAMES = 2704, 1352, 1014, 300
 
-# HyperNeRF: photographs are read from the folder of half the size. Without a list of test views every fourth is trained on.
+# HyperNeRF: folder of the photographs at half size; without a list of test views, every fourth view is for training.
 HALF, EVERY = "2x", 4
 
 
@@ -34,15 +34,15 @@ def is_hypernerf(path: Path) -> bool:
 
 
 def read_dynerf(path: Path) -> Scene:
-    """Every video's camera, the first for testing. A training camera is taken at some moments only, so that all of them together are as many
-    views as a video has frames, one at each. Frames lie in cam<NN>/images, if they were extracted. Raises SceneError."""
+    """The cameras of all videos, the first for testing. Training cameras take turns, so that together they have one view per frame. Frames
+    are in cam<NN>/images, if they were extracted. Raises SceneError."""
     rows = read_array(path / "poses_bounds.npy")
     if rows.dim() != 2 or rows.shape[1] != 17 or len(rows) < 2:
         raise SceneError(f"{path / 'poses_bounds.npy'}: expected one row of 17 numbers for each of several cameras, got {list(rows.shape)}")
     poses = rows[:, :15].reshape(-1, 3, 5)
     videos = sorted({entry.name.partition(".")[0] for entry in path.glob("cam*")}) or [f"cam{number:02d}" for number in range(len(poses))]
     if len(videos) != len(poses):
-        raise SceneError(f"{path}: has {len(videos)} videos ({videos[0]}, ...), but poses_bounds.npy tells {len(poses)} cameras; copy all of them")
+        raise SceneError(f"{path}: has {len(videos)} videos ({videos[0]}, ...), but poses_bounds.npy has {len(poses)} cameras; copy all of them")
     cameras: list[Camera] = []
     images: dict[Camera, Path] = {}
     for number, (video, pose) in enumerate(zip(videos, poses, strict=True)):
@@ -68,10 +68,10 @@ def read_hypernerf(path: Path) -> Scene:
     for name, split, warp in _chosen(names, set(tests), set(trains), warps):
         photograph = path / "rgb" / HALF / f"{name}.png"
         camera = _of_capture(path / "camera" / f"{name}.json", name, split, warp / last)
-        there = is_file(photograph)
-        camera = camera.resized(*(image_size(photograph) if there else (camera.width // 2, camera.height // 2)))
+        exists = is_file(photograph)
+        camera = camera.resized(*(image_size(photograph) if exists else (camera.width // 2, camera.height // 2)))
         cameras.append(camera)
-        if there:
+        if exists:
             images[camera] = photograph
     if not cameras:
         raise SceneError(f"{path / 'dataset.json'}: lists no view; copy it again")
@@ -79,7 +79,7 @@ def read_hypernerf(path: Path) -> Scene:
 
 
 def _of_video(pose: Tensor, video: str, moment: int, split: Literal["train", "test"], where: str) -> Camera:
-    """`pose` [3, 5] is LLFF's: the camera's axes down, right and backwards, its place, and (height, width, focal length)."""
+    """`pose` [3, 5] in LLFF's convention: the camera's axes down, right and backwards, its position, and (height, width, focal length)."""
     down, right, back, eye, lens = pose.unbind(1)
     to_world = torch.eye(4, dtype=torch.float64)
     to_world[:3, :3] = rotation(torch.stack([right, -down, back], 1).tolist(), where)
@@ -112,7 +112,7 @@ def _warp(entry: Any, where: str) -> float:
 
 
 def _chosen(names: list[str], tests: set[str], trains: set[str], warps: list[float]) -> list[tuple[str, Literal["train", "test"], float]]:
-    """Who is trained on and who is for testing; the others are left out."""
+    """The training and test views; the others are left out."""
     if not tests:
         trains, tests = set(names[::EVERY]), set(names[EVERY // 2 :: EVERY])
     both = list(zip(names, warps, strict=True))
@@ -120,7 +120,7 @@ def _chosen(names: list[str], tests: set[str], trains: set[str], warps: list[flo
 
 
 def _of_capture(file: Path, name: str, split: Literal["train", "test"], time: float) -> Camera:
-    """nerfies' camera: a rotation of the world to the camera, the eye, and a lens, of which that project takes the focal length alone."""
+    """A camera of nerfies: world-to-camera rotation, position, and intrinsics, of which that project uses only the focal length."""
     data = read_json(file)
     turn = rotation(present(data, "orientation", str(file)), f"{file}, orientation")
     eye = numbers(present(data, "position", str(file)), (3,), f"{file}, position")

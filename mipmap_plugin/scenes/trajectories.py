@@ -1,4 +1,4 @@
-"""Generated views: around the given ones, or around the scene where none are given. Each needs no photograph."""
+"""Generated views: around the given cameras, or around the scene if there are none."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 
-ORBIT_FOV = math.radians(50)  # across the shorter side: neither wide nor tele
-ORBIT_ELEVATIONS = (math.radians(10), math.radians(50))  # above the horizon, where people hold cameras
+ORBIT_FOV = math.radians(50)  # along the shorter side: a normal lens
+ORBIT_ELEVATIONS = (math.radians(10), math.radians(50))  # above the horizon, typical of handheld cameras
 
-# The share of the splats that an orbit frames; the farthest tenth are mostly floaters and background.
+# Fraction of the splats that an orbit frames; the farthest tenth are mostly floaters and background.
 FRAMED = 0.9
 
-# How much flatter along y than along z a scene must be before y is taken for its vertical.
+# Largest ratio of the extents along y and z at which y is assumed to be vertical.
 FLATTER = 0.8
 
-# A generated view lies on the way from a camera to one of its nearest few, or this share of the way beyond either end. With 4
-# neighbors and nothing beyond, views fill the gaps between cameras so poorly that 0.8 dB are lost on lego's test views at x1/8.
+# A generated view lies between a camera and one of its NEIGHBORS nearest, or beyond either end by up to this fraction of the way. With 4
+# neighbors and 0 beyond, views fill the gaps between cameras so poorly that lego's test views at x1/8 lose 0.8 dB.
 NEIGHBORS = 16
 BEYOND = 0.25
 
-# So many times as many views are thought of as are kept: those that fill gaps are worth 0.5 dB more than any on lego's test views at x1/8.
+# Candidates per generated view: keeping those that fill gaps gains 0.5 dB on lego's test views at x1/8.
 CANDIDATES = 16
 
-# Sine of the angle below which two lines of sight say nothing about where they meet.
+# Sine of the angle below which the intersection of two lines of sight is undefined.
 PARALLEL = 1e-6
 
-# Cameras that are turned farther apart see different things, and nobody looked where halfway between them is.
+# Cameras whose directions differ more see different content, and views halfway between them look where no camera did.
 SAME_DIRECTION = math.radians(60)
 
 
 def orbit(
     means: Tensor | Gaussians, size: tuple[int, int], count: int, generator: torch.Generator, up: Sequence[float] | None = None
 ) -> list[Camera]:
-    """`count` views of `size` (height, width) px around the scene, for a checkpoint that came without cameras.
+    """`count` views of `size` (height, width) px around the scene, for a checkpoint without cameras.
 
-    All look at the median of `means` [N, 3] from a distance that frames nine tenths of them; azimuths are even from a
-    random start, elevations random. `up` (world axes) is `guess_up` unless given. It suits objects: where the cameras
-    of an unbounded scene stood cannot be known from its splats. Raises SettingsError without splats or views.
+    All look at the median of `means` [N, 3] from a distance that frames nine tenths of them; azimuths are evenly spaced from a
+    random start, elevations are random. `up` (world axes) defaults to `guess_up`. Suitable for objects: the positions of the
+    cameras of an unbounded scene do not follow from its splats. Raises SettingsError without splats or views.
     """
     means = means.means if isinstance(means, Gaussians) else means
     means = means.detach().to("cpu", torch.float64)
@@ -55,28 +55,28 @@ def orbit(
     center = means.median(dim=0).values
     vertical = guess_up(means) if up is None else torch.tensor(up, dtype=torch.float64)
     radius = _quantile((means - center).norm(dim=1), FRAMED).item()
-    distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * NEAR_PLANE)  # a small scene must not fall before the near plane
+    distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * NEAR_PLANE)  # a small scene must not lie in front of the near plane
     directions = _sky_directions(vertical / vertical.norm(), count, generator)
-    return [_looking_at(center, center + distance * each, vertical, size, f"orbit_{i:04d}") for i, each in enumerate(directions)]
+    return [_looking_at(center, center + distance * direction, vertical, size, f"orbit_{i:04d}") for i, direction in enumerate(directions)]
 
 
 def guess_up(means: Tensor) -> Tensor:
-    """[3] the likely vertical of the splats at `means` [N, 3]: +z (Blender, nerfstudio), or -y (COLMAP) for a scene clearly flatter along y.
+    """The likely vertical [3] of the splats at `means` [N, 3]: +z (Blender, nerfstudio), or -y (COLMAP) for a scene clearly flatter along y.
 
-    Scenes are wider than they are high. On flowers of mip-NeRF 360 (-y) and on lego and chair (+z) it is right.
+    Scenes are usually wider than high. It is right for flowers of mip-NeRF 360 (-y), and lego and chair (+z).
     """
     spread = _quantile(means, FRAMED) - _quantile(means, 1 - FRAMED)
     return means.new_tensor((0.0, -1.0, 0.0) if spread[1] < FLATTER * spread[2] else (0.0, 0.0, 1.0))
 
 
 def jittered(cameras: Sequence[Camera], count: int, generator: torch.Generator, amount: float = 0.05) -> list[Camera]:
-    """`count` views from where the scene was seen, looking the way it was looked at, for training.
+    """`count` training views near the given cameras, looking in similar directions.
 
-    Each takes the lens, size and time of one of `cameras` and lies at a random point on the way to a near camera that looks
-    the same way, or a little before or behind it (`BEYOND`): centers on the arc around what both look at, rotations on an arc.
-    Then its center moves by `amount` of the distance between the two, and it turns by `amount` of its field of view, one standard
-    deviation each. Of `CANDIDATES` times as many such views those are kept that lie farthest from the cameras and from each other.
-    Raises SettingsError without cameras.
+    Each has the intrinsics, size and time of one of `cameras`. It is interpolated at random towards a near camera that looks in a
+    similar direction, or extrapolated a little (`BEYOND`): centers on an arc around the point that both look at, rotations on an
+    arc. Then the center is moved by `amount` of the distance between the two, and the view rotated by `amount` of its field of
+    view, one standard deviation each. Of `CANDIDATES` times as many views, those farthest from the cameras and from each other are
+    kept. Raises SettingsError without cameras.
     """
     if not cameras or count < 0 or amount < 0:
         raise SettingsError(f"jittered views need cameras, but got {len(cameras)} cameras, count={count} and amount={amount}")
@@ -94,12 +94,12 @@ def jittered(cameras: Sequence[Camera], count: int, generator: torch.Generator, 
     gap = (centers[pairs[1]] - centers[pairs[0]]).norm(dim=1, keepdim=True)
     moved = _on_arc(centers[pairs], rotations[pairs][..., 2], along) + shift * gap
     far = _farthest(_places(moved, turned, times[index], centers), _places(centers, rotations, times, centers), count)
-    poses = [(cameras[int(index[each])], _viewmat(turned[each], moved[each])) for each in far]
+    poses = [(cameras[int(index[i])], _viewmat(turned[i], moved[i])) for i in far]
     return [replace(camera, viewmat=pose, name=f"jittered_{n:04d}", split="train") for n, (camera, pose) in enumerate(poses)]
 
 
 def rotation_vector(rotation: Tensor) -> Tensor:
-    """[..., 3] axis times angle (radians, below pi) of rotations [..., 3, 3]; the logarithm."""
+    """Rotation vectors [..., 3], axis times angle (radians, below pi), of rotations [..., 3, 3]; the logarithm."""
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
     angle = torch.acos(((trace - 1) / 2).clamp(-1, 1))
     skew = rotation - rotation.mT
@@ -107,16 +107,17 @@ def rotation_vector(rotation: Tensor) -> Tensor:
 
 
 def rotation_matrix(vector: Tensor) -> Tensor:
-    """[..., 3, 3] the rotations by |vector| radians around `vector` [..., 3]; the exponential."""
+    """The rotations [..., 3, 3] by |vector| radians around `vector` [..., 3]; the exponential."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3)))
 
 
 def _on_arc(centers: Tensor, forwards: Tensor, along: Tensor) -> Tensor:
-    """[V, 3] points `along` [V, 1] (0..1, or beyond) the way between eyes [2, V, 3] that look `forwards` [2, V, 3], around what both look at.
+    """Points [V, 3] at fractions `along` [V, 1] (0..1, or beyond) of the arcs between eyes [2, V, 3] around the point that both look at.
 
-    That is where their lines of sight come closest. Where they do not meet in front of both, the way is straight.
+    That point is where their lines of sight, in the directions `forwards` [2, V, 3], come closest. If it is not in front of both, the
+    path is straight.
     """
     gap = centers[1] - centers[0]
     sights = torch.stack([forwards[0], -forwards[1]], dim=-1)
@@ -133,7 +134,7 @@ def _on_arc(centers: Tensor, forwards: Tensor, along: Tensor) -> Tensor:
 
 
 def _neighbors(centers: Tensor, rotations: Tensor, index: Tensor, generator: torch.Generator) -> Tensor:
-    """[V] for each of `index` [V] one of the nearest cameras that look the same way; itself where none does."""
+    """For each of `index` [V], a random one of the nearest cameras that look in a similar direction, [V]; itself if none does."""
     traces = rotations.flatten(1) @ rotations.flatten(1).T  # of the rotation from one to the other, 1 + 2 cos(angle)
     distances = torch.cdist(centers, centers)
     distances[(traces - 1) / 2 < math.cos(SAME_DIRECTION)] = math.inf
@@ -145,7 +146,7 @@ def _neighbors(centers: Tensor, rotations: Tensor, index: Tensor, generator: tor
 
 
 def _places(centers: Tensor, rotations: Tensor, times: Tensor, around: Tensor) -> Tensor:
-    """[V, 7] where views are, in units of the size of the path `around` [C, 3], where they look, and when."""
+    """Features [V, 7] of views: position, in units of the size of the camera path `around` [C, 3], direction, and time."""
     size = (around - around.mean(0)).norm(dim=1).max()
     return torch.cat([centers / (size if size > 0 else 1.0), rotations[..., 2], times[:, None]], dim=1)
 
@@ -161,7 +162,7 @@ def _farthest(places: Tensor, taken: Tensor, count: int) -> list[int]:
 
 
 def _sky_directions(up: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """[count, 3] unit vectors at even azimuths and random elevations over the horizon whose normal is `up` (unit)."""
+    """Unit vectors [count, 3] at evenly spaced azimuths and random elevations above the horizon whose normal is `up` (unit)."""
     east = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[up.abs().argmin()])
     east = east / east.norm()
     north = torch.linalg.cross(up, east)
@@ -173,7 +174,7 @@ def _sky_directions(up: Tensor, count: int, generator: torch.Generator) -> Tenso
 
 
 def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], name: str) -> Camera:
-    """A camera at `eye` that looks at `target` with `up` upwards; columns of its rotation are right, down, forward."""
+    """A camera at `eye` that looks at `target`, with `up` upwards. The columns of its rotation are right, down and forward."""
     forward = (target - eye) / (target - eye).norm()
     right = torch.linalg.cross(forward, up)
     right = right / right.norm()

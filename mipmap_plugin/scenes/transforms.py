@@ -22,10 +22,10 @@ IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 PERSPECTIVE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
-# What ns-process-data turned COLMAP's world by before its files said so (data/dataparsers/nerfstudio_dataparser.py). It is a rotation.
+# The rotation that ns-process-data applied to COLMAP's world before its files recorded it (data/dataparsers/nerfstudio_dataparser.py).
 USUAL_TURN = [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 
-# Radians; half of it has a tangent that can be divided by, and no lens is as long.
+# Radians: a smaller angle of view is longer than any lens, and its tangent may underflow.
 MIN_ANGLE = 1e-9
 
 # OpenGL's camera looks along -z with y up, OpenCV's along +z with y down.
@@ -35,36 +35,36 @@ OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.f
 def read_transforms(path: str | Path) -> Scene:
     """The scene of a folder with transforms files, or of one such file.
 
-    `transforms_test.json` is the test split; without it `transforms_val.json` is. A frame's image may be absent:
-    the camera stays where the file states its size (`w`, `h`) and is left out otherwise; `notes` count both.
+    `transforms_test.json` is the test split, or `transforms_val.json` if there is none. A frame whose image is missing stays a
+    view if the file states its size (`w`, `h`), and is left out otherwise; `notes` count both.
 
     Raises:
-        SceneError: no transforms file, no usable frame, a lens that is no perspective's, or an entry that cannot be read.
+        SceneError: no transforms file, no usable frame, a lens that is not perspective, or an entry that cannot be read.
     """
     path = Path(path)
     cameras: list[Camera] = []
     images: dict[Camera, Path] = {}
     notes: list[str] = []
     lenses: dict[Path, Lens] = {}
-    bent: list[Lens] = []
+    distorted: list[Lens] = []
     for file, split in transforms_files(path):
-        found, absent = _read_file(file, split)
-        cameras += [camera for camera, _, _ in found]
-        images |= {camera: image for camera, image, _ in found if image}
-        lenses |= {image: lens for _, image, lens in found if image and lens}
-        bent += [lens for _, _, lens in found if lens]
+        views, absent = _read_file(file, split)
+        cameras += [camera for camera, _, _ in views]
+        images |= {camera: image for camera, image, _ in views if image}
+        lenses |= {image: lens for _, image, lens in views if image and lens}
+        distorted += [lens for _, _, lens in views if lens]
         if absent:
-            unsized = absent - sum(image is None for _, image, _ in found)
+            unsized = absent - sum(image is None for _, image, _ in views)
             notes.append(f"{file.name}: {absent} listed images are absent; {unsized} of their cameras are left out because the file has no w and h")
     if not cameras:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
     first = transforms_files(path)[0][0]
-    notes += [note(bent, len(bent)) + ("" if can_undistort() else f"; pycolmap does that: {INSTALL}")] if bent else []
+    notes += [note(distorted, len(distorted)) + ("" if can_undistort() else f"; pycolmap does that: {INSTALL}")] if distorted else []
     return Scene(tuple(cameras), images, path, notes, applied=_applied(first), applied_scale=_applied_scale(first), lenses=lenses)
 
 
 def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
-    """The transforms files behind `path`, each with its split. Raises SceneError when there is none."""
+    """The transforms files at `path`, each with its split. Raises SceneError if there is none."""
     if path.is_file():
         return [(path, "test" if path.stem.endswith(("_test", "_val")) else "train")]
     train = _first_file(path, "transforms_train.json", "transforms.json")
@@ -77,8 +77,8 @@ def transforms_files(path: Path) -> list[tuple[Path, Literal["train", "test"]]]:
 def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
     """World to camera [4, 4], OpenCV axes, from a camera-to-world pose [4, 4] with OpenGL axes.
 
-    graphdeco-inria before commit 0f125cb, and its descendants, have the translation's x with the other sign. That is
-    the same camera only where this x is 0, as in all of NeRF-Synthetic; this is the exact inverse.
+    In graphdeco-inria before commit 0f125cb, and in its descendants, the x of the translation has the opposite sign. That is
+    the same camera only if this x is 0, as in all of NeRF-Synthetic; this is the exact inverse.
     """
     return torch.linalg.inv(camera_to_world @ OPENGL_TO_OPENCV)
 
@@ -88,18 +88,18 @@ def _first_file(folder: Path, *names: str) -> list[Path]:
 
 
 def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[Camera, Path | None, Lens | None]], int]:
-    """Each usable camera with its image and the lens that it has to be undistorted from, and how many listed images are absent."""
+    """The usable cameras with their images and lenses that have to be undistorted, and the number of listed images that are missing."""
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise SceneError(f"{file}: has no list of 'frames'; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
-    found: list[tuple[Camera, Path | None, Lens | None]] = []
+    views: list[tuple[Camera, Path | None, Lens | None]] = []
     absent = 0
     for index, frame in enumerate(frames):
         where = f"{file}, frame {index}"
         if not isinstance(frame, dict):
             raise SceneError(f"{where}: is not a camera; export the file again")
-        values = {**data, **frame}  # a frame's own lens wins over the file's
+        values = {**data, **frame}  # a frame's own intrinsics override the file's
         listed = str(present(frame, "file_path", where))
         image = _image(file.parent, listed)
         absent += image is None
@@ -109,12 +109,12 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
             name = image.stem if image else listed.replace("\\", "/").rsplit("/", 1)[-1]
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
             lens = _lens(values, camera, f"{where} ({name})")
-            found.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
-    return found, absent
+            views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
+    return views, absent
 
 
 def _applied(file: Path) -> Tensor | None:
-    """[4, 4] nerfstudio's `applied_transform`, by which it has turned COLMAP's world already; in old data it goes without saying."""
+    """nerfstudio's `applied_transform` [4, 4], which was applied to COLMAP's world already; old files do not record it."""
     data = read_json(file)
     if "applied_transform" not in data:
         return _pose(USUAL_TURN, str(file)) if file.name == "transforms.json" and (file.parent / "colmap/sparse/0").exists() else None
@@ -126,7 +126,7 @@ def _applied_scale(file: Path) -> float:
 
 
 def _image(folder: Path, listed: str) -> Path | None:
-    """The image file behind a `file_path`, which may lack its extension; None when it is absent."""
+    """The image file of a `file_path`, which may lack its suffix; None if it is missing."""
     stem = listed.replace("\\", "/")
     return next((folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES if is_file(folder / f"{stem}{suffix}")), None)
 
@@ -138,7 +138,7 @@ def _stated_size(values: Mapping[str, Any], where: str) -> tuple[int, int] | Non
 
 
 def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: Literal["train", "test"], where: str) -> Camera:
-    """The camera at `size` (width, height) px, which the lens is stated at."""
+    """The camera at `size` (width, height) px, to which the intrinsics refer."""
     width, height = size
     fx = _focal(values, "x", width, where)
     if fx is None:
@@ -155,7 +155,7 @@ def _viewmat(values: Mapping[str, Any], where: str) -> Tensor:
 
 
 def _pose(value: Any, where: str) -> Tensor:
-    """A rotation and a shift as [4, 4] float64. Raises SceneError, led by `where`."""
+    """A rotation and a translation as [4, 4] float64. Raises SceneError, beginning with `where`."""
     rows = value[:3] if isinstance(value, list) else value  # the last row is 0 0 0 1, and some files leave it out
     upper = numbers(rows, (3, 4), where)
     rotation(upper[:, :3].tolist(), where)
@@ -165,7 +165,7 @@ def _pose(value: Any, where: str) -> Tensor:
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float | None:
-    """The focal length in px from `fl_x` or `camera_angle_x` (radians), or their y twins; None when neither is given."""
+    """The focal length in px from `fl_x` or `camera_angle_x` (radians), or those of y; None if neither is given."""
     if f"fl_{axis}" in values:
         return positive(values[f"fl_{axis}"], f"{where}, fl_{axis}")
     if f"camera_angle_{axis}" not in values:
@@ -177,7 +177,7 @@ def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float
 
 
 def _lens(values: Mapping[str, Any], camera: Camera, where: str) -> Lens | None:
-    """The lens of `camera`, where it bends; its parameters are OpenCV's, and need no size. Raises SceneError where it is no perspective's."""
+    """The lens of a `camera` with distortion, with OpenCV's parameters; None for a pinhole. Raises SceneError if it is not perspective."""
     model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if model not in (*PERSPECTIVE_MODELS, "OPENCV_FISHEYE"):
         raise SceneError(f"{where}: has a lens that is not perspective ({model}); resample its images to a pinhole first")

@@ -1,1 +1,1 @@
-"""The mathematics of one image in readable torch, and what viewers do differently, as data."""
+"""The mathematics of splatting one image, in readable torch, and the conventions of viewers, as data."""

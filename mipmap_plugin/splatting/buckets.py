@@ -1,6 +1,7 @@
-"""The coarse order in which PlayCanvas draws on WebGL: splats sorted into buckets of depth, as many as a counting sort has counters.
+"""The approximate depth order of PlayCanvas on WebGL: a counting sort of splats into buckets of depth.
 
-Read in playcanvas 2.23.3: gsplat-unified-sort-worker, gsplat-sort-bin-weights, and the order in which a file's rows are kept (Morton's).
+Source: playcanvas 2.23.3, gsplat-unified-sort-worker and gsplat-sort-bin-weights. Splats of one bucket keep the order of the rows
+in memory, which is Morton order.
 """
 
 from __future__ import annotations
@@ -13,24 +14,24 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 
-# The depths of the box around all splats, so many standard deviations beyond their centers, are cut into bins of the same length.
+# The depth range of a box around all splats, BOX standard deviations beyond their centers, is cut into BINS bins of equal length.
 BOX, BINS = 2, 32
 
-# Bins have buckets in proportion to the weight of the first row that lists them: at most so many bins from the camera's own, weight.
+# (distance to the camera's bin in bins, weight): a bin has buckets in proportion to the weight of the first entry whose distance covers it.
 WEIGHTS = ((0, 40), (2, 20), (5, 8), (10, 3), (BINS, 1))
 
-# 2 to the power of round(log2(N / 4)) buckets, and one more, with the power in these bounds.
+# There are 2^b + 1 buckets, b = round(log2(N / 4)) clamped to these bounds.
 LEAST_BITS, MOST_BITS = 10, 20
 
-# Bits of Morton's order along each axis.
+# Bits of the Morton code per axis.
 MORTON_BITS = 10
 
 
 @torch.no_grad()
 def ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """[N] int32: each splat's place front to back. In one bucket the order is Morton's, wherever the splats lie in it.
+    """Rank of each splat front to back, [N] int32. Within a bucket splats are in Morton order, whatever their depth.
 
-    Computed in float64, so that every backend finds the same order. What is not finite has any place.
+    Computed in float64, so that every backend gets the same order. The rank of a splat that is not finite is arbitrary.
     """
     means = gaussians.means.double().nan_to_num(0.0, 0.0, 0.0)
     sizes = gaussians.scales.double().nan_to_num(0.0, 0.0, 0.0).abs().amax(1, keepdim=True)
@@ -48,19 +49,19 @@ def ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
 
 
 def _buckets(bins: Tensor, own: int, count: int) -> Tensor:
-    """[N] int64, the higher the nearer. `bins`: 0..BINS from the farthest to the nearest, of which the camera's is `own`."""
+    """Bucket of each splat, [N] int64; higher is nearer. `bins` [N] is 0..BINS from farthest to nearest; `own` is the camera's bin."""
     most = 2 ** min(max(round(math.log2(count / 4)), LEAST_BITS), MOST_BITS) + 1
     weights = [next(weight for reach, weight in WEIGHTS if abs(i - own) <= reach) for i in range(BINS)]
     sizes = [max(1, weight * most // sum(weights)) for weight in weights]
     sizes[-1] = max(1, sizes[-1] - max(0, sum(sizes) - most))
-    # What lies at the very end of the last bin has a bucket of its own.
-    first, room = bins.new_tensor([0, *sizes]).cumsum(0), bins.new_tensor([*sizes, 0])
+    # A splat at the very end of the last bin has a bucket of its own.
+    first, count_of = bins.new_tensor([0, *sizes]).cumsum(0), bins.new_tensor([*sizes, 0])
     whole = bins.long().clamp(0, BINS)
-    return (first[whole] + room[whole] * (bins - whole)).long()
+    return (first[whole] + count_of[whole] * (bins - whole)).long()
 
 
 def _morton(means: Tensor) -> Tensor:
-    """[N] int64: the bits of x, y and z, each in 2^MORTON_BITS cells of the box of centers, one after the other."""
+    """Morton code of each center, [N] int64: interleaved bits of x, y and z in a grid of 2^MORTON_BITS cells per axis of their bounding box."""
     low, high = means.amin(0), means.amax(0)
     cells = ((means - low) * 2**MORTON_BITS / (high - low).clamp_min(torch.finfo(means.dtype).tiny)).clamp_max(2**MORTON_BITS - 1).long()
     return sum(((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3))  # type: ignore[return-value]

@@ -1,10 +1,10 @@
-"""Culls: splats that a viewer does not draw, with a gradient that lets them come back, and splats that it draws in another shape.
+"""Culling by viewers, with a gradient that lets culled splats return; and splats that viewers draw in another shape.
 
-A viewer compares a measure of a splat (its variance, its contribution) with a threshold. With x the smallest quotient of measure and
-threshold, a splat's alpha is multiplied by a gate: in the image 1 where x >= 1 and else 0, exactly as the viewer does it; for the
-gradient the smooth step x⁴ / (1 + x⁴), which is the logistic function of 4·ln(x). A culled splat is thus felt where it would lie: if the
-loss fell with it, its measure grows. The power makes the step narrow: of a splat four times above the threshold its slope is 0.004,
-while a splat is still felt that lies as far below it as dilation alone lets any.
+A viewer compares a measure of a splat (its variance, its contribution) with a threshold. Let x be the smallest ratio of measure to
+threshold. The splat's alpha is multiplied by a gate: in the image 1 where x >= 1, else 0, exactly as in the viewer; in the backward
+pass the smooth step x⁴ / (1 + x⁴), the logistic function of 4·ln(x). So a culled splat has a gradient: if drawing it would lower the
+loss, its measure grows. The exponent makes the step narrow (slope 0.004 at four times the threshold), yet wide enough to reach the
+smallest splats, whose size dilation alone determines.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ STEEPNESS = 4.0
 
 
 def gate(shape: tuple[Tensor, Tensor, Tensor, Tensor], opacities: Tensor, settings: RenderSettings) -> Tensor:
-    """[N]: 1 where a splat is drawn and 0 where it is culled, with the gradient of the smooth step.
+    """1 where a splat is drawn and 0 where it is culled, [N], with the gradient of the smooth step.
 
     `shape`: (xx, xy, yy, det) [N] of the dilated covariances, px² and px⁴. `opacities` [N]: before any compensation.
     """
     xx, _, yy, det = shape
-    quotients = []
+    ratios = []
     if settings.min_variance:
         larger = torch.maximum(xx, yy) if settings.boxed else (xx + yy) / 2 + spread(shape)
-        quotients.append(larger / settings.min_variance)
+        ratios.append(larger / settings.min_variance)
     if settings.min_contribution:
-        quotients.append(opacities * det.sqrt() / settings.min_contribution)
+        ratios.append(opacities * det.sqrt() / settings.min_contribution)
     if settings.least_spread:
-        quotients.append((xx + yy) / 2 / settings.least_spread)
-    least = torch.stack(quotients).amin(0)
-    # `where` before the logarithm: a splat of opacity 0 has none, and no gradient.
+        ratios.append((xx + yy) / 2 / settings.least_spread)
+    least = torch.stack(ratios).amin(0)
+    # `where` before the logarithm: at opacity 0 it is infinite, and the gradient has to be 0.
     smooth = torch.sigmoid(STEEPNESS * torch.where(least > 0, least, 1.0).log())
     return (least >= 1).to(smooth) + smooth - smooth.detach()
 
 
 def spread(shape: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
-    """[N] px²: how far the variances along a splat's axes lie from their mean."""
+    """Half the difference of the variances along a splat's two axes, [N] px²."""
     squared = ((shape[0] - shape[2]) / 2).square() + shape[1].square()
     # `where` before the root as well as after it: the root's gradient at 0 is infinite, and infinity times zero is NaN.
     return torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
 
 
 def stretched(shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The shapes of splats whose variances are put `least` px² from their mean where they lie nearer, of those that are `drawn` [N].
+    """Stretch the `drawn` [N] splats whose `spread` is below `least` px² until it is `least`.
 
-    As GaussianSplats3D does it (SplatMaterial3D): the direction of the longer axis is (xy, mean + least - xx), which is an eigenvector
-    only where the variances are left as they are. A round splat becomes an upright one.
+    As in GaussianSplats3D (SplatMaterial3D): the direction of the longer axis is (xy, mean + least - xx), which is an eigenvector
+    only where the variances do not change. A round splat becomes elongated along y.
     """
     xx, xy, yy, _ = shape
     mean, half = (xx + yy) / 2, (xx - yy) / 2
@@ -61,11 +61,10 @@ def stretched(shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least
 
 
 def limited(shape: tuple[Tensor, Tensor, Tensor, Tensor], most: float, whole: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The shapes [N] of splats whose variances along their axes are at most `most` px²; `whole`: all of a splat shrinks, until those along
-    x and y are.
+    """Clamp the variances along each splat's axes to `most` px². `whole`: scale the splat uniformly until its variances along x and y fit.
 
-    What becomes of the eigenvalues of a matrix M while its eigenvectors stay is a·M + b·1 (Cayley and Hamilton). With variances
-    long > most > short that is a = (most - short) / (long - short) and b = short · (long - most) / (long - short), sums without cancellation.
+    A change of a matrix M's eigenvalues that keeps its eigenvectors is a·M + b·1 (Cayley and Hamilton). For variances
+    long > most > short: a = (most - short) / (long - short), b = short · (long - most) / (long - short), sums without cancellation.
     """
     xx, xy, yy, det = shape
     if whole:

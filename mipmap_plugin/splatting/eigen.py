@@ -1,6 +1,6 @@
 """Eigenvalues and eigenvectors of many symmetric 3 x 3 matrices at once, in a fixed number of steps on any device.
 
-`torch.linalg.eigh` hands each of them to a solver for large ones: on GPUs slow for many, and limited in their number.
+`torch.linalg.eigh` uses a solver for large matrices: on GPUs it is slow for large batches, and their size is limited.
 """
 
 from __future__ import annotations
@@ -8,22 +8,22 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Each sweep of Jacobi's method more than squares what is left off the diagonal: four take any matrix to the rounding of double. One to spare.
+# Jacobi's method converges quadratically: four sweeps take any matrix to double precision. One to spare.
 SWEEPS = 5
 
 
 @torch.no_grad()
 def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Symmetric [N, 3, 3] -> eigenvalues [N, 3], ascending, and eigenvectors [N, 3, 3], in columns; as `torch.linalg.eigh`.
+    """Eigenvalues [N, 3], ascending, and eigenvectors [N, 3, 3], in columns, of symmetric [N, 3, 3]; as `torch.linalg.eigh`. No gradient.
 
-    The cyclic Jacobi method (Golub and Van Loan, Matrix Computations, 8.5): each turn zeroes one entry off the diagonal by the smaller
-    of the two angles that do. No cubic is solved, so that equal eigenvalues need no case of their own. Numbers are scaled first, so that
-    no square leaves the range; small eigenvalues are as exact as the rounding of the largest. Without gradient.
+    The cyclic Jacobi method (Golub and Van Loan, Matrix Computations, 8.5): each rotation zeroes one off-diagonal entry, by the smaller
+    of the two possible angles. Equal eigenvalues are not a special case, as they are for a cubic. Matrices are scaled first, so that
+    squares do not overflow; the absolute error of small eigenvalues is the rounding error of the largest.
     """
     largest = matrices.abs().amax((1, 2), keepdim=True)
     scaled = matrices / torch.where(largest > 0, largest, 1.0)
     diagonal = [scaled[:, k, k] for k in range(3)]
-    off = [scaled[:, 1, 2], scaled[:, 2, 0], scaled[:, 0, 1]]  # each under the index that is not its own
+    off = [scaled[:, 1, 2], scaled[:, 2, 0], scaled[:, 0, 1]]  # off[k]: the entry whose row and column are not k
     vectors = [torch.eye(3, dtype=matrices.dtype, device=matrices.device)[k].expand(len(matrices), 3) for k in range(3)]
     for _ in range(SWEEPS):
         for r, p, q in ((2, 0, 1), (1, 2, 0), (0, 1, 2)):
@@ -40,7 +40,7 @@ def eigh3(matrices: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _tangent(off: Tensor, gap: Tensor) -> Tensor:
-    """[N]: the tangent, at most 1, of the turn after which nothing is left of `off`, between two axes whose entries differ by `gap`."""
-    # 2·off / (gap ± sqrt(gap² + 4·off²)), of which both terms have one sign.
+    """Tangent, at most 1, of the rotation that zeroes the entry `off` [N] between two axes whose diagonal entries differ by `gap` [N]."""
+    # 2·off / (gap ± sqrt(gap² + 4·off²)), with the sign for which both terms agree.
     below = gap.abs() + torch.hypot(gap, 2 * off)
     return torch.where(below > 0, 2 * off * torch.where(gap < 0, -1.0, 1.0) / torch.where(below > 0, below, 1.0), 0.0)

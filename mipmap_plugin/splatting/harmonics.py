@@ -18,7 +18,7 @@ C4 = (2.5033429417967046, -1.7701307697799304, 0.9461746957575601, -0.6690465435
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Unit directions [N, 3] -> basis functions [N, (degree + 1)²]."""
+    """Basis functions [N, (degree + 1)²] at unit directions [N, 3]."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     bands = [[torch.full_like(x, C0)]]
@@ -39,12 +39,12 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(sh: Tensor, means: Tensor, eye: Tensor, degree: int) -> Tensor:
-    """Linear RGB [N, 3] of splats at `means` seen from `eye` [3]: SH + 0.5, not below 0, no upper bound."""
-    if degree == 0:  # the same from everywhere: no direction is needed
+    """Linear RGB [N, 3] of splats at `means` [N, 3] seen from `eye` [3]: SH + 0.5, clamped to at least 0, no upper bound."""
+    if degree == 0:  # independent of the direction
         return (C0 * sh[:, 0]).add(0.5).clamp_min(0)
     bands = (degree + 1) ** 2
     rays = means - eye
-    # A splat in the very eye has no direction: any unit vector will do, as long as it and its gradient are finite.
+    # A splat exactly at the eye has no direction: any unit vector will do, as long as it and its gradient are finite.
     length = rays.norm(dim=-1, keepdim=True)
     at_eye = length == 0
     directions = torch.where(at_eye, rays.new_tensor([0.0, 0.0, 1.0]), rays / torch.where(at_eye, 1.0, length))

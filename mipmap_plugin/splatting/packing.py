@@ -1,10 +1,11 @@
-"""Packing: splats as a viewer keeps them in memory, rounded. Gradients go through as if nothing were rounded (straight-through)."""
+"""Packing: splats quantized as a viewer stores them in memory. Gradients ignore the rounding (straight-through)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,12 +15,12 @@ from mipmap_plugin.effects import Packing
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.harmonics import C0
 
-# The sine of half an angle below which a rotation has no axis.
+# Sine of half the angle below which a rotation's axis is undefined.
 LEAST_TURN = 1e-6
 
 
 def packed(gaussians: Gaussians, camera: Camera, packing: Packing) -> Gaussians:
-    """`gaussians` as `camera` sees them after `packing`. Covariances that a model gives are left as they are.
+    """`gaussians` after `packing`; `camera` matters for means that are stored relative to it. Covariances are not packed.
 
     Computed in float64, so that every backend rounds the same way.
     """
@@ -36,27 +37,27 @@ def packed(gaussians: Gaussians, camera: Camera, packing: Packing) -> Gaussians:
         if packing.half_means:
             eye = camera.center.to(exact.means)
             rounded["means"] = (exact.means.half().double() - eye).half().double() + eye
-    return replace(gaussians, **{name: _through(getattr(gaussians, name), value) for name, value in rounded.items()})
+    return replace(gaussians, **{name: _straight_through(getattr(gaussians, name), value) for name, value in rounded.items()})
 
 
-def in_steps(given: Tensor, steps: Tensor) -> Tensor:
-    """The nearest multiples of `steps`, with the gradient of `given`."""
-    return _through(given, (given.detach() / steps).round() * steps)
+def round_to(values: Tensor, steps: Tensor) -> Tensor:
+    """The nearest multiples of `steps`, with the gradient of `values`."""
+    return _straight_through(values, (values.detach() / steps).round() * steps)
 
 
-def _through(given: Tensor, rounded: Tensor) -> Tensor:
-    """`rounded` with the gradient of `given`; what is not finite stays as it is."""
-    rounded = torch.where(given.isfinite(), rounded.to(given), given).detach()
-    return rounded if not given.requires_grad else _StraightThrough.apply(given, rounded)  # type: ignore[no-any-return]
+def _straight_through(values: Tensor, rounded: Tensor) -> Tensor:
+    """`rounded` with the gradient of `values`; values that are not finite are not rounded."""
+    rounded = torch.where(values.isfinite(), rounded.to(values), values).detach()
+    return rounded if not values.requires_grad else _StraightThrough.apply(values, rounded)  # type: ignore[no-any-return]
 
 
 class _StraightThrough(torch.autograd.Function):
     @staticmethod
-    def forward(_ctx, given, rounded):
+    def forward(_ctx: Any, _values: Tensor, rounded: Tensor) -> Tensor:
         return rounded
 
     @staticmethod
-    def backward(_ctx, gradient):
+    def backward(_ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
         return gradient, None
 
 
@@ -65,7 +66,7 @@ def _stepped(values: Tensor, step: float, downwards: bool = False) -> Tensor:
 
 
 def _harmonics(sh: Tensor, packing: Packing) -> Tensor:
-    """[N, K, 3]. The color of degree 0 within 0..1 and the coefficients above it within -1..1, each a multiple of its step."""
+    """Quantize [N, K, 3]: the color of degree 0 within 0..1, higher coefficients within -1..1, each to multiples of its step."""
     parts = [sh[:, :1]]
     if packing.color is not None:
         parts = [(_stepped((C0 * sh[:, :1] + 0.5).clamp(0, 1), packing.color, packing.downwards) - 0.5) / C0]
@@ -76,21 +77,21 @@ def _harmonics(sh: Tensor, packing: Packing) -> Tensor:
 
 
 def _scales(scales: Tensor, least: float, most: float, step: float) -> Tensor:
-    """[N, 3]. Logarithms in steps; 0 stays 0."""
+    """Quantize the logarithms of scales [N, 3]; 0 stays 0."""
     logarithms = scales.abs().clamp_min(torch.finfo(scales.dtype).tiny).log()
     stepped = (_stepped(logarithms - least, step) + least).clamp(least, most)
     return torch.where(scales == 0, 0.0, stepped.exp() * scales.sign())
 
 
-def _quaternions(quats: Tensor, rounded: Callable[[Tensor], Tensor]) -> Tensor:
-    """[N, 4] wxyz. A quaternion keeps its norm, for its gradient is of that size; one of norm 0 stays."""
+def _quaternions(quats: Tensor, quantize: Callable[[Tensor], Tensor]) -> Tensor:
+    """Quantize the rotations of [N, 4] wxyz. Norms are kept, because gradients scale with them; a zero quaternion stays."""
     length = quats.norm(dim=1, keepdim=True)
     unit = torch.where(length > 0, quats / torch.where(length > 0, length, 1.0), quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
-    return rounded(torch.where(unit[:, :1] < 0, -unit, unit)) * length
+    return quantize(torch.where(unit[:, :1] < 0, -unit, unit)) * length
 
 
 def _octahedral(unit: Tensor) -> Tensor:
-    """The axis of rotation on an unfolded octahedron (u, v), and the angle of 0..π, in 255 steps each."""
+    """Axis-angle: the axis on an unfolded octahedron (u, v), the angle in 0..π, in 255 steps each."""
     angle = 2 * unit[:, :1].clamp(-1, 1).acos()
     axis = torch.where(unit[:, 1:].norm(dim=1, keepdim=True) > LEAST_TURN, unit[:, 1:], unit.new_tensor([1.0, 0.0, 0.0]))
     axis = axis / axis.abs().sum(1, keepdim=True)
@@ -103,7 +104,7 @@ def _octahedral(unit: Tensor) -> Tensor:
 
 
 def _folded(u_v: Tensor) -> Tensor:
-    """The lower half of the octahedron folded out, and back in: (1 - |v|, 1 - |u|) with the signs of (u, v)."""
+    """Unfold the lower half of the octahedron, or fold it back: (1 - |v|, 1 - |u|) with the signs of (u, v)."""
     return (1 - u_v.flip(1).abs()) * torch.where(u_v >= 0, 1.0, -1.0)
 
 

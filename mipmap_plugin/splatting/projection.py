@@ -1,4 +1,4 @@
-"""EWA projection: Gaussians in the world -> Gaussians on the image plane (Zwicker et al. 2001, as 3DGS uses it)."""
+"""EWA projection: 3D Gaussians in the world -> 2D Gaussians on the image plane (Zwicker et al. 2001, as 3DGS uses it)."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from mipmap_plugin.splatting.rotations import rotations
 
 @dataclass(frozen=True, eq=False)
 class Projected:
-    """N splats on the image plane, without any screen filter."""
+    """N splats on the image plane, before any screen filter."""
 
     means2d: Tensor  # [N, 2] px
     depths: Tensor  # [N] world units along the optical axis
-    xx: Tensor  # [N] px², the covariance's entries
+    xx: Tensor  # [N] px², entries of the covariance
     xy: Tensor  # [N] px²
     yy: Tensor  # [N] px²
     det: Tensor  # [N] px⁴, never negative
 
 
 def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: float = FRUSTUM_MARGIN) -> Projected:
-    """Means, depths and covariances on the image plane. Splats nearer than `near` get finite values of no meaning."""
+    """Project splats to the image plane. The values of splats nearer than `near` are finite but meaningless."""
     viewmat = camera.viewmat.to(gaussians.means)
     in_camera = camera.to_camera(gaussians.means)
     depths = in_camera[:, 2]
@@ -43,7 +43,7 @@ def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: fl
 
 
 def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: float) -> Tensor:
-    """The projection's derivative at each center [N, 2, 3]; slopes are frozen outside the widened frustum."""
+    """Jacobian of the projection at each center, [N, 2, 3]; slopes are clamped to the frustum widened by `frozen_beyond` on each side."""
     half = slopes.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2
     left = slopes.new_tensor([camera.cx / camera.fx, camera.cy / camera.fy])
     margin = frozen_beyond * half
@@ -55,8 +55,8 @@ def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: flo
 def _from_factors(factor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Covariance entries and determinant of F Fᵀ for F [N, 2, 3].
 
-    The determinant is the sum of F's squared minors (Cauchy-Binet): unlike xx·yy - xy² it cannot turn negative when a
-    needle's axes differ by many orders of magnitude.
+    The determinant is the sum of F's squared minors (Cauchy-Binet): unlike xx·yy - xy² it cannot become negative when the
+    axes of a splat differ by many orders of magnitude.
     """
     first, second = factor.unbind(1)
     det = torch.linalg.cross(first, second).square().sum(-1)

@@ -5,25 +5,24 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# A quaternion without a component of this size is no rotation, as one of zeros is: the shorter it is the steeper is its gradient, which
-# would leave float32.
+# Quaternions whose largest component is smaller are treated as zero: the gradient grows as the norm shrinks, and would overflow float32.
 LEAST_QUATERNION = 1e-30
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Quaternions wxyz of any norm [N, 4] -> rotation matrices [N, 3, 3]; a zero quaternion is the identity."""
+    """Rotation matrices [N, 3, 3] of quaternions wxyz [N, 4] of any norm; a zero quaternion is the identity."""
     w, x, y, z = unit(quats).unbind(-1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+               2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+               2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    return torch.stack(entries, -1).unflatten(-1, (3, 3))
 
 
 def unit(quats: Tensor) -> Tensor:
-    """Quaternions of any norm [N, 4] -> of norm 1, and zeros for a zero quaternion.
+    """Normalize quaternions [N, 4]; a zero quaternion stays zero.
 
-    Divided by its largest component first, a quaternion's squares stay in range. That is taken as a constant, which is exact: the
-    result does not depend on it.
+    Each is divided by its largest component first, so that squares do not overflow. No gradient flows through that component,
+    which is exact: the result does not depend on it.
     """
     largest = quats.detach().abs().amax(-1, keepdim=True)
     zero = largest < LEAST_QUATERNION
@@ -33,10 +32,9 @@ def unit(quats: Tensor) -> Tensor:
 
 
 def unit_quaternions(quats: Tensor) -> Tensor:
-    """[N, 4] -> [N, 4] of length 1, with a finite gradient everywhere; a zero quaternion becomes the identity.
+    """Normalize quaternions [N, 4], with a finite gradient everywhere; a zero quaternion becomes the identity.
 
-    Dividing by the largest component first keeps the squares in range. It is taken as a constant, which is exact: the
-    result does not depend on it.
+    Each is divided by its largest component first, so that squares do not overflow (as in `unit`).
     """
     largest = quats.detach().abs().amax(dim=1, keepdim=True)
     is_zero = largest < torch.finfo(quats.dtype).tiny
@@ -46,7 +44,7 @@ def unit_quaternions(quats: Tensor) -> Tensor:
 
 
 def quaternions(rotation: Tensor) -> Tensor:
-    """[N, 4] wxyz of rotations [N, 3, 3], from the largest of its components (Shepperd 1978), so that nothing cancels."""
+    """Quaternions wxyz [N, 4] of rotation matrices [N, 3, 3], computed from the largest component (Shepperd 1978), so that nothing cancels."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotation.unbind(-2))
     squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], dim=1)
     w, x, y, z = squares.unbind(-1)
@@ -61,7 +59,7 @@ def quaternions(rotation: Tensor) -> Tensor:
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:
-    """[N, 4] wxyz: the rotation `second`, then `first`."""
+    """The Hamilton product of quaternions wxyz [N, 4]: the rotation `second`, then `first`."""
     w, v = first[:, :1], first[:, 1:]
     u, x = second[:, :1], second[:, 1:]
     return torch.cat([w * u - (v * x).sum(1, keepdim=True), w * x + u * v + torch.cross(v, x, dim=1)], dim=1)

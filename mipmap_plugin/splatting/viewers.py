@@ -1,8 +1,8 @@
-"""Viewers: what the programs that people look at splats with do to them, as data. A new one is one record.
+"""Viewers: the drawing conventions of the programs that show splats, as data. A new viewer is one record.
 
-Read in the sources of the versions named, which count variances in other units: where a viewer's focal length is viewport · projection, and
-so twice that of the picture, a variance of v there is v/4 px² here; where its covariances are four times as large besides, v/16. What every
-WebGL viewer has in common is `WEBGL`.
+Taken from the sources of the versions named. Units of variance differ: where a viewer's focal length is viewport · projection, twice
+that of the image, a variance of v there is v/4 px² here; where its covariances are four times as large as well, v/16. `WEBGL` is what
+all WebGL viewers have in common.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from mipmap_plugin.registry import Registry
 
 @dataclass(frozen=True)
 class Viewer:
-    """One convention of drawing: a screen filter, and what a viewer does beside it."""
+    """One drawing convention: a screen filter and further render settings."""
 
     name: str
     title: str
-    source: str  # what was read, with its version
+    source: str  # the source code this record was taken from, with its version
     screen_filter: str  # of `Effects`: "classic" dilates, "antialiased" and "mip" compensate
-    eps2d: float  # px² of the picture
+    eps2d: float  # px² of the image
     settings: RenderSettings = USUAL
-    near_plane: float | None = None  # world units; None: the page that shows the viewer decides
+    near_plane: float | None = None  # world units; None: decided by the page that embeds the viewer
     sh_degree: int = 3  # bands above it are not drawn
-    filter_3d: bool = False  # whether splats are smoothed by a column filter_3D of their file; others do not read it
-    unlike: str = ""  # what it does otherwise than this record says
+    filter_3d: bool = False  # whether the viewer reads the column filter_3D of a PLY and smooths splats by it
+    unlike: str = ""  # known differences between the viewer and this record
 
     def effects(self, effects: Effects) -> Effects:
-        """`effects`, which say what the splats are, as this viewer draws them. Where it has no near plane of its own, that of `effects` stays."""
+        """`effects` under this viewer's convention. The near plane changes only if the viewer has one."""
         near = effects.near_plane if self.near_plane is None else self.near_plane
         degree = min(effects.sh_degree, self.sh_degree)
         return replace(
@@ -39,18 +39,17 @@ class Viewer:
         )
 
 
-# Standard deviations at which viewers that draw a splat as a square of 2 by 2 with the weight exp(-r²) to r = 2 end it.
+# Standard deviations at which a splat ends in viewers that draw it as a 2 x 2 square with the weight exp(-r²) up to r = 2.
 EDGE = 8**0.5
 
-# Pictures of 8 bits, in which each splat is rounded: what adds less than half a step to them is not seen. A splat may cover a pixel wholly;
-# here the largest alpha is a little less, so that what lies behind keeps a gradient. No viewer stops at a transmittance; here one so small
-# that nobody sees it ends a pixel.
+# The frame buffer has 8 bits and is rounded after each splat, so less than half a step is invisible. In the viewers alpha may be 1; here
+# it is a little less, so that splats behind keep a gradient. The viewers have no least transmittance; here it is too small to be visible.
 WEBGL = RenderSettings(min_alpha=0.5 / 255, radius=EDGE, max_alpha=0.999, min_transmittance=1e-6, frozen_beyond=math.inf, picture_step=1 / 255)
 
-# px²: PlayCanvas and Cesium ask for half-axes of 2 half pixels: 2·sqrt(2·4·v) >= 2, v >= 1/8.
+# px²: PlayCanvas and Cesium require half-axes of 2 half pixels: 2·sqrt(2·4·v) >= 2, v >= 1/8.
 PIXEL_SIZE = 1 / 8
 
-# px²: PlayCanvas asks for opacity · 2π · sqrt(det) >= 3 in half pixels, where the determinant is 16 times as large.
+# px²: PlayCanvas requires opacity · 2π · sqrt(det) >= 3 in half pixels, where the determinant is 16 times as large.
 CONTRIBUTION = 3 / (2 * math.pi * 4)
 
 PLAYCANVAS = replace(
@@ -86,7 +85,7 @@ BUILT_IN = (
         unlike=INRIA_UNLIKE,
     ),
     Viewer(
-        # Its compensation has no least share; that of "mip" lies below its least alpha, so that nobody sees it.
+        # Its compensation has no lower bound; that of "mip" is below its least alpha, so the difference is invisible.
         "spark", "Spark (three.js)", "@sparkjsdev/spark 2.2.0, SparkRenderer, vertex and fragment shader, packSplatEncoding",
         "mip", DILATION,
         replace(
@@ -101,40 +100,40 @@ BUILT_IN = (
     Viewer(
         "playcanvas-webgpu", "PlayCanvas and SuperSplat, WebGPU", "playcanvas 2.23.3, compute-gsplat-common, gsplat-hybrid-renderer",
         "classic", DILATION / 4, replace(PLAYCANVAS, bucketed=False, boxed=True, min_contribution=CONTRIBUTION),
-        unlike="amid splats much larger than the picture it shows something else here and there, 40 dB away",
+        unlike="among splats much larger than the image some pixels differ, 40 dB in all",
     ),
     Viewer("playcanvas-aa", "PlayCanvas and SuperSplat with antiAlias", PLAYCANVAS_SOURCE, "mip", DILATION / 4, PLAYCANVAS),
     Viewer(
         "gaussian-splats-3d", "GaussianSplats3D", "@mkkellogg/gaussian-splats-3d 0.4.7, SplatMaterial3D",
         "classic", DILATION,
         replace(WEBGL, frame=1.2, max_half_axis=1024.0, least_spread=0.1**0.5, packing=replace(EIGHT_BITS, downwards=True)), sh_degree=0,
-        unlike="degree 0 is its default, and 2 what it can be asked for",
+        unlike="SH degree 0 is its default; it can draw up to degree 2",
     ),
     Viewer(
         "antimatter15", "antimatter15/splat", "antimatter15/splat ba182b5, main.js", "classic", 0.0,
         replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS), sh_degree=0,
-        unlike="covariances are kept in float16; not compared with a picture",
+        unlike="covariances are stored in float16; not compared with its images",
     ),
     Viewer(
         "cesium", "Cesium", "@cesium/engine 24.0.0, PrimitiveGaussianSplat shaders; cesium-wasm-utils, wasm-splats", "classic", DILATION / 16,
         replace(WEBGL, frame=1.2, min_variance=PIXEL_SIZE, packing=EIGHT_BITS),
-        unlike="a splat ends at a square instead of an ellipse, and covariances are kept in float16; not compared with a picture",
+        unlike="a splat ends at a square instead of an ellipse, and covariances are stored in float16; not compared with its images",
     ),
     Viewer(
         "babylon", "Babylon.js", "@babylonjs/core 9.34.0, gaussianSplatting shaders, GaussianSplattingMaterial", "classic", DILATION / 4,
         replace(WEBGL, frame=1.2, packing=EIGHT_BITS),
-        unlike="covariances are kept in float16 and coefficients in 8 bits; not compared with a picture",
+        unlike="covariances are stored in float16 and SH coefficients in 8 bits; not compared with its images",
     ),
     Viewer(
         "unity", "UnityGaussianSplatting (aras-p)", "UnityGaussianSplatting 1.1.1 (2c6fed3), RenderGaussianSplats, GaussianSplatting.hlsl",
         "classic", DILATION, replace(WEBGL, min_alpha=1 / 255, frozen_beyond=FRUSTUM_MARGIN, picture_step=None),
-        unlike="a splat ends at a square instead of an ellipse, and assets are packed as coarsely as they were asked to be; "
-        "not compared with a picture",
+        unlike="a splat ends at a square instead of an ellipse, and assets are packed at the quality chosen on import; "
+        "not compared with its images",
     ),
     Viewer(
         "brush", "Brush", "brush 8b7f5c6c, brush-render, for a file without SplatRenderMode mip", "classic", DILATION,
-        RenderSettings(max_alpha=0.999), near_plane=0.01, sh_degree=4, unlike="of a file with SplatRenderMode mip it is mip; "
-        "not compared with a picture",
+        RenderSettings(max_alpha=0.999), near_plane=0.01, sh_degree=4, unlike="a file with SplatRenderMode mip is drawn as mip; "
+        "not compared with its images",
     ),
 )  # fmt: skip
 
@@ -144,8 +143,8 @@ VIEWERS = Registry("mipmap_plugin.viewers", {})
 
 
 def register_viewer(name: str, viewer: Viewer | tuple[str, ...] | str, *, replace: bool = False) -> None:
-    """Add a viewer under `name`: a record, or `"package.module:RECORD"` that is imported at first use; or the names of several registered
-    ones, which a file can be for at once."""
+    """Register a viewer under `name`: a record, or `"package.module:RECORD"`, which is imported at first use; or a group, given by the
+    names of registered viewers, that one file has to suit."""
     VIEWERS.add(name, viewer, replace=replace)
 
 
@@ -157,23 +156,23 @@ register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN))
 
 
 def viewers_for(name: str) -> tuple[str, ...]:
-    """The viewers that a file made for `name` has to be right in: that one, or those that it stands for.
+    """The names of the viewers that a file for `name` has to suit: `name` itself, or the members of a group.
 
-    Raises SettingsError when unknown, PluginError for several that are no names.
+    Raises SettingsError for an unknown viewer, PluginError for a group that is not made of names.
     """
     viewer = VIEWERS.get(name)
     if not isinstance(viewer, tuple):
         return (name,)
-    if not viewer or not all(isinstance(each, str) for each in viewer):
-        raise PluginError(f"viewer {name!r} stands for {viewer!r}; it has to be the names of registered viewers")
+    if not viewer or not all(isinstance(member, str) for member in viewer):
+        raise PluginError(f"viewer group {name!r} must contain names of registered viewers, got {viewer!r}")
     return viewer
 
 
 def find_viewer(name: str) -> Viewer:
-    """The viewer `name`. Raises SettingsError when unknown or several, PluginError when it is no record of a viewer."""
+    """The viewer `name`. Raises SettingsError if it is unknown or a group, PluginError if its target is not a `Viewer`."""
     viewer = VIEWERS.get(name)
     if isinstance(viewer, tuple):
-        raise SettingsError(f"{name} is not one viewer but several, which draw a file differently; name one: {', '.join(viewers_for(name))}")
+        raise SettingsError(f"{name} is a group of viewers, which draw a file differently; name one of them: {', '.join(viewers_for(name))}")
     if not isinstance(viewer, Viewer):
-        raise PluginError(f"viewer {name!r} is a {type(viewer).__name__}; it has to be a mipmap_plugin.splatting.viewers.Viewer")
+        raise PluginError(f"viewer {name!r} must be a mipmap_plugin.splatting.viewers.Viewer, got {type(viewer).__name__}")
     return viewer

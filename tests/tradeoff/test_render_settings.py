@@ -66,7 +66,7 @@ def test_gradients_are_of_what_is_drawn():
 def test_a_backend_whose_cut_offs_are_fixed_says_so():
     splats = samples.gaussians(3, dtype=torch.float32)
     needs = Needs.of(splats, Effects(1, settings=RenderSettings(radius=3.0, tile=8)), gradients=False)
-    assert "it does not have other tiles, which the reference backend has" in CpuBackend().lacking(needs)
+    assert "it does not support another tile size, which the reference backend does" in CpuBackend().lacking(needs)
     assert not BACKEND.lacking(needs)
     usual = Needs.of(splats, Effects(1), gradients=False)
     assert not [reason for reason in CpuBackend().lacking(usual) if "reference" in reason]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.optimizer import change_rows
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -57,7 +58,7 @@ class ScreenGradients:
         return self.total / self.seen.clamp_min(1)
 
 
-def prune(model: SplatModel, optimizer: torch.optim.Adam, keep: Tensor) -> None:
+def prune(model: SplatModel, optimizer: Adam, keep: Tensor) -> None:
     """Drop the rows where `keep` [N] is False; the last splat stays, for an empty model has no gradient to come back by."""
     if keep.all():
         return
@@ -76,7 +77,7 @@ def strongest(gradients: Tensor, least: float, most: int) -> Tensor:
 
 
 def clone_and_split(
-    model: SplatModel, optimizer: torch.optim.Adam, grown: Tensor, extent: float, shown: Gaussians, generator: torch.Generator
+    model: SplatModel, optimizer: Adam, grown: Tensor, extent: float, shown: Gaussians, generator: torch.Generator
 ) -> None:
     """Clone the small and split the large among the rows where `grown` [N] is True. `shown`: the model's activated splats.
 
@@ -96,7 +97,7 @@ def clone_and_split(
     _grow(model, optimizer, ~(grown & large), parents, _in_world(offsets, shown.quats[parents]), shape)
 
 
-def halve(model: SplatModel, optimizer: torch.optim.Adam, grown: Tensor, shown: Gaussians) -> None:
+def halve(model: SplatModel, optimizer: Adam, grown: Tensor, shown: Gaussians) -> None:
     """Split the rows where `grown` [N] is True in two along their longest axis, so that they show almost what they did.
 
     In one place, two of opacity b and size s have the light of one of opacity a and size 1 where s² (2b - b²/2) = a. Of all such
@@ -129,7 +130,7 @@ def _in_world(offsets: Tensor, quats: Tensor) -> Tensor:
 
 
 def _grow(
-    model: SplatModel, optimizer: torch.optim.Adam, kept: Tensor, parents: Tensor, offsets: Tensor, shape: Callable[[str, Tensor], None]
+    model: SplatModel, optimizer: Adam, kept: Tensor, parents: Tensor, offsets: Tensor, shape: Callable[[str, Tensor], None]
 ) -> None:
     """Leave the rows that are `kept` [N], and add a child of each of the `parents` [M], `offsets` [M, 3] away.
 
@@ -150,7 +151,7 @@ def _grow(
     change_rows(model, optimizer, rebuild, lambda old: old[rows].masked_fill(fresh.view(-1, *[1] * (old.dim() - 1)), 0.0))
 
 
-def reset_opacities(optimizer: torch.optim.Adam) -> None:
+def reset_opacities(optimizer: Adam) -> None:
     """Cut every opacity logit to at most that of 0.01, and forget its moments."""
     for group in optimizer.param_groups:
         if group["name"] == "opacities":

@@ -14,10 +14,13 @@ from mipmap_plugin.adaptation.optimization.growing import control_density, judge
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.optimizer import set_rates, take_back
 from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.small import most_threads
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.adaptation.views import Order
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.threads import side_by_side
 
 # Of a mean square difference: half a step of an 8-bit image, squared. What is closer than a display can show counts no more.
 UNSEEN = (0.5 / 255) ** 2
@@ -60,30 +63,44 @@ def is_checked(step: int, config: AdaptConfig) -> bool:
     return step % (config.check_every if step >= rising else max(1, min(config.check_every, rising // CHECKS_RISING))) == 0 or step == config.steps
 
 
+# Shown in docs/how_it_works.md, up to the next such line.
+# --8<-- [start:step]
+
+
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
     now = run.progress(config)
     set_rates(run.optimizer, config, now, run.steering.boldness(now, config), still=still(run))
     splats = Activation(run.student, share=len(views) > 1)
-    before: Tensor | float = 0.0  # the gradient of the means from the views before this one
-    for nth, view in enumerate(views, run.step * config.views_per_step):
-        camera = cameras[view]
+    splats.activate(cameras[views[0]])
+
+    def compare(place: tuple[int, Camera]) -> tuple[Gaussians, Camera, Tensor]:
+        nth, view = place
+        seen, camera = splats(cameras[view]), cameras[view]
         target = task.truth(view)  # r(x̂): the frozen base, resized
-        image = task.drawn(nth)(splats(camera), camera)  # x: the student at the new scale
+        image = task.drawn(nth)(seen, camera)  # x: the student at the new scale
         difference = difference_from(target, image, config.resize)
         loss = _loss(difference, config.loss)
         (loss if task.detail is None else loss + task.detail(view, image)).backward()
-        run.square_error = run.square_error + difference.detach().square().mean().double() / len(views)
-        if run.gradients is not None and splats.means.grad is not None:
-            run.gradients.add(splats.means, splats.means.grad - before, camera)
-            before = splats.means.grad.clone()
+        return seen, camera, difference.detach().square().mean()
+
+    places = list(enumerate(views, run.step * config.views_per_step))
+    at_once = most_threads(run.student.parameters()["means"], cameras[views[0]]) if splats.shares else 1
+    for seen, camera, square in side_by_side(compare, places, at_once):
+        run.square_error = run.square_error + square.double() / len(views)
+        splats.gather(seen)
+        if run.gradients is not None:
+            run.gradients.add(*splats.of_means(seen), camera)
     splats.backward()
     run.optimizer.step()
     run.optimizer.zero_grad()
     run.step += 1
     if run.step % config.prune_every == 0 and run.step < config.steps:
         control_density(run, task, config)
+
+
+# --8<-- [end:step]
 
 
 def _loss(difference: Tensor, name: str) -> Tensor:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import CARRIED, SplatModel
@@ -15,22 +16,18 @@ from mipmap_plugin.models.base import CARRIED, SplatModel
 # INRIA's: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
 ADAM_EPS = 1e-15
 
-# From this version on torch has all of a step in one kernel for processors too.
-FUSED = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 4)
 
-
-def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> torch.optim.Adam:
+def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> Adam:
     """One group per parameter that moves; that of means is in pixels of `pixel` world units."""
     rates = {**config.rates.model_dump(), CARRIED: 0.0}
     rates["means"] *= pixel
     groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]
     if shared := list(model.shared_parameters().values()):
         groups.append({"params": shared, "lr": rates["networks"], "base_lr": rates["networks"], "name": "networks"})
-    fused = FUSED or all(tensor.is_cuda for group in groups for tensor in group["params"])
-    return torch.optim.Adam(groups, betas=config.betas, eps=ADAM_EPS, fused=fused)
+    return Adam(groups, betas=config.betas, eps=ADAM_EPS)
 
 
-def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float, boldness: float, still: Collection[str] = ()) -> None:
+def set_rates(optimizer: Adam, config: AdaptConfig, progress: float, boldness: float, still: Collection[str] = ()) -> None:
     """Each rate at `progress` (0..1) of its fall, which is half a cosine (Loshchilov and Hutter 2017, SGDR, equation 5), times `boldness`.
 
     The groups in `still` stand.
@@ -40,7 +37,7 @@ def set_rates(optimizer: torch.optim.Adam, config: AdaptConfig, progress: float,
         group["lr"] = 0.0 if group["name"] in still else group["base_lr"] * share
 
 
-def take_back(model: SplatModel, optimizer: torch.optim.Adam, snapshot: Snapshot) -> None:
+def take_back(model: SplatModel, optimizer: Adam, snapshot: Snapshot) -> None:
     """Let the model hold the snapshot, in its own leaves where it has as many rows; Adam begins anew."""
     if len(model.parameters()["means"]) != len(snapshot.rows["means"]):
         put_back(model, optimizer, snapshot.rows)
@@ -48,7 +45,7 @@ def take_back(model: SplatModel, optimizer: torch.optim.Adam, snapshot: Snapshot
     optimizer.state.clear()
 
 
-def put_back(model: SplatModel, optimizer: torch.optim.Adam, before: Mapping[str, Tensor]) -> None:
+def put_back(model: SplatModel, optimizer: Adam, before: Mapping[str, Tensor]) -> None:
     """Let the model hold the parameters that it had `before`; for them Adam begins anew.
 
     Moments at 0 whose steps went on being counted would make the first step three times too long.
@@ -59,7 +56,7 @@ def put_back(model: SplatModel, optimizer: torch.optim.Adam, before: Mapping[str
 
 
 def change_rows(
-    model: SplatModel, optimizer: torch.optim.Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
+    model: SplatModel, optimizer: Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
 ) -> None:
     """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in model and optimizer alike."""
     fresh, moves = {}, {}

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
+from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
@@ -79,7 +80,7 @@ class Run:
     """Where a run stands: all that is needed to go on with it."""
 
     student: SplatModel
-    optimizer: torch.optim.Adam
+    optimizer: Adam
     watch: Stopwatch
     gradients: ScreenGradients | None  # None: nothing is cloned or split (any more), so nobody asks for them
     steering: Steering

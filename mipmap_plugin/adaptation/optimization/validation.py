@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
+from mipmap_plugin.adaptation.small import most_threads
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import Camera, evenly
@@ -22,6 +23,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes.trajectories import jittered
+from mipmap_plugin.threads import side_by_side
 
 # Of the given cameras one in so many may be kept back for validation, where a policy leaves the choice of views to us.
 KEPT_BACK = 16
@@ -67,12 +69,13 @@ class Validation:
 
     @torch.no_grad()
     def _decibels(self, render: Callable[[Gaussians, Camera], Tensor], model: SplatModel, views: Sequence[Camera]) -> float:
-        total = 0.0
-        for view in views:
+        def of_view(view: Camera) -> float:
             camera = view.zoomed(self.scale)
             image = render(model.gaussians(camera), camera).clamp(0, 1)
-            total += decibel(float(difference_from(self.truth(view), image, self.resize).square().mean()))
-        return total / max(1, len(views))
+            return decibel(float(difference_from(self.truth(view), image, self.resize).square().mean()))
+
+        at_once = most_threads(model.parameters()["means"], views[0].zoomed(self.scale)) if views else 1
+        return sum(side_by_side(of_view, views, at_once)) / max(1, len(views))
 
     def steer(self, model: SplatModel) -> float:
         """Of the mean square over viewers, in which the worst weighs most. The worst alone falls now and then while all come closer, and

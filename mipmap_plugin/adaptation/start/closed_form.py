@@ -35,7 +35,7 @@ from mipmap_plugin.adaptation.start.surfel_form import lay_out, least_sizes, sho
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.filters import INTEGRALS, SQUARE_VARIANCE, footprint, keeps_light, widening
+from mipmap_plugin.splatting.filters import INTEGRALS, SQUARE_VARIANCE, compensates, footprint, widening
 from mipmap_plugin.splatting.projection import Projected, project
 
 # Target pixels: how thin an axis may become. It is 1/50 of the classic dilation's width, so nobody sees it, and its log is finite.
@@ -77,16 +77,16 @@ def closed_form(
     averaged = _averaged(base, form.crispness) if scale > 1 else 0.0
     wide = gaussians.scales.square() + ((_width(base) - averaged) * base_pixel**2)[:, None]
     narrow = (wide - ((_width(target) - averaged) * target_pixel**2)[:, None]).clamp_min(0)
-    if keeps_light(target.screen_filter):  # an area may become smaller by as much as the opacity can rise
+    if compensates(target.screen_filter):  # an area may become smaller by as much as the opacity can rise
         narrow = narrow.maximum(gaussians.opacities[:, None] * wide)
     thinnest = torch.full_like(narrow, THINNEST**2).scatter(1, wide.topk(2, dim=1).indices, max(THINNEST**2, _least_variance(target)))
     scales = narrow.maximum(thinnest * target_pixel[:, None].square()).sqrt()
     new = replace(gaussians, scales=scales)
     opacities = gaussians.opacities * _light(gaussians, views, base)
     # A splat of no size of its own rises most; a view from afar, in which every splat has none, must not raise it further.
-    most = _width(base) / (_width(base) - averaged + averaged / scale**2) if averaged else torch.inf if keeps_light(target.screen_filter) else 1.0
+    most = _width(base) / (_width(base) - averaged + averaged / scale**2) if averaged else torch.inf if compensates(target.screen_filter) else 1.0
     areas = _area_ratio(gaussians, new, views, scale, (base, target), most)
-    opacities = opacities * areas ** (form.area_power if scale <= 1 and not keeps_light(target.screen_filter) else 1.0)
+    opacities = opacities * areas ** (form.area_power if scale <= 1 and not compensates(target.screen_filter) else 1.0)
     # What the target's renderer takes off by itself is added before.
     return scales, (opacities / _light(new, [view.zoomed(scale) for view in views], target)).clamp_max(1)
 
@@ -96,7 +96,7 @@ def needs_nothing(scale: float, base: Effects, target: Effects) -> bool:
     same = (base.screen_filter, base.eps2d) == (target.screen_filter, target.eps2d)
     if target.screen_filter == SURFEL or (not same and target.screen_filter not in INTEGRALS):
         return False
-    return keeps_light(target.screen_filter) and keeps_light(base.screen_filter)
+    return compensates(target.screen_filter) and compensates(base.screen_filter)
 
 
 def _of_surfels(
@@ -160,7 +160,7 @@ def _averaged(base: Effects, crispness: float) -> float:
 
 def _light(gaussians: Gaussians, views: Sequence[Camera], effects: Effects) -> Tensor | float:
     """[N], at most 1: the share of its opacity that the screen filter leaves to a splat."""
-    if not keeps_light(effects.screen_filter):
+    if not compensates(effects.screen_filter):
         return 1.0
     # An integral over the pixel dims as a Gaussian of the pixel's variance does.
     name = "mip" if effects.screen_filter in INTEGRALS else effects.screen_filter

@@ -1,7 +1,7 @@
 """Conformance: hard cases on which every backend must equal the float64 reference.
 
-`check_backend` gives one `Outcome` a case; `MORE` are random scenes, which take some minutes. Authors of a backend subclass `BackendSuite`
-(in `.suite`, which needs pytest) in a test file.
+`check_backend` returns one `Outcome` per case; the random scenes in `MORE` take some minutes. Authors of a backend subclass
+`BackendSuite` (in `.suite`, which needs pytest) in a test file.
 """
 
 from mipmap_plugin.backends.conformance.cases import CASES, MORE, Builder, HardCase

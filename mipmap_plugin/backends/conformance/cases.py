@@ -1,4 +1,4 @@
-"""The hard cases, as a table: name -> a builder of Gaussians in float64, a camera and effects."""
+"""The table of hard cases: name -> function that builds Gaussians in float64, a camera and effects."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mipmap_plugin.splatting.filters import USUAL_EPS2D
 from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.splatting.viewers import BUILT_IN, Viewer
 
-NEAR = 0.25  # world units; unlike 0.2 the same number in float32, so that "on the near plane" means one thing
+NEAR = 0.25  # world units; unlike 0.2 exact in float32, so that "on the near plane" is unambiguous
 
 
 class HardCase(NamedTuple):
-    """What a backend is asked to render."""
+    """A scene for a backend to render."""
 
     gaussians: Gaussians  # float64
     camera: Camera
@@ -34,7 +34,7 @@ Builder = Callable[[], HardCase]
 
 
 def view(width: int = 24, height: int = 18, *, cx: float | None = None, turned: bool = False) -> Camera:
-    """From the origin along +z with fx != fy. Not turned, a splat's depth is its z, bit by bit."""
+    """A camera at the origin that looks along +z, with fx != fy. Unless `turned`, a splat's depth equals its z exactly."""
     viewmat = torch.eye(4, dtype=torch.float64)
     if turned:
         viewmat[:3, :3] = rotations(torch.tensor([[1.0, 0.03, -0.06, 0.1]], dtype=torch.float64))[0]
@@ -43,45 +43,48 @@ def view(width: int = 24, height: int = 18, *, cx: float | None = None, turned: 
 
 
 def crowd(n: int = 12, degree: int = 1, seed: int = 0) -> Gaussians:
-    """Ordinary splats in front of `view()`, a few beside it; faint to nearly opaque, no two axes of the same length."""
+    """Ordinary splats in front of `view()`, a few outside its image; faint to nearly opaque, no two axes of the same length."""
     rng = torch.Generator().manual_seed(seed)
-    spread = partial(torch.rand, generator=rng, dtype=torch.float64)
-    means = (spread(n, 3) - 0.5) * torch.tensor([3.0, 2.4, 3.0]) + torch.tensor([0.0, 0.0, 3.0])
-    scales = 0.02 + 0.3 * spread(n, 3) ** 2
-    return Gaussians(means, spread(n, 4) - 0.5, scales, 0.05 + 0.9 * spread(n), spread(n, (degree + 1) ** 2, 3) - 0.3)
+    rand = partial(torch.rand, generator=rng, dtype=torch.float64)
+    means = (rand(n, 3) - 0.5) * torch.tensor([3.0, 2.4, 3.0]) + torch.tensor([0.0, 0.0, 3.0])
+    scales = 0.02 + 0.3 * rand(n, 3) ** 2
+    return Gaussians(means, rand(n, 4) - 0.5, scales, 0.05 + 0.9 * rand(n), rand(n, (degree + 1) ** 2, 3) - 0.3)
 
 
 def covariances(gaussians: Gaussians) -> Tensor:
-    """[N, 3, 3], the same shapes as the quaternions and scales."""
+    """The covariances [N, 3, 3] of the quaternions and scales."""
     factor = rotations(gaussians.quats) * gaussians.scales[:, None, :]
     return factor @ factor.mT
 
 
 def odd_row(row: dict[str, Tensor], screen_filter: str = "classic") -> HardCase:
-    """A crowd in which one splat is the hard one: what it does to itself, and to the others."""
+    """A crowd in which the values `row` make one splat hard; the others show whether it harms them."""
     gaussians = crowd()
     row = {**_row(means=(0.1, 0.05, 2.5)), **row}
-    held = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
-    held = {name: tensor if name not in row else tensor.index_put((torch.tensor(5),), row[name]) for name, tensor in held.items()}
-    return HardCase(Gaussians(**held), view(), Effects(1, screen_filter, USUAL_EPS2D[screen_filter], near_plane=NEAR))
+    tensors = {f.name: getattr(gaussians, f.name) for f in fields(gaussians)}
+    tensors = {name: tensor if name not in row else tensor.index_put((torch.tensor(5),), row[name]) for name, tensor in tensors.items()}
+    return HardCase(Gaussians(**tensors), view(), Effects(1, screen_filter, USUAL_EPS2D[screen_filter], near_plane=NEAR))
 
 
 def seen_by(camera: Camera, screen_filter: str = "classic") -> HardCase:
+    """A crowd in front of `camera`."""
     return HardCase(crowd(), camera, Effects(1, screen_filter, background=(0.2, 0.5, 0.9)))
 
 
 def of_degree(degree: int, evaluated: int) -> HardCase:
+    """Coefficients of SH `degree`, of which the bands up to `evaluated` are rendered."""
     return HardCase(crowd(degree=degree), view(turned=True), Effects(evaluated))
 
 
 def random_scene(seed: int, screen_filter: str, eps2d: float, degree: int = 3) -> HardCase:
+    """120 ordinary splats on white."""
     return HardCase(crowd(120, degree, seed), view(40, 32, turned=True), Effects(degree, screen_filter, eps2d, (1.0, 1.0, 1.0)))
 
 
 def seen_in(viewer: Viewer, seed: int) -> HardCase:
-    """Splats from a twentieth of a pixel to some pixels, so that each of a viewer's rules takes some and leaves some.
+    """Splats from a twentieth of a pixel to several pixels, so that each of a viewer's rules applies to some and not to others.
 
-    The picture is not rounded: in another precision rounding falls to the other side here and there, and a pixel moves by a step.
+    The image is not rounded: in another precision some values would be rounded the other way, and pixels would differ by a step.
     """
     gaussians = crowd(120, 3, seed)
     sizes = 0.02 + 0.4 * torch.rand(120, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 2
@@ -90,6 +93,7 @@ def seen_in(viewer: Viewer, seed: int) -> HardCase:
 
 
 def odd_row_seen_in(viewer: Viewer, row: dict[str, Tensor]) -> HardCase:
+    """`odd_row` in a viewer."""
     case = odd_row(row)
     return case._replace(effects=_unrounded(viewer.effects(case.effects)))
 
@@ -99,51 +103,54 @@ def _unrounded(effects: Effects) -> Effects:
 
 
 def in_a_rounded_picture() -> HardCase:
+    """A crowd in an image that is rounded to 8 bits after each splat."""
     settings = RenderSettings(picture_step=1 / 255, min_alpha=0.5 / 255, max_alpha=0.999, min_transmittance=1e-6)
     return HardCase(crowd(), view(), Effects(1, background=(0.2, 0.5, 0.9), settings=settings))
 
 
 def ruled(rule: RenderSettings, seed: int = 1) -> HardCase:
-    """One rule alone, hard enough that it takes many splats."""
+    """A single rule, strict enough that it affects many splats."""
     case = random_scene(seed, "classic", DILATION)
     return case._replace(effects=replace(case.effects, settings=rule))
 
 
 def in_buckets() -> HardCase:
-    """A splat so large, behind the camera, that the depths of the others share few buckets."""
+    """A splat behind the camera, so large that the depths of all others share few buckets."""
     case = random_scene(1, "classic", DILATION)
     first = torch.tensor(0)
     rows = {name: getattr(case.gaussians, name).index_put((first,), value) for name, value in _row(means=(0.0, 0.0, -5.0), scales=1e3).items()}
     return HardCase(replace(case.gaussians, **rows), case.camera, replace(case.effects, settings=RenderSettings(bucketed=True)))
 
 
-def covariances_given(screen_filter: str, broken: bool = False) -> HardCase:
+def with_covariances(screen_filter: str, broken: bool = False) -> HardCase:
+    """A crowd with covariances in place of quaternions and scales. `broken`: one of them contains NaN."""
     gaussians = crowd()
-    given = covariances(gaussians)
+    matrices = covariances(gaussians)
     if broken:
-        given[5, 0, 0] = math.nan
-    return HardCase(replace(gaussians, covariances=given), view(turned=True), Effects(1, screen_filter, USUAL_EPS2D[screen_filter]))
+        matrices[5, 0, 0] = math.nan
+    return HardCase(replace(gaussians, covariances=matrices), view(turned=True), Effects(1, screen_filter, USUAL_EPS2D[screen_filter]))
 
 
 def none_drawn(n: int) -> HardCase:
-    """No splat at all, or all of them behind the camera: the background, and a gradient that is 0."""
+    """No splats, or only splats behind the camera: the background, with a gradient of 0."""
     gaussians = crowd(max(n, 1))
     return HardCase(replace(gaussians, means=-gaussians.means)[torch.arange(n)], view(), Effects(1, background=(1.0, 1.0, 1.0)))
 
 
-def first_of_the_crowd(rows: list[int]) -> HardCase:
+def rows_of_the_crowd(rows: list[int]) -> HardCase:
+    """The splats `rows` of a crowd."""
     return HardCase(crowd()[torch.tensor(rows)], view(), Effects(1))
 
 
 def at_one_depth(n: int = 10_000) -> HardCase:
-    """Ties: the splat with the lower index is in front."""
+    """Ties in depth: the splat with the lower index is in front."""
     gaussians = crowd(n)
     gaussians.means[:, 2] = 3
     return HardCase(replace(gaussians, scales=gaussians.scales / 4), view(), Effects(1))
 
 
 def in_one_pixel(n: int = 10_000) -> HardCase:
-    """Opaque specks, one behind the other, each somewhere in the same pixel."""
+    """Tiny opaque splats, one behind the other, all in the same pixel."""
     gaussians = crowd(n)
     camera = view(16, 16)
     depths = 1 + torch.arange(n, dtype=torch.float64) / n
@@ -154,7 +161,7 @@ def in_one_pixel(n: int = 10_000) -> HardCase:
 
 
 def far_from_the_origin(shift: float = 1e6, size: float = 64.0) -> HardCase:
-    """A world so far out that float32 knows its places to 1/16 unit: eye and splats must be subtracted before anything else."""
+    """A scene so far from the origin that float32 resolves only 1/16 unit: the eye must be subtracted before any other operation."""
     gaussians, camera = crowd(), view(turned=True)
     eye = torch.full((3,), shift, dtype=torch.float64)
     viewmat = camera.viewmat.clone()
@@ -164,13 +171,13 @@ def far_from_the_origin(shift: float = 1e6, size: float = 64.0) -> HardCase:
 
 
 def long_lens(seed: int, screen_filter: str, focal: float = 171_310.0) -> HardCase:
-    """One splat through a telescope, 10 to 10,000 px long along each of its axes: it hardly changes over the image."""
+    """One splat through a telephoto lens, 10 to 10,000 px long along each of its axes, so that it hardly varies over the image."""
     rng = torch.Generator().manual_seed(seed)
-    spread = partial(torch.rand, generator=rng, dtype=torch.float64)
+    rand = partial(torch.rand, generator=rng, dtype=torch.float64)
     camera = replace(view(), fx=focal, fy=0.9 * focal)
     pixel = 3 / focal
-    means = torch.cat([(spread(1, 2) - 0.5) * 18 * pixel, torch.full((1, 1), 3.0)], 1)
-    splat = Gaussians(means, spread(1, 4) - 0.5, 10 ** (1 + 3 * spread(1, 3)) * pixel, 0.3 + 0.5 * spread(1), spread(1, 4, 3) - 0.3)
+    means = torch.cat([(rand(1, 2) - 0.5) * 18 * pixel, torch.full((1, 1), 3.0)], 1)
+    splat = Gaussians(means, rand(1, 4) - 0.5, 10 ** (1 + 3 * rand(1, 3)) * pixel, 0.3 + 0.5 * rand(1), rand(1, 4, 3) - 0.3)
     return HardCase(splat, camera, Effects(1, screen_filter, USUAL_EPS2D[screen_filter]))
 
 
@@ -179,9 +186,9 @@ def _row(**values: tuple[float, ...] | float) -> dict[str, Tensor]:
 
 
 TURN = (0.8, 0.1, -0.3, 0.5)  # an ordinary quaternion, almost of norm 1
-WIDE = (0.9, 0.7, 0.5)  # many pixels lie so near the center that an opaque splat's alpha is cut off at 0.99 there
+WIDE = (0.9, 0.7, 0.5)  # large enough that an opaque splat's alpha is clamped at 0.99 on many pixels around its center
 
-# One splat of a crowd. Near plane: NEAR. Eye: the origin.
+# Values of one splat in a crowd. The near plane is NEAR, the eye is the origin.
 ROWS = {
     "on-the-near-plane": _row(means=(0.02, 0.01, NEAR), scales=(0.05, 0.04, 0.03)),
     "just-in-front-of-the-near-plane": _row(means=(0.02, 0.01, NEAR + 1e-6), scales=(0.05, 0.04, 0.03)),
@@ -192,7 +199,7 @@ ROWS = {
     "in-the-eye": _row(means=(0.0, 0.0, 0.0)),
     "center-off-screen-body-on": _row(means=(-1.9, 0.1, 3.0), scales=(0.6, 0.3, 0.2)),
     "center-beyond-the-frustum-body-on": _row(means=(4.0, 2.5, 3.0), scales=(1.9, 1.4, 1.2)),
-    "1e25-units-aside": _row(means=(1e25, 0.05, 2.5)),  # further than integers count
+    "1e25-units-aside": _row(means=(1e25, 0.05, 2.5)),  # overflows integers
     "1e6-units-ahead": _row(means=(3e4, 2e4, 1e6), scales=(1e5, 7e4, 5e4)),
     "scale-0-on-one-axis": _row(scales=(0.3, 0.2, 0.0)),
     "scale-0-on-two-axes": _row(scales=(0.3, 0.0, 0.0)),
@@ -217,7 +224,7 @@ ROWS = {
     "negative-color": _row(sh=-1e3),
     "saturated-color": _row(sh=1e3),
 }
-# Of these, what viewers' rules have to bear too.
+# Those of ROWS that are rendered in viewers too.
 ODD_IN_VIEWERS = ("scale-0-on-one-axis", "scale-0-on-three-axes", "scale-1e4", "needle-1e12", "quaternion-0", "opacity-0", "opacity-1")
 CAMERAS = {
     "image-1x1": view(1, 1),
@@ -234,8 +241,8 @@ BAD = (math.nan, math.inf)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 FILTERS = ("classic", "antialiased", "mip", "analytic", "window")
 
-# Viewers that do more than dilate and compensate.
-OTHERS = tuple(viewer for viewer in BUILT_IN if viewer.settings != USUAL)
+# Viewers with render settings of their own.
+WITH_SETTINGS = tuple(viewer for viewer in BUILT_IN if viewer.settings != USUAL)
 RULES = {
     "radius": RenderSettings(radius=2.0),
     "faint-and-transparent": RenderSettings(min_alpha=0.02, min_transmittance=0.1, max_alpha=0.8),
@@ -257,8 +264,8 @@ CASES: dict[str, Builder] = {
     **{f"{bad}-in-{field}-{kind}": partial(odd_row, _row(**{field: bad}), kind) for field, bad, kind in product(FIELDS, BAD, FILTERS)},
     "no-splat": partial(none_drawn, 0),
     "no-splat-in-view": partial(none_drawn, 5),
-    "one-splat": partial(first_of_the_crowd, [4]),
-    "identical-splats": partial(first_of_the_crowd, [4, 4, 4]),
+    "one-splat": partial(rows_of_the_crowd, [4]),
+    "identical-splats": partial(rows_of_the_crowd, [4, 4, 4]),
     "10000-at-one-depth": at_one_depth,
     "10000-opaque-in-one-pixel": in_one_pixel,
     "1e6-units-from-the-origin": far_from_the_origin,
@@ -267,24 +274,24 @@ CASES: dict[str, Builder] = {
     **{f"long-lens-{seed}-window": partial(long_lens, seed, "window") for seed in (35, 48)},
     **{f"sh-degree-{degree}": partial(of_degree, degree, degree) for degree in range(5)},
     "sh-bands-left-out": partial(of_degree, 3, 1),
-    **{f"covariances-{kind}": partial(covariances_given, kind) for kind in FILTERS},
+    **{f"covariances-{kind}": partial(with_covariances, kind) for kind in FILTERS},
     **{f"{viewer.name}-{seed}": partial(seen_in, viewer, seed) for viewer, seed in product(BUILT_IN, (1, 2))},
     **{
         f"{name}-{viewer.name}": partial(odd_row_seen_in, viewer, ROWS[name])
-        for name, viewer in product(ODD_IN_VIEWERS, OTHERS)
+        for name, viewer in product(ODD_IN_VIEWERS, WITH_SETTINGS)
         if viewer.eps2d or not name.startswith("needle")  # without any dilation its width is lost in float32
     },
     "rule-rounded-picture": in_a_rounded_picture,
     "rule-buckets": in_buckets,
     **{f"rule-{name}": partial(ruled, rule) for name, rule in RULES.items()},
-    "nan-in-covariances": partial(covariances_given, "classic", broken=True),
+    "nan-in-covariances": partial(with_covariances, "classic", broken=True),
     **{
         f"random-{seed}-{kind}-{eps2d:.2g}": partial(random_scene, seed, kind, eps2d)
         for seed, kind, eps2d in product((1, 2), FILTERS, (DILATION, DILATION / 64))
     },
 }
 
-# What is looked at where there is time.
+# Further cases, which take some minutes.
 MORE: dict[str, Builder] = {
     **{f"random-{seed}-{kind}": partial(random_scene, seed, kind, USUAL_EPS2D[kind]) for seed, kind in product(range(3, 43), FILTERS)},
     **{f"long-lens-{seed}-window": partial(long_lens, seed, "window") for seed in range(100) if f"long-lens-{seed}-window" not in CASES},

@@ -1,4 +1,4 @@
-"""A pytest suite for the authors of backends. This module alone needs pytest."""
+"""A pytest suite for the authors of backends. Only this module needs pytest."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mipmap_plugin.backends.conformance.checks import check_case
 
 
 class BackendSuite:
-    """Subclass it in a test file, and pytest checks your backend against the reference::
+    """Subclass it in a test file, and pytest compares your backend with the reference::
 
         class TestMine(BackendSuite):
             backend = MyBackend()
@@ -21,12 +21,12 @@ class BackendSuite:
     dtype: torch.dtype = torch.float32
     device: str = "cpu"
 
-    def test_declares_itself(self):
+    def test_declares_itself(self) -> None:
         assert self.backend.name and isinstance(self.backend.speed, int)
         assert self.backend.api_version == API_VERSION
 
     @pytest.mark.parametrize("case", CASES)
-    def test_equals_the_reference(self, case):
+    def test_equals_the_reference(self, case: str) -> None:
         outcome = check_case(self.backend, case, CASES[case], dtype=self.dtype, device=self.device)
         if outcome.skipped:
             pytest.skip(outcome.message)

@@ -13,7 +13,7 @@ from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL, OV
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.splatting.filters import LEAST_LIGHT, w_end
+from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, w_end
 
 SAMPLING = {"analytic": OVER_PIXEL, "window": OVER_WINDOW}
 
@@ -102,7 +102,7 @@ def view_of(camera: Camera, effects: Effects, splats: SplatArrays, gradients: bo
         height=camera.height,
         near_plane=float(effects.near_plane),
         eps2d=float(effects.eps2d),
-        min_compensation=LEAST_LIGHT.get(effects.screen_filter, 1.0),
+        min_compensation=LEAST_COMPENSATION.get(effects.screen_filter, 1.0),
         sampling=SAMPLING.get(effects.screen_filter, AT_CENTER),
         sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
         max_color=math.inf if settings.max_color is None else settings.max_color,

@@ -1,12 +1,10 @@
-"""Threads for kernels: as many as torch uses, after dismissing torch's own idle ones."""
+"""Threads for kernels, after dismissing torch's idle ones."""
 
 from __future__ import annotations
 
 import ctypes
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -14,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+from mipmap_plugin import threads
 
 # Crowded tiles take longer than others, so idle threads take chunks from the end of other threads' queues. Each chunk is CHUNK_SHARE of
 # what is left of a queue, but at least MIN_CHUNK_SHARE of all work, because taking a chunk costs time.
@@ -47,11 +47,7 @@ class Team:
                         break
                     kernel(start, stop, *arguments)
 
-        futures = [_pool(self.threads - 1, os.getpid()).submit(work, thread) for thread in range(1, self.threads)]
-        work(0)
-        for future in futures:
-            if not future.cancel():  # a future that has not begun has nothing left to do
-                future.result()
+        threads.team(work, self.threads)
 
 
 def chunks(first: int, last: int, min_chunk: int) -> Iterator[tuple[int, int]]:
@@ -63,17 +59,11 @@ def chunks(first: int, last: int, min_chunk: int) -> Iterator[tuple[int, int]]:
 
 
 def team(work: int) -> Team:
-    """As many threads as torch uses if `work`, splats plus pixels, is large enough; else one."""
-    threads = torch.get_num_threads() if work >= MIN_WORK else 1
-    if threads > 1:
+    """As many threads as kernels may use if `work`, splats plus pixels, is large enough; else one."""
+    count = threads.count() if work >= MIN_WORK else 1
+    if count > 1 and torch.get_num_threads() > 1:
         _dismiss_idle_threads()
-    return Team(threads)
-
-
-@cache
-def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Waiting threads. Each process has its own, because threads do not survive a fork."""
-    return ThreadPoolExecutor(threads, f"mipmap_plugin-{process}")
+    return Team(count)
 
 
 def _dismiss_idle_threads() -> None:

@@ -1,6 +1,6 @@
-"""Which splats each tile draws, front to back: one sort of the splats by depth, one stable sort of (splat, tile) pairs by tile.
+"""Lists of the splats in each tile, front to back: a sort of the splats by depth, then a stable sort of (splat, tile) pairs by tile.
 
-Sorting by depth first leaves 16 bits of a pair to sort, where tile and depth together would be 64; ties keep the splats' own order.
+Sorting by depth first leaves pairs with 16-bit keys, where tile and depth together would take 64; ties keep the order of the splats.
 """
 
 from __future__ import annotations
@@ -17,60 +17,60 @@ from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, falloff
 
 LOG2_MIN_ALPHA = views.LOG2_MIN_ALPHA
 
-# px from a tile's edge to the outermost centers of its pixels, less some room for rounding.
+# px from a tile's edge to the outermost pixel centers, less a margin for rounding.
 EDGE = tl.constexpr(0.49)
 
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """The pairs, sorted by tile and then by depth."""
+    """(splat, tile) pairs, sorted by tile and then by depth."""
 
-    members: Tensor  # [pairs] int32, the splat of each
-    edges: Tensor  # [tiles + 1] int64, where a tile's pairs begin and end; behind them lie those that touch no tile after all
-    rows: Tensor  # [pairs] int64, the place of each where the pairs of one splat lie side by side
-    starts: Tensor  # [N] int64, where those of each splat begin
-    counts: Tensor  # [N] int32, and how many they are
+    splat_ids: Tensor  # [pairs] int32
+    tile_offsets: Tensor  # [tiles + 1] int64, where each tile's pairs begin and end; pairs in no tile follow after the last
+    places: Tensor  # [pairs] int64, index of each pair when the pairs of each splat lie side by side
+    starts: Tensor  # [N] int64, first index of each splat in that order
+    counts: Tensor  # [N] int32, number of its pairs
 
 
 @triton.jit
-def emit_kernel(records, boxes, starts, owners, tiles, view, count, columns, nowhere, TILE: tl.constexpr, BLOCK: tl.constexpr):
-    """The tile of each pair, or `nowhere` for one in the corner of a splat's box that its ellipse leaves out."""
+def emit_kernel(records, boxes, starts, owners, tiles, view, count, tiles_x, no_tile, TILE: tl.constexpr, BLOCK: tl.constexpr):
+    """Write the tile of each pair, or `no_tile` where the splat's ellipse does not reach that tile of its box."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = at < count
     owner = tl.load(owners + at, inside, 0).to(tl.int64)
     nth = (at - tl.load(starts + owner, inside, 0)).to(tl.int32)
     box = boxes + 4 * owner
     wide = tl.load(box + 2, inside, 1)
-    column, row = tl.load(box, inside, 0) + nth % wide, tl.load(box + 1, inside, 0) + nth // wide
-    x, y, along, shear, across, strength = falloff(records, owner, inside)
-    level = tl.maximum(strength - tl.load(view + LOG2_MIN_ALPHA), 0.0)  # how far the logarithm may fall: along dy² + across u² >= -level
+    tile_x, tile_y = tl.load(box, inside, 0) + nth % wide, tl.load(box + 1, inside, 0) + nth // wide
+    x, y, along, shear, across, log2_opacity = falloff(records, owner, inside)
+    level = tl.maximum(log2_opacity - tl.load(view + LOG2_MIN_ALPHA), 0.0)  # inside the ellipse, along dy² + across u² >= -level
     across, along = tl.minimum(across, -1e-37), tl.minimum(along, -1e-37)
-    # Where in the tile's rows the ellipse reaches furthest to the right, and to the left: both at `high` from the center, or at the row's edge.
+    # The dy, within the tile, at which the ellipse reaches furthest right and left: `high` and -`high`, or the tile's top or bottom.
     across_2, along_2 = (-1 / across) * HALF_LOG2_E, (-1 / along) * HALF_LOG2_E  # variances, px²
     tall = tl.sqrt(level / -along)
     high = shear * along_2 / tl.sqrt(across_2 + shear * shear * along_2) * tl.sqrt(level / HALF_LOG2_E)
-    top, bottom = tl.maximum(row * TILE + EDGE - y, -tall), tl.minimum(row * TILE + TILE - EDGE - y, tall)
+    top, bottom = tl.maximum(tile_y * TILE + EDGE - y, -tall), tl.minimum(tile_y * TILE + TILE - EDGE - y, tall)
     at_right, at_left = tl.minimum(tl.maximum(high, top), bottom), tl.minimum(tl.maximum(-high, top), bottom)
     right = shear * at_right + tl.sqrt(tl.maximum(level + along * at_right * at_right, 0.0) / -across)
     left = shear * at_left - tl.sqrt(tl.maximum(level + along * at_left * at_left, 0.0) / -across)
-    left_out = (top > bottom) | (x + right < column * TILE + EDGE) | (x + left > column * TILE + TILE - EDGE)
-    tl.store(tiles + at, tl.where(left_out, nowhere, row * columns + column), inside)
+    outside = (top > bottom) | (x + right < tile_x * TILE + EDGE) | (x + left > tile_x * TILE + TILE - EDGE)
+    tl.store(tiles + at, tl.where(outside, no_tile, tile_y * tiles_x + tile_x), inside)
 
 
-def bins(records: Tensor, depths: Tensor, boxes: Tensor, view: Tensor, columns: int, rows: int) -> Bins:
-    """Pairs of `records` [N, 9] and the tiles in their `boxes` [N, 4]. The host waits once, for the number of pairs."""
+def bin_splats(records: Tensor, depths: Tensor, boxes: Tensor, view: Tensor, tiles_x: int, tiles_y: int) -> Bins:
+    """Pair `records` [N, 9] with the tiles in their `boxes` [N, 4]. The host synchronizes once, for the number of pairs."""
     order = depths.argsort(stable=True)
     counts = boxes[:, 3]
     ends = counts[order].cumsum(0, dtype=torch.int64)
     starts = torch.empty_like(ends).scatter_(0, order, ends - counts[order])
     pairs = int(ends[-1]) if len(ends) else 0
     owners = order.int().repeat_interleave(counts[order], output_size=pairs)
-    nowhere = columns * rows
-    # Radix sorts take as many passes as a key has bytes.
-    tiles = torch.empty(pairs, dtype=torch.int16 if nowhere < 1 << 15 else torch.int32, device=depths.device)
+    no_tile = tiles_x * tiles_y
+    # A radix sort takes one pass per byte of the key.
+    tiles = torch.empty(pairs, dtype=torch.int16 if no_tile < 1 << 15 else torch.int32, device=depths.device)
     if pairs:
         grid = (triton.cdiv(pairs, PAIRS),)
-        emit_kernel[grid](records, boxes, starts, owners, tiles, view, pairs, columns, nowhere, TILE=TILE, BLOCK=PAIRS)
+        emit_kernel[grid](records, boxes, starts, owners, tiles, view, pairs, tiles_x, no_tile, TILE=TILE, BLOCK=PAIRS)
     by_tile, places = tiles.sort(stable=True)
-    edges = torch.searchsorted(by_tile, torch.arange(nowhere + 1, dtype=tiles.dtype, device=tiles.device))
-    return Bins(owners[places], edges, places, starts, counts)
+    tile_offsets = torch.searchsorted(by_tile, torch.arange(no_tile + 1, dtype=tiles.dtype, device=tiles.device))
+    return Bins(owners[places], tile_offsets, places, starts, counts)

@@ -1,7 +1,7 @@
-"""One program draws one tile: its splats one after the other, front to back, until no pixel is open.
+"""Compositing: one program renders one tile, splat by splat, front to back, until no pixel is open.
 
-Where there are many tiles a program is a single warp, whose lanes hold eight pixels each: what a splat is need be read once for all of
-them, the eight hide one another's latency, and sums over the tile need no barrier.
+With many tiles a program is a single warp, whose lanes hold eight pixels each: a splat's record is read once for all eight, they hide
+each other's latency, and sums over the tile need no barrier.
 """
 
 from __future__ import annotations
@@ -14,57 +14,58 @@ from mipmap_plugin.backends.triton_kernels import views
 from mipmap_plugin.backends.triton_kernels.records import RECORD
 
 MAX_ALPHA = tl.constexpr(effects.MAX_ALPHA)
-MIN_ALPHA, MIN_THROUGH = views.MIN_ALPHA, views.MIN_THROUGH
+MIN_ALPHA, MIN_TRANSMITTANCE = views.MIN_ALPHA, views.MIN_TRANSMITTANCE
 RED, GREEN, BLUE = views.RED, views.GREEN, views.BLUE
 
 
 @triton.jit
-def pixels(columns, width, height, TILE: tl.constexpr):
-    """Centers in px and index in the image of this program's pixels [TILE²], and which of them lie in it."""
+def pixels(tiles_x, width, height, TILE: tl.constexpr):
+    """This program's pixels [TILE²]: their centers in px, their index in the image, and whether they lie inside it."""
     tile = tl.program_id(0)
     nth = tl.arange(0, TILE * TILE)
-    x, y = tile % columns * TILE + nth % TILE, tile // columns * TILE + nth // TILE
+    x, y = tile % tiles_x * TILE + nth % TILE, tile // tiles_x * TILE + nth // TILE
     return x + 0.5, y + 0.5, (y * width + x).to(tl.int64), (x < width) & (y < height)
 
 
 @triton.jit
-def member(records, members, slot, end):
-    """The splat at a slot and its record; behind the end the last one's, which then has to be taken for invisible."""
-    splat = tl.load(members + tl.minimum(slot, end - 1)).to(tl.int64)
+def splat_at(records, splat_ids, slot, end):
+    """The splat in a slot and a pointer to its record. Past the end those of the last slot, which the caller has to ignore."""
+    splat = tl.load(splat_ids + tl.minimum(slot, end - 1)).to(tl.int64)
     return splat, records + splat * RECORD
 
 
 @triton.jit
-def alpha_at(row, there, px, py, least):
-    """Of the record `row` at the pixels [P]: dy, dx - shear · dy, and alpha before and after its cut-offs."""
+def alpha_at(row, valid, px, py, least):
+    """For the record at `row` and the pixels [P]: dy, u = dx - shear · dy, and alpha before and after its cut-offs."""
     dy = py - tl.load(row + 1)
     u = px - tl.load(row) - tl.load(row + 3) * dy
-    strength = tl.where(there, tl.load(row + 5), float("-inf"))
-    raw = tl.exp2(tl.load(row + 2) * dy * dy + tl.load(row + 4) * u * u + strength)
+    log2_opacity = tl.where(valid, tl.load(row + 5), float("-inf"))
+    raw = tl.exp2(tl.load(row + 2) * dy * dy + tl.load(row + 4) * u * u + log2_opacity)
     return dy, u, raw, tl.where(raw >= least, tl.minimum(raw, MAX_ALPHA), 0.0)
 
 
 @triton.jit
-def composite_kernel(records, members, edges, view, image, through, columns, width, height, TILE: tl.constexpr, BATCH: tl.constexpr):
-    px, py, at, inside = pixels(columns, width, height, TILE)
-    slot, end = tl.load(edges + tl.program_id(0)), tl.load(edges + tl.program_id(0) + 1)
-    least, stop = tl.load(view + MIN_ALPHA), tl.load(view + MIN_THROUGH)
-    run = tl.where(inside, 1.0, 0.0)  # light that would be left if pixels never stopped: below `stop` one is finished for good
-    left = tl.zeros_like(run) + 1  # light that is left
-    red, green, blue = tl.zeros_like(run), tl.zeros_like(run), tl.zeros_like(run)
-    while (slot < end) & (tl.max(run, axis=0) >= stop):
+def composite_kernel(records, splat_ids, tile_offsets, view, image, transmittances, tiles_x, width, height, TILE: tl.constexpr, BATCH: tl.constexpr):
+    """Composite one tile into `image` and `transmittances`."""
+    px, py, at, inside = pixels(tiles_x, width, height, TILE)
+    slot, end = tl.load(tile_offsets + tl.program_id(0)), tl.load(tile_offsets + tl.program_id(0) + 1)
+    least, stop = tl.load(view + MIN_ALPHA), tl.load(view + MIN_TRANSMITTANCE)
+    running = tl.where(inside, 1.0, 0.0)  # transmittance if pixels never stopped; once it is below `stop`, the pixel is finished
+    transmittance = tl.zeros_like(running) + 1
+    red, green, blue = tl.zeros_like(running), tl.zeros_like(running), tl.zeros_like(running)
+    while (slot < end) & (tl.max(running, axis=0) >= stop):
         for _ in tl.static_range(BATCH):
-            _, row = member(records, members, slot, end)
+            _, row = splat_at(records, splat_ids, slot, end)
             _, _, _, alpha = alpha_at(row, slot < end, px, py, least)
-            behind = run * (1 - alpha)
-            weight = tl.where(behind >= stop, run * alpha, 0.0)
+            behind = running * (1 - alpha)
+            weight = tl.where(behind >= stop, running * alpha, 0.0)
             red += weight * tl.load(row + 6)
             green += weight * tl.load(row + 7)
             blue += weight * tl.load(row + 8)
-            left = tl.where(behind >= stop, behind, left)
-            run = behind
+            transmittance = tl.where(behind >= stop, behind, transmittance)
+            running = behind
             slot += 1
-    tl.store(image + 3 * at, red + left * tl.load(view + RED), inside)
-    tl.store(image + 3 * at + 1, green + left * tl.load(view + GREEN), inside)
-    tl.store(image + 3 * at + 2, blue + left * tl.load(view + BLUE), inside)
-    tl.store(through + at, left, inside)
+    tl.store(image + 3 * at, red + transmittance * tl.load(view + RED), inside)
+    tl.store(image + 3 * at + 1, green + transmittance * tl.load(view + GREEN), inside)
+    tl.store(image + 3 * at + 2, blue + transmittance * tl.load(view + BLUE), inside)
+    tl.store(transmittances + at, transmittance, inside)

@@ -1,4 +1,4 @@
-"""Splats in the world -> what the tiles need of them: records, depths, and the box of tiles that each may touch. One splat a lane."""
+"""Projection: from splats in the world to records, depths, and boxes of the tiles that each may touch. One splat per lane."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from mipmap_plugin.backends.triton_kernels.harmonics import color
 from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD, store_nine
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes, from_covariance, load_quat
 from mipmap_plugin.backends.triton_kernels.vectors import finite, load3
-from mipmap_plugin.backends.triton_kernels.views import from_eye, frozen, image_axis, in_camera
+from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_camera
 
-NEAR, EPS2D, LEAST, MIN_ALPHA, LOG2_MIN_ALPHA = views.NEAR, views.EPS2D, views.LEAST, views.MIN_ALPHA, views.LOG2_MIN_ALPHA
+NEAR, EPS2D, LEAST_COMPENSATION, MIN_ALPHA, LOG2_MIN_ALPHA = views.NEAR, views.EPS2D, views.LEAST_COMPENSATION, views.MIN_ALPHA, views.LOG2_MIN_ALPHA
 FX, FY, CX, CY = views.FX, views.FY, views.CX, views.CY
 
 
 @triton.jit
-def place(view, means, at, mask):
-    """Of the splats `at` [B]: from the eye in the world, along the camera's axes, and the depth to divide by."""
+def relative_position(view, means, at, mask):
+    """Positions of the splats `at` [B] relative to the eye, in world axes and in camera axes, and the depth clamped to the near plane."""
     world = from_eye(view, *load3(means + 3 * at, mask))
     eye = in_camera(view, *world)
     return world, eye, tl.maximum(eye[2], tl.load(view + NEAR))
 
 
 @triton.jit
-def flat(view, eye, safe, quats, scales, covariances, at, mask, GIVEN: tl.constexpr):
-    """xx, xy, yy, det on the image, without any screen filter."""
-    u, v = frozen(view, eye[0] / safe, eye[1] / safe)
+def image_covariance(view, eye, safe, quats, scales, covariances, at, mask, HAS_COVARIANCES: tl.constexpr):
+    """xx, xy, yy, det on the image, before any screen filter."""
+    u, v = clamped_slopes(view, eye[0] / safe, eye[1] / safe)
     t = image_axis(view, u, tl.load(view + FX) / safe, 0)
     r = image_axis(view, v, tl.load(view + FY) / safe, 1)
-    if GIVEN:
+    if HAS_COVARIANCES:
         xx, xy, yy, det = from_covariance(covariances + 9 * at, mask, t, r)
     else:
         xx, xy, yy, det = from_axes(load_quat(quats + 4 * at, mask), load3(scales + 3 * at, mask), t, r)
@@ -39,7 +39,7 @@ def flat(view, eye, safe, quats, scales, covariances, at, mask, GIVEN: tl.conste
 
 @triton.jit
 def direction(world):
-    """The unit vector from the eye to a splat and 1 / distance; of one in the very eye any unit vector, and 0."""
+    """The unit vector from the eye to a splat, and 1 / distance; for a splat exactly at the eye an arbitrary unit vector and 0."""
     squared = world[0] * world[0] + world[1] * world[1] + world[2] * world[2]
     per = tl.where(squared == 0, 0.0, 1 / tl.sqrt(tl.where(squared == 0, 1.0, squared)))
     return world[0] * per, world[1] * per, tl.where(squared == 0, 1.0, world[2] * per), per
@@ -47,7 +47,7 @@ def direction(world):
 
 @triton.jit
 def bounds(center, extent, tiles, TILE: tl.constexpr):
-    """The first tile that [center ± extent] px reaches, and how many; clamped as floats, for an integer may not count that far."""
+    """The first tile that [center ± extent] px reaches, and their number; as clamped floats, because integers could overflow."""
     first = tl.minimum(tl.maximum(tl.floor((center - extent) / TILE), 0.0), tiles)
     last = tl.minimum(tl.maximum(tl.floor((center + extent) / TILE) + 1, 0.0), tiles)
     return first, tl.maximum(last - first, 0.0)
@@ -55,36 +55,36 @@ def bounds(center, extent, tiles, TILE: tl.constexpr):
 
 @triton.jit
 def project_kernel(
-    means, quats, scales, covariances, opacities, sh, view, records, depths, boxes, count, width, height, columns, rows,
-    GIVEN: tl.constexpr, COMPENSATES: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, covariances, opacities, sh, view, records, depths, boxes, count, width, height, tiles_x, tiles_y,
+    HAS_COVARIANCES: tl.constexpr, COMPENSATES: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     inside = at < count
-    world, eye, safe = place(view, means, at, inside)
+    world, eye, safe = relative_position(view, means, at, inside)
     ahead = inside & (eye[2] > tl.load(view + NEAR))
-    xx, xy, yy, det = flat(view, eye, safe, quats, scales, covariances, at, ahead, GIVEN)
+    xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, ahead, HAS_COVARIANCES)
     eps2d = tl.load(view + EPS2D)
-    wide = det + eps2d * (xx + yy) + eps2d * eps2d
+    det_blur = det + eps2d * (xx + yy) + eps2d * eps2d
     opacity = tl.load(opacities + at, ahead, 0.0)
     if COMPENSATES:
-        opacity *= tl.sqrt(tl.maximum(det / wide, tl.load(view + LEAST)))
+        opacity *= tl.sqrt(tl.maximum(det / det_blur, tl.load(view + LEAST_COMPENSATION)))
     xx, yy = xx + eps2d, yy + eps2d
     x = eye[0] / safe * tl.load(view + FX) + tl.load(view + CX)
     y = eye[1] / safe * tl.load(view + FY) + tl.load(view + CY)
-    sound = finite(x) & finite(y) & finite(xx) & finite(xy) & finite(yy) & finite(wide) & finite(opacity)
-    shear, across, strength = xy / yy, wide / yy, tl.log2(opacity)
-    drawn = ahead & sound & (opacity >= tl.load(view + MIN_ALPHA)) & (across > 0)
-    reach = tl.sqrt(tl.maximum(strength - tl.load(view + LOG2_MIN_ALPHA), 0.0) * (2 * LN_2))
+    all_finite = finite(x) & finite(y) & finite(xx) & finite(xy) & finite(yy) & finite(det_blur) & finite(opacity)
+    shear, across, log2_opacity = xy / yy, det_blur / yy, tl.log2(opacity)
+    drawn = ahead & all_finite & (opacity >= tl.load(view + MIN_ALPHA)) & (across > 0)
+    reach = tl.sqrt(tl.maximum(log2_opacity - tl.load(view + LOG2_MIN_ALPHA), 0.0) * (2 * LN_2))
     reach_x, reach_y = reach * tl.sqrt(xx), reach * tl.sqrt(yy)
     drawn &= (x + reach_x > 0) & (x - reach_x < width) & (y + reach_y > 0) & (y - reach_y < height)
     dx, dy, dz, _ = direction(world)
     red, green, blue = color(sh + at * (3 * BANDS), dx, dy, dz, drawn, DEGREE)
     drawn &= finite(red) & finite(green) & finite(blue)
     red, green, blue = tl.maximum(red + 0.5, 0.0), tl.maximum(green + 0.5, 0.0), tl.maximum(blue + 0.5, 0.0)
-    store_nine(records + at * RECORD, x, y, (-1 / yy) * HALF_LOG2_E, shear, (-1 / across) * HALF_LOG2_E, strength, red, green, blue, drawn)
+    store_nine(records + at * RECORD, x, y, (-1 / yy) * HALF_LOG2_E, shear, (-1 / across) * HALF_LOG2_E, log2_opacity, red, green, blue, drawn)
     tl.store(depths + at, tl.where(drawn, eye[2], float("inf")), inside)
-    first_x, wide_x = bounds(x, reach_x, columns.to(tl.float32), TILE)
-    first_y, wide_y = bounds(y, reach_y, rows.to(tl.float32), TILE)
+    first_x, wide_x = bounds(x, reach_x, tiles_x.to(tl.float32), TILE)
+    first_y, wide_y = bounds(y, reach_y, tiles_y.to(tl.float32), TILE)
     box = boxes + 4 * at
     tl.store(box, tl.where(drawn, first_x, 0.0).to(tl.int32), inside)
     tl.store(box + 1, tl.where(drawn, first_y, 0.0).to(tl.int32), inside)

@@ -1,4 +1,4 @@
-"""The gradients of the records, back to means, quaternions, scales or covariances, opacities and harmonics. One splat a lane."""
+"""Backward pass of projection: from the gradients of the records to those of the splats. One splat per lane."""
 
 from __future__ import annotations
 
@@ -7,37 +7,37 @@ import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
 from mipmap_plugin.backends.triton_kernels.harmonics import color, color_back
-from mipmap_plugin.backends.triton_kernels.projection import direction, flat, place
+from mipmap_plugin.backends.triton_kernels.projection import direction, image_covariance, relative_position
 from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes_back, from_covariance_back, load_quat
 from mipmap_plugin.backends.triton_kernels.vectors import dot, load3, store3
-from mipmap_plugin.backends.triton_kernels.views import frozen, image_axis, in_world, rotation_row
+from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, image_axis, in_world, rotation_row
 
-EPS2D, LEAST, FX, FY = views.EPS2D, views.LEAST, views.FX, views.FY
+EPS2D, LEAST_COMPENSATION, FX, FY = views.EPS2D, views.LEAST_COMPENSATION, views.FX, views.FY
 
 
 @triton.jit
-def filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_strength, COMPENSATES: tl.constexpr):
-    """Gradients of xx, xy, yy, det, without the filter, and of the opacity from those of a record's falloff."""
+def filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity, COMPENSATES: tl.constexpr):
+    """Gradients of xx, xy, yy and det before the screen filter, and of the opacity, from those of a record."""
     eps2d = tl.load(view + EPS2D)
-    wide_yy = yy + eps2d
-    wide = det + eps2d * (xx + yy) + eps2d * eps2d
-    across = wide / wide_yy
+    yy_blur = yy + eps2d
+    det_blur = det + eps2d * (xx + yy) + eps2d * eps2d
+    across = det_blur / yy_blur
     d_width = d_across * HALF_LOG2_E / (across * across)
-    d_yy = (d_along * HALF_LOG2_E / wide_yy - d_shear * xy / wide_yy - d_width * across) / wide_yy
-    d_wide, d_xy = d_width / wide_yy, d_shear / wide_yy
-    d_opacity, d_det = d_strength / (opacity * LN_2), tl.zeros_like(det)
+    d_yy = (d_along * HALF_LOG2_E / yy_blur - d_shear * xy / yy_blur - d_width * across) / yy_blur
+    d_det_blur, d_xy = d_width / yy_blur, d_shear / yy_blur
+    d_opacity, d_det = d_log2_opacity / (opacity * LN_2), tl.zeros_like(det)
     if COMPENSATES:
-        share = det / wide
-        light = tl.sqrt(tl.maximum(share, tl.load(view + LEAST)))
-        d_share = tl.where(share < tl.load(view + LEAST), 0.0, d_strength / (light * light * (2 * LN_2)))
-        d_det, d_wide = d_share / wide, d_wide - d_share * share / wide
-    return d_wide * eps2d, d_xy, d_yy + d_wide * eps2d, d_det + d_wide, d_opacity
+        ratio = det / det_blur
+        compensation = tl.sqrt(tl.maximum(ratio, tl.load(view + LEAST_COMPENSATION)))
+        d_ratio = tl.where(ratio < tl.load(view + LEAST_COMPENSATION), 0.0, d_log2_opacity / (compensation * compensation * (2 * LN_2)))
+        d_det, d_det_blur = d_ratio / det_blur, d_det_blur - d_ratio * ratio / det_blur
+    return d_det_blur * eps2d, d_xy, d_yy + d_det_blur * eps2d, d_det + d_det_blur, d_opacity
 
 
 @triton.jit
-def place_back(view, eye, safe, u, v, dt, dr, d_x, d_y):
-    """Gradient of the place in the world from those of the image axes and of the center on the image."""
+def relative_position_back(view, eye, safe, u, v, dt, dr, d_x, d_y):
+    """Gradient of the position in the world from those of the image axes and of the center on the image."""
     right, down, ahead = rotation_row(view, 0), rotation_row(view, 1), rotation_row(view, 2)
     per_x, per_y = tl.load(view + FX) / safe, tl.load(view + FY) / safe
     slope_x, slope_y = eye[0] / safe, eye[1] / safe
@@ -51,18 +51,18 @@ def place_back(view, eye, safe, u, v, dt, dr, d_x, d_y):
 
 @triton.jit
 def project_back_kernel(
-    means, quats, scales, covariances, opacities, sh, view, depths, pulls, d_means, d_quats, d_scales, d_covariances, d_opacities, d_sh, count,
-    GIVEN: tl.constexpr, COMPENSATES: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, covariances, opacities, sh, view, depths, d_records, d_means, d_quats, d_scales, d_covariances, d_opacities, d_sh, count,
+    HAS_COVARIANCES: tl.constexpr, COMPENSATES: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     inside = at < count
     drawn = inside & (tl.load(depths + at, inside, float("inf")) < float("inf"))
-    pull = pulls + at * RECORD
-    d_x, d_y, d_along = load3(pull, drawn)
-    d_shear, d_across, d_strength = load3(pull + 3, drawn)
-    d_red, d_green, d_blue = load3(pull + 6, drawn)
-    world, eye, safe = place(view, means, at, drawn)
-    safe = tl.where(drawn, safe, 1.0)  # with a near plane of 0 a row that was not drawn may have no depth to divide by
+    d_record = d_records + at * RECORD
+    d_x, d_y, d_along = load3(d_record, drawn)
+    d_shear, d_across, d_log2_opacity = load3(d_record + 3, drawn)
+    d_red, d_green, d_blue = load3(d_record + 6, drawn)
+    world, eye, safe = relative_position(view, means, at, drawn)
+    safe = tl.where(drawn, safe, 1.0)  # with a near plane of 0, the depth of a splat that is not drawn may be 0
     dx, dy, dz, per = direction(world)
     coefficients = sh + at * (3 * BANDS)
     red, green, blue = color(coefficients, dx, dy, dz, drawn, DEGREE)
@@ -71,23 +71,23 @@ def project_back_kernel(
     px, py, pz = color_back(coefficients, out, dx, dy, dz, d_red, d_green, d_blue, drawn, inside, DEGREE)
     for band in tl.static_range((DEGREE + 1) * (DEGREE + 1), BANDS):
         store3(out + 3 * band, tl.zeros_like(px), tl.zeros_like(px), tl.zeros_like(px), inside)
-    along = px * dx + py * dy + pz * dz  # a splat that moves along its ray keeps its color
+    along = px * dx + py * dy + pz * dz  # removed below: the color does not change along the ray
 
-    xx, xy, yy, det = flat(view, eye, safe, quats, scales, covariances, at, drawn, GIVEN)
+    xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, drawn, HAS_COVARIANCES)
     opacity = tl.load(opacities + at, drawn, 1.0)
-    d_xx, d_xy, d_yy, d_det, d_opacity = filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_strength, COMPENSATES)
+    d_xx, d_xy, d_yy, d_det, d_opacity = filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity, COMPENSATES)
     tl.store(d_opacities + at, tl.where(drawn, d_opacity, 0.0), inside)
-    # Rows that are not drawn were read as zeros; what follows from zeros may still be NaN.
+    # Splats that are not drawn were read as zeros, from which NaN may follow.
     d_xx, d_xy = tl.where(drawn, d_xx, 0.0), tl.where(drawn, d_xy, 0.0)
     d_yy, d_det = tl.where(drawn, d_yy, 0.0), tl.where(drawn, d_det, 0.0)
-    u, v = frozen(view, eye[0] / safe, eye[1] / safe)
+    u, v = clamped_slopes(view, eye[0] / safe, eye[1] / safe)
     t = image_axis(view, u, tl.load(view + FX) / safe, 0)
     r = image_axis(view, v, tl.load(view + FY) / safe, 1)
-    if GIVEN:
+    if HAS_COVARIANCES:
         dt, dr = from_covariance_back(covariances + 9 * at, drawn, t, r, d_xx, d_xy, d_yy, d_det, d_covariances + 9 * at, inside)
     else:
         quat, scale = load_quat(quats + 4 * at, drawn), load3(scales + 3 * at, drawn)
         dt, dr = from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quats + 4 * at, d_scales + 3 * at, inside)
-    mx, my, mz = place_back(view, eye, safe, u, v, dt, dr, d_x, d_y)
+    mx, my, mz = relative_position_back(view, eye, safe, u, v, dt, dr, d_x, d_y)
     mx, my, mz = mx + per * (px - along * dx), my + per * (py - along * dy), mz + per * (pz - along * dz)
     store3(d_means + 3 * at, tl.where(drawn, mx, 0.0), tl.where(drawn, my, 0.0), tl.where(drawn, mz, 0.0), inside)

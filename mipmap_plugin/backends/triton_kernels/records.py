@@ -1,7 +1,9 @@
-"""What the tiles need of a splat: nine numbers, whose logarithms spare every pixel a product and a division.
+"""Records: the nine numbers per splat that compositing reads. Factors and logarithms are chosen so that a pixel needs no division.
 
-alpha = 2^(along · dy² + across · (dx - shear · dy)² + strength), with along = -log2(e)/2 / yy, across = -log2(e)/2 · yy / det and
-strength = log2 of the opacity; yy, shear and det are those of `filters.Footprint`.
+    x, y, along, shear, across, log2_opacity, red, green, blue
+    alpha = 2^(along · dy² + across · (dx - shear · dy)² + log2_opacity)
+
+with along = -log2(e)/2 / yy and across = -log2(e)/2 · yy / det; yy, shear and det are those of `filters.Footprint`.
 """
 
 from __future__ import annotations
@@ -20,17 +22,17 @@ LN_2 = tl.constexpr(math.log(2))
 
 @triton.jit
 def falloff(records, at, mask):
-    """x, y, along, shear, across, strength of the splats `at` [B]."""
+    """x, y, along, shear, across, log2_opacity of the splats `at` [B]."""
     row = records + at * RECORD
     x, y = tl.load(row, mask, 0.0), tl.load(row + 1, mask, 0.0)
     along, shear = tl.load(row + 2, mask, 0.0), tl.load(row + 3, mask, 0.0)
-    across, strength = tl.load(row + 4, mask, 0.0), tl.load(row + 5, mask, 0.0)
-    return x, y, along, shear, across, strength
+    across, log2_opacity = tl.load(row + 4, mask, 0.0), tl.load(row + 5, mask, 0.0)
+    return x, y, along, shear, across, log2_opacity
 
 
 @triton.jit
 def store_nine(rows, a, b, c, d, e, f, g, h, i, mask):
-    """Nine numbers [B] side by side at the pointers `rows` [B]."""
+    """Store nine numbers [B] side by side at the pointers `rows` [B]."""
     tl.store(rows, a, mask)
     tl.store(rows + 1, b, mask)
     tl.store(rows + 2, c, mask)

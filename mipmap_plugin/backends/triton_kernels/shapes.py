@@ -1,11 +1,11 @@
-"""A splat's covariance on the image, from its axes or its covariance in the world, and their gradients. Formulas: `projection.py`."""
+"""A splat's covariance on the image, from its axes or its covariance in the world, and the gradients. Formulas: `splatting/projection.py`."""
 
 from __future__ import annotations
 
 import triton
 import triton.language as tl
 
-from mipmap_plugin.backends.triton_kernels.vectors import columns, columns_back, cross, dot, load3, store3, unit
+from mipmap_plugin.backends.triton_kernels.vectors import cross, dot, load3, rotation_columns, rotation_columns_back, store3, unit
 
 
 @triton.jit
@@ -15,9 +15,9 @@ def load_quat(rows, mask):
 
 @triton.jit
 def from_axes(quat, scale, t, r):
-    """xx, xy, yy and the determinant without cancellation, under the image axes t and r (x and y, px per world unit)."""
+    """xx, xy, yy and the determinant, without cancellation. t and r: image axes x and y, px per world unit."""
     w, x, y, z, _ = unit(quat[0], quat[1], quat[2], quat[3])
-    a, b, c = columns(w, x, y, z)
+    a, b, c = rotation_columns(w, x, y, z)
     f0, f1, f2 = scale[0] * dot(*t, *a), scale[1] * dot(*t, *b), scale[2] * dot(*t, *c)
     g0, g1, g2 = scale[0] * dot(*r, *a), scale[1] * dot(*r, *b), scale[2] * dot(*r, *c)
     n0, n1, n2 = cross(f0, f1, f2, g0, g1, g2)
@@ -26,7 +26,7 @@ def from_axes(quat, scale, t, r):
 
 @triton.jit
 def times(rows, mask, v):
-    """Σ v and Σᵀ v of the matrices [3, 3] at `rows`."""
+    """Σ v and Σᵀ v for the matrices Σ [3, 3] at `rows`."""
     a, b, c = load3(rows, mask), load3(rows + 3, mask), load3(rows + 6, mask)
     forth = dot(*a, *v), dot(*b, *v), dot(*c, *v)
     back = a[0] * v[0] + b[0] * v[1] + c[0] * v[2], a[1] * v[0] + b[1] * v[1] + c[1] * v[2], a[2] * v[0] + b[2] * v[1] + c[2] * v[2]
@@ -35,7 +35,7 @@ def times(rows, mask, v):
 
 @triton.jit
 def from_covariance(rows, mask, t, r):
-    """As `from_axes`, of covariances [3, 3] at `rows`."""
+    """As `from_axes`, for covariances [3, 3] at `rows`."""
     forth_t, _ = times(rows, mask, t)
     forth_r, _ = times(rows, mask, r)
     xx, xy, yy = dot(*t, *forth_t), dot(*t, *forth_r), dot(*r, *forth_r)
@@ -46,7 +46,7 @@ def from_covariance(rows, mask, t, r):
 def from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quats, d_scales, inside):
     """Write the gradients of quaternions and scales; return those of the image axes."""
     w, x, y, z, inverse = unit(quat[0], quat[1], quat[2], quat[3])
-    a, b, c = columns(w, x, y, z)
+    a, b, c = rotation_columns(w, x, y, z)
     ta, tb, tc = dot(*t, *a), dot(*t, *b), dot(*t, *c)
     ra, rb, rc = dot(*r, *a), dot(*r, *b), dot(*r, *c)
     f0, f1, f2, g0, g1, g2 = scale[0] * ta, scale[1] * tb, scale[2] * tc, scale[0] * ra, scale[1] * rb, scale[2] * rc
@@ -60,8 +60,8 @@ def from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quats, d_scales
     da = df0 * t[0] + dg0 * r[0], df0 * t[1] + dg0 * r[1], df0 * t[2] + dg0 * r[2]
     db = df1 * t[0] + dg1 * r[0], df1 * t[1] + dg1 * r[1], df1 * t[2] + dg1 * r[2]
     dc = df2 * t[0] + dg2 * r[0], df2 * t[1] + dg2 * r[1], df2 * t[2] + dg2 * r[2]
-    dw, dx, dy, dz = columns_back(w, x, y, z, da, db, dc)
-    along = w * dw + x * dx + y * dy + z * dz  # a longer quaternion is the same rotation
+    dw, dx, dy, dz = rotation_columns_back(w, x, y, z, da, db, dc)
+    along = w * dw + x * dx + y * dy + z * dz  # removed below: the norm of a quaternion does not matter
     tl.store(d_quats, inverse * (dw - w * along), inside)
     store3(d_quats + 1, inverse * (dx - x * along), inverse * (dy - y * along), inverse * (dz - z * along), inside)
     dt = df0 * a[0] + df1 * b[0] + df2 * c[0], df0 * a[1] + df1 * b[1] + df2 * c[1], df0 * a[2] + df1 * b[2] + df2 * c[2]

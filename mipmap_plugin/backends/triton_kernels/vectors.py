@@ -1,4 +1,4 @@
-"""Vectors and rotations of one splat a lane, as tuples of numbers; reads and writes of a few numbers a row."""
+"""Vectors and rotations, one splat per lane, as tuples of numbers; loads and stores of a few numbers per row."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ def cross(ax, ay, az, bx, by, bz):
 
 @triton.jit
 def unit(w, x, y, z):
-    """A quaternion over its length, and 1 / length; of a zero quaternion zeros, whose rotation is the identity."""
+    """A normalized quaternion, and 1 / norm; zeros for a zero quaternion, whose rotation is the identity."""
     largest = tl.maximum(tl.maximum(tl.abs(w), tl.abs(x)), tl.maximum(tl.abs(y), tl.abs(z)))
     zero = largest < LEAST_QUATERNION
-    per = tl.where(zero, 0.0, 1 / tl.where(zero, 1.0, largest))  # of its own size the squares would leave float32
+    per = tl.where(zero, 0.0, 1 / tl.where(zero, 1.0, largest))  # without this factor the squares may overflow or underflow
     w, x, y, z = w * per, x * per, y * per, z * per
     scale = tl.rsqrt(tl.where(zero, 1.0, w * w + x * x + y * y + z * z))
     return w * scale, x * scale, y * scale, z * scale, scale * per
 
 
 @triton.jit
-def columns(w, x, y, z):
-    """The columns of a unit quaternion's rotation matrix."""
+def rotation_columns(w, x, y, z):
+    """The three columns of a unit quaternion's rotation matrix."""
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
@@ -60,8 +60,8 @@ def columns(w, x, y, z):
 
 
 @triton.jit
-def columns_back(w, x, y, z, a, b, c):
-    """Gradient of w, x, y, z from those of the columns a, b, c of `columns`."""
+def rotation_columns_back(w, x, y, z, a, b, c):
+    """Gradients of w, x, y, z from those of the columns a, b, c."""
     dw = 2 * (x * (b[2] - c[1]) + y * (c[0] - a[2]) + z * (a[1] - b[0]))
     dx = 2 * (w * (b[2] - c[1]) + y * (a[1] + b[0]) + z * (a[2] + c[0]) - 2 * x * (b[1] + c[2]))
     dy = 2 * (w * (c[0] - a[2]) + x * (a[1] + b[0]) + z * (b[2] + c[1]) - 2 * y * (a[0] + c[2]))

@@ -1,4 +1,4 @@
-"""The camera and the screen filter as a row of numbers on the device, and what a splat's place in the view is."""
+"""The camera and the screen filter as an array on the device, and transformations between world, camera and image."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import FRUSTUM_MARGIN, Effects
-from mipmap_plugin.splatting.filters import LEAST_LIGHT
+from mipmap_plugin.splatting import filters
 
-# Where the numbers lie in the row; before them the rotation, row by row, and the eye.
+# Indices into the array. It begins with the rotation, row by row, at 0.
 EYE, FX, FY, CX, CY = tl.constexpr(9), tl.constexpr(12), tl.constexpr(13), tl.constexpr(14), tl.constexpr(15)
-LEFT, RIGHT, TOP, BOTTOM = tl.constexpr(16), tl.constexpr(17), tl.constexpr(18), tl.constexpr(19)  # where slopes freeze
-NEAR, EPS2D, LEAST, MIN_ALPHA = tl.constexpr(20), tl.constexpr(21), tl.constexpr(22), tl.constexpr(23)
-LOG2_MIN_ALPHA, MIN_THROUGH = tl.constexpr(24), tl.constexpr(25)
+LEFT, RIGHT, TOP, BOTTOM = tl.constexpr(16), tl.constexpr(17), tl.constexpr(18), tl.constexpr(19)  # bounds of the slopes in the Jacobian
+NEAR, EPS2D, MIN_ALPHA = tl.constexpr(20), tl.constexpr(21), tl.constexpr(23)
+LEAST_COMPENSATION = tl.constexpr(22)  # squared
+LOG2_MIN_ALPHA, MIN_TRANSMITTANCE = tl.constexpr(24), tl.constexpr(25)
 RED, GREEN, BLUE = tl.constexpr(26), tl.constexpr(27), tl.constexpr(28)  # of the background
 
 
-def row_of(camera: Camera, effects: Effects, like: Tensor) -> Tensor:
-    """[29] on the device of `like`. A copy of 116 bytes, which the host does not wait for."""
+def view_parameters(camera: Camera, effects: Effects, like: Tensor) -> Tensor:
+    """The array [29], on the device of `like`. A copy of 116 bytes that does not synchronize."""
     margin_x, margin_y = FRUSTUM_MARGIN * camera.width / camera.fx / 2, FRUSTUM_MARGIN * camera.height / camera.fy / 2
     numbers = [
         *camera.viewmat[:3, :3].flatten().tolist(),
@@ -30,7 +31,7 @@ def row_of(camera: Camera, effects: Effects, like: Tensor) -> Tensor:
         *(camera.fx, camera.fy, camera.cx, camera.cy),
         *(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
         *(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
-        *(effects.near_plane, effects.eps2d, LEAST_LIGHT[effects.screen_filter] ** 2, effects.settings.min_alpha),
+        *(effects.near_plane, effects.eps2d, filters.LEAST_COMPENSATION[effects.screen_filter] ** 2, effects.settings.min_alpha),
         *(math.log2(effects.settings.min_alpha), effects.settings.min_transmittance),
         *effects.background,
     ]
@@ -44,33 +45,33 @@ def rotation_row(view, which: tl.constexpr):
 
 @triton.jit
 def from_eye(view, x, y, z):
-    """A point of the world, from the eye."""
+    """A point of the world relative to the eye, in world axes."""
     return x - tl.load(view + EYE), y - tl.load(view + EYE + 1), z - tl.load(view + EYE + 2)
 
 
 @triton.jit
 def in_camera(view, x, y, z):
-    """A direction of the world along the camera's axes."""
+    """A world vector in camera axes."""
     r0, r1, r2 = rotation_row(view, 0), rotation_row(view, 1), rotation_row(view, 2)
     return r0[0] * x + r0[1] * y + r0[2] * z, r1[0] * x + r1[1] * y + r1[2] * z, r2[0] * x + r2[1] * y + r2[2] * z
 
 
 @triton.jit
 def in_world(view, x, y, z):
-    """A direction along the camera's axes in the world."""
+    """A vector in camera axes, in world axes."""
     r0, r1, r2 = rotation_row(view, 0), rotation_row(view, 1), rotation_row(view, 2)
     return r0[0] * x + r1[0] * y + r2[0] * z, r0[1] * x + r1[1] * y + r2[1] * z, r0[2] * x + r1[2] * y + r2[2] * z
 
 
 @triton.jit
-def frozen(view, slope_x, slope_y):
-    """Slopes where the projection is taken to be linear: the splat's own, or the nearest on the widened image's edge."""
+def clamped_slopes(view, slope_x, slope_y):
+    """The slopes at which the Jacobian is evaluated: the splat's own, clamped to the widened frustum."""
     u = tl.minimum(tl.maximum(slope_x, tl.load(view + LEFT)), tl.load(view + RIGHT))
     return u, tl.minimum(tl.maximum(slope_y, tl.load(view + TOP)), tl.load(view + BOTTOM))
 
 
 @triton.jit
 def image_axis(view, slope, per_unit, which: tl.constexpr):
-    """px per world unit along the image's x or y: a row of the projection's derivative."""
+    """px per world unit along the image's x or y: a row of the Jacobian of the projection, in world axes."""
     r, ahead = rotation_row(view, which), rotation_row(view, 2)
     return per_unit * (r[0] - slope * ahead[0]), per_unit * (r[1] - slope * ahead[1]), per_unit * (r[2] - slope * ahead[2])

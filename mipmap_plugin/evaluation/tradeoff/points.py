@@ -111,7 +111,7 @@ def measure(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> I
 
 def on_backend(model: Wrapped, name: str) -> Wrapped:
     """The same base, rendered and adapted by another backend."""
-    return Wrapped(model.model, model.cameras, name, model.trained)
+    return Wrapped(model.model, model.cameras, name, model.trained, model.threads)
 
 
 def _rivals(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> list[Rival]:

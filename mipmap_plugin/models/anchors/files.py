@@ -1,4 +1,4 @@
-"""The file of an anchor model: the columns of its PLY, as raw parameters and back, and what lies around it."""
+"""Files of an anchor model: conversion between the columns of its PLY and raw parameters, and its companion files."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from mipmap_plugin.models.vanilla import Origin
 
 OFFSET, FEATURE = "f_offset_", "f_anchor_feat_"
 
-# The first three stretch an anchor's offsets, the others its splats.
+# The first three scale an anchor's offsets, the others its splats.
 SCALES = tuple(f"scale_{i}" for i in range(6))
 
 
 @dataclass(frozen=True, eq=False)
 class AnchorFile:
-    """What was read: of the PLY, its companions and its folder, or of a live object."""
+    """The contents of the PLY, its companions and its folder, or of a live object."""
 
     parameters: dict[str, Tensor]  # of the finite anchors
     carried: tuple[str, ...]  # the names of the columns in `parameters[CARRIED]`
@@ -41,30 +41,30 @@ class AnchorFile:
     options: dict[str, Any]  # of cfg_args
     trained: TrainedScale
     origin: Origin
-    first: dict[str, np.ndarray] = field(default_factory=dict)  # by column, the first two values; where Octree-GS keeps its constants
+    first: dict[str, np.ndarray] = field(default_factory=dict)  # the first two values of each column; Octree-GS keeps constants there
     notes: tuple[str, ...] = ()
 
 
 def read_anchors(path: str | Path, family: str, iteration: int | None) -> AnchorFile:
     """Read the anchors at `path`, a PLY or model folder of `family`. Anchors that are not finite are dropped, with a note.
 
-    Raises CheckpointError for what is damaged, incomplete, or of another family.
+    Raises CheckpointError for a path that is damaged, incomplete, or of another family.
     """
-    found = detect_as(path, (family,), iteration=iteration)
-    ply = read_ply(found.path)
-    parameters, carried = to_parameters(ply.columns, found.path)
-    weights, companions = read_networks(found.path.parent)
-    parameters, dropped = _sound(parameters, weights, found.path)
+    checkpoint = detect_as(path, (family,), iteration=iteration)
+    ply = read_ply(checkpoint.path)
+    parameters, carried = to_parameters(ply.columns, checkpoint.path)
+    weights, companions = read_networks(checkpoint.path.parent)
+    parameters, dropped = _checked(parameters, weights, checkpoint.path)
     first = {name: column[:2].copy() for name, column in ply.columns.items()}
-    options, notes = read_options(found.folder)
-    origin = _origin(found, ply.comments)
-    every_note = (*found.notes, *ply.notes, *notes, *dropped)
+    options, notes = read_options(checkpoint.folder)
+    origin = _origin(checkpoint, ply.comments)
+    every_note = (*checkpoint.notes, *ply.notes, *notes, *dropped)
     return AnchorFile(parameters, carried, weights, companions, options, trained_scale(options, None), origin, first, every_note)
 
 
 def anchors_in_memory(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, name: str) -> AnchorFile:
-    """As `read_anchors`, of tensors that came from no file; `name` tells whose they are. Raises CheckpointError."""
-    parameters, dropped = _sound(parameters, weights, name)
+    """As `read_anchors`, but from tensors of the live object `name`. Raises CheckpointError."""
+    parameters, dropped = _checked(parameters, weights, name)
     return AnchorFile(parameters, carried, weights, {}, {}, trained_scale({}, None), Origin(), notes=(f"copied from a live {name}", *dropped))
 
 
@@ -77,7 +77,7 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> tuple[dict[s
     missing = [name for name in (*POSITION, "opacity", *SCALES, *QUATERNION) if name not in columns]
     if missing or not features or not offsets or len(offsets) % 3:
         lacking = ", ".join(missing) or f"{len(offsets)} offsets and {len(features)} features do not make anchors"
-        raise CheckpointError(f"{path} is no whole anchor model, for its columns are not all there: {lacking}; export it again")
+        raise CheckpointError(f"{path} is an incomplete anchor model, columns are missing: {lacking}; export it again")
     known = {*POSITION, *NORMAL, *offsets, *features, *SCALES, "info"}
     carried = tuple(name for name in columns if name not in known)
     return {
@@ -90,20 +90,20 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> tuple[dict[s
 
 
 def to_columns(parameters: Mapping[str, Tensor], carried: tuple[str, ...], second: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns as the originals order them, all f4; those of `second` follow the position."""
+    """The columns in the original's order, all f4; those of `second` follow the position."""
     raw = {name: tensor.detach().to("cpu", torch.float32) for name, tensor in parameters.items()}
     blocks = {OFFSET: raw["offsets"].transpose(1, 2).flatten(1), FEATURE: raw["features"]}
-    held = {f"{prefix}{i}": block[:, i].numpy() for prefix, block in blocks.items() for i in range(block.shape[1])}
-    middle = tuple(held)
+    named = {f"{prefix}{i}": block[:, i].numpy() for prefix, block in blocks.items() for i in range(block.shape[1])}
+    middle = tuple(named)
     for names, block in ((POSITION, raw["means"]), (SCALES, raw["scales"]), (carried, raw[CARRIED])):
-        held |= {name: block[:, i].numpy() for i, name in enumerate(names)}
-    held |= second
+        named |= {name: block[:, i].numpy() for i, name in enumerate(names)}
+    named |= second
     order = dict.fromkeys((*POSITION, *second, *middle, "opacity", *SCALES, *QUATERNION, *carried))
-    return {name: held[name] for name in order}
+    return {name: named[name] for name in order}
 
 
 def write_beside(ply: Path, companions: Mapping[str, bytes], source: Path | None, overwrite: bool) -> None:
-    """Put the networks' files, whose names are fixed, beside a PLY. Raises OutputExists rather than spoil other anchors' networks."""
+    """Write the networks' files, whose names are fixed, beside a PLY. Raises OutputExists if networks of other anchors would be replaced."""
     differ = refuse_others(ply, companions, source, overwrite)
     for name, content in companions.items():
         if name in differ or not (ply.parent / name).exists():
@@ -112,7 +112,7 @@ def write_beside(ply: Path, companions: Mapping[str, bytes], source: Path | None
 
 
 def refuse_others(ply: Path, companions: Mapping[str, bytes], source: Path | None, overwrite: bool) -> list[str]:
-    """The files beside `ply` that differ from `companions`. Raises OutputExists where they may not be replaced."""
+    """The files beside `ply` that differ from `companions`. Raises OutputExists if they may not be replaced."""
     differ = [name for name, content in companions.items() if (ply.parent / name).exists() and (ply.parent / name).read_bytes() != content]
     if differ and (not overwrite or (source is not None and os.path.realpath(source.parent) == os.path.realpath(ply.parent))):
         raise OutputExists(f"{ply.parent} holds other networks ({', '.join(differ)}) that would be replaced; choose an empty folder")
@@ -120,7 +120,7 @@ def refuse_others(ply: Path, companions: Mapping[str, bytes], source: Path | Non
 
 
 def cfg_text(source: Path | None, target: Path, trained: TrainedScale, options: dict[str, Any]) -> str:
-    """The source's own cfg_args; where there is none, the original's usual options and those that the files tell."""
+    """The source's own cfg_args; if there is none, the original's usual options and those that follow from the files."""
     if source is not None and (source / "cfg_args").is_file():
         return (source / "cfg_args").read_bytes().decode("utf-8")
     usual = {"source_path": "", "model_path": str(target), "images": "images", "resolution": trained.resolution, "data_device": "cuda", "eval": False}
@@ -129,29 +129,29 @@ def cfg_text(source: Path | None, target: Path, trained: TrainedScale, options: 
 
 
 def needs_views(views: Any) -> None:
-    """Raise SettingsError without views: anchors show nothing by themselves."""
+    """Raise SettingsError without views: anchors have no splats without a camera."""
     if not views:
         raise SettingsError("the splats of anchors exist only for a camera; give at least one view")
 
 
-def _origin(found: Checkpoint, comments: tuple[str, ...]) -> Origin:
-    return Origin(found.path, sha256(found.path), found.folder, found.iteration, comments)
+def _origin(checkpoint: Checkpoint, comments: tuple[str, ...]) -> Origin:
+    return Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, comments)
 
 
-def _sound(parameters: dict[str, Tensor], weights: Weights, where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
-    """The finite anchors, whose networks fit them, and a note when these are not all."""
+def _checked(parameters: dict[str, Tensor], weights: Weights, where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
+    """The finite anchors, after a check that the networks fit them, and a note if some were dropped."""
     folder = where.parent if isinstance(where, Path) else where
     check_networks(weights, parameters["features"].shape[1], parameters["offsets"].shape[1], folder)
     return _finite(parameters, where)
 
 
 def _finite(parameters: dict[str, Tensor], where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
-    """The anchors that are finite once activated, and of a size that float32 can reckon with; a note when these are not all."""
+    """The anchors that are finite and at most LARGEST once activated, and a note if some were dropped."""
     values = [*parameters.values(), parameters["scales"].exp()]
-    sound = torch.stack([(value.flatten(1).abs() <= LARGEST).all(1) for value in values]).all(0)  # not so for NaN
-    if sound.all():
+    valid = torch.stack([(value.flatten(1).abs() <= LARGEST).all(1) for value in values]).all(0)  # False for NaN
+    if valid.all():
         return parameters, []
-    if not sound.any():
-        raise CheckpointError(f"{where}: none of its {len(sound):,} anchors is finite; the training or the export failed")
-    lost = f"{int((~sound).sum()):,} of {len(sound):,} anchors are not finite and were dropped"
-    return {name: tensor[sound] for name, tensor in parameters.items()}, [lost]
+    if not valid.any():
+        raise CheckpointError(f"{where}: none of its {len(valid):,} anchors is finite; the training or the export failed")
+    note = f"{int((~valid).sum()):,} of {len(valid):,} anchors are not finite and were dropped"
+    return {name: tensor[valid] for name, tensor in parameters.items()}, [note]

@@ -1,4 +1,4 @@
-"""Models of anchors: Scaffold-GS and what is built on it. A splat exists only for a camera, decoded from its anchor's features."""
+"""Anchor models: Scaffold-GS and its descendants. Splats exist only for a camera, decoded from the features of their anchors."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from mipmap_plugin.models.outputs import finite, refuse_parts
 from mipmap_plugin.models.vanilla import MIN_SCALE, VanillaModel
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
-# Views that tell how opaque an anchor gets, and those that its splats are reshaped in: networks change slowly with the direction.
+# Views sampled for the opacities of anchors, and for reshaping: the networks vary slowly with the direction.
 OPACITY_VIEWS = 12
 RESHAPE_VIEWS = 4
 
@@ -40,14 +40,14 @@ RESHAPE_VIEWS = 4
 class AnchorModel(ABC):
     """N anchors with k splats each.
 
-    Raw parameters: means [N, 3], which never move; offsets [N, k, 3]; features [N, F]; scales [N, 6] log, of the offsets and of the
-    splats; carried [N, C], columns that nothing moves. The networks are shared parameters. Those of a copy require gradients.
+    Raw parameters: means [N, 3], which are never optimized; offsets [N, k, 3]; features [N, F]; scales [N, 6] log, of the offsets and of
+    the splats; carried [N, C], constants. The networks are shared parameters. Parameters of a copy require gradients.
     """
 
     family: str
 
     def __init__(self, read: AnchorFile, inputs: Mapping[str, tuple[str, ...]]) -> None:
-        """`inputs`: what each network takes, in its order (`anchor_decoding.decode`)."""
+        """`inputs`: the inputs of each network, in order (`decoding.decode`)."""
         self._read, self._inputs = read, dict(inputs)
         self._parameters, self._weights = dict(read.parameters), read.weights
         self.source, self.folder, self.digest = read.origin.source, read.origin.folder, read.origin.digest
@@ -59,17 +59,17 @@ class AnchorModel(ABC):
 
     @property
     def traits(self) -> Traits:
-        return Traits(no_viewer="networks decode its splats for each camera, which no viewer of the list does", effects=self._effects())
+        return Traits(no_viewer="networks decode its splats for each camera, which none of the viewers does", effects=self._effects())
 
     def _effects(self) -> tuple[Effect, ...]:
-        products = sum(held.numel() for name, held in self.shared_parameters().items() if held.dim() == 2 and not name.startswith("appearance"))
+        products = sum(tensor.numel() for name, tensor in self.shared_parameters().items() if tensor.dim() == 2 and not name.startswith("appearance"))
         size = appearance_size(self._weights)
-        told = f"the embedding has {size} numbers a training view" if size else "the model has no embedding"
+        reason = f"the embedding has {size} numbers a training view" if size else "the model has no embedding"
         inputs = f"{size or ''} more inputs of the color network".strip()
         decoding = f"{products:,} multiplications an anchor in view, of {len(self):,}, for each image"
         return (
             Effect("view-dependent geometry", True, "splats are decoded from anchors for each camera", decoding),
-            Effect("appearance embedding", size > 0, told, inputs),
+            Effect("appearance embedding", size > 0, reason, inputs),
         )
 
     def gaussians(self, camera: Camera) -> Gaussians:
@@ -78,66 +78,67 @@ class AnchorModel(ABC):
         return decode(self._anchors(rows, camera), self._weights, self._inputs, camera)[0]
 
     def bake(self, camera: Camera) -> VanillaModel:
-        """A plain 3DGS model of what this camera sees, true for views near it only: colors, opacities and shapes follow the direction."""
+        """A plain 3DGS model of what this camera sees, valid near this view only: colors, opacities and shapes depend on the direction."""
         return VanillaModel.from_gaussians(self.gaussians(camera), self.trained)
 
     def parameters(self) -> dict[str, Tensor]:
+        """The raw parameters by name, without copying them."""
         return dict(self._parameters)
 
     def shared_parameters(self) -> dict[str, Tensor]:
-        """The networks and the appearances, by dotted name."""
-        return {f"{name}.{key}": held for name, state in self._weights.items() for key, held in state.items()}
+        """The weights of the networks and the appearance embedding, by dotted name."""
+        return {f"{name}.{key}": tensor for name, state in self._weights.items() for key, tensor in state.items()}
 
     def copy(self) -> AnchorModel:
-        """An independent model whose leaves require gradients; as it may change, it has no digest of a file."""
-        other = self._each(lambda tensor: tensor.detach().clone().requires_grad_())
+        """An independent model whose parameters are leaves that require gradients; it has no digest, because it may change."""
+        other = self._map(lambda tensor: tensor.detach().clone().requires_grad_())
         other.digest = ""
         return other
 
     def to(self, device: torch.device | str) -> AnchorModel:
         """A copy on another device, which requires gradients where this one does."""
-        return self._each(lambda tensor: tensor.detach().to(device, copy=True).requires_grad_(tensor.requires_grad))
+        return self._map(lambda tensor: tensor.detach().to(device, copy=True).requires_grad_(tensor.requires_grad))
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
-        """Take these very tensors as leaves, as an optimizer does. Raises ShapeError."""
-        for name, held in self._parameters.items():
+        """Use these tensors themselves as leaves, as an optimizer requires. Raises ShapeError."""
+        for name, old in self._parameters.items():
             new = parameters.get(name)
-            if new is None or new.shape[1:] != held.shape[1:] or len(new) != len(parameters["means"]):
-                raise ShapeError(f"{name}: expected shape [N, {', '.join(map(str, held.shape[1:]))}], got {None if new is None else list(new.shape)}")
+            if new is None or new.shape[1:] != old.shape[1:] or len(new) != len(parameters["means"]):
+                raise ShapeError(f"{name}: expected shape [N, {', '.join(map(str, old.shape[1:]))}], got {None if new is None else list(new.shape)}")
         leaves = {name: parameters[name] if parameters[name].is_leaf else parameters[name].detach() for name in self._parameters}
         self._parameters = {name: leaf.requires_grad_() for name, leaf in leaves.items()}
 
     @torch.no_grad()
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera]) -> None:
-        """Stretch each anchor's splats by the mean log ratio of the scales that `form` finds for them in a few of the `views`.
+        """Scale each anchor's splats by the mean log ratio of new to old scales, as `form` returns them, over a few of the `views`.
 
-        An anchor has one stretch for all its splats and no opacity of its own: opacities come from the networks, so that those of
-        `form` cannot be absorbed and are left to the optimization.
+        An anchor has one scale for all its splats and no opacity of its own: opacities come from the networks, so the opacities that
+        `form` returns are ignored and left to the optimization.
         """
         needs_views(views)
         stretch, count = torch.zeros_like(self._parameters["means"]), torch.zeros_like(self._parameters["means"][:, :1])
         for view in every_nth(views, RESHAPE_VIEWS):
-            shown, row = self._decode_all(view)
-            ratio = form(shown)[0].clamp_min(MIN_SCALE) / shown.scales.clamp_min(MIN_SCALE)
+            splats, row = self._decode_all(view)
+            ratio = form(splats)[0].clamp_min(MIN_SCALE) / splats.scales.clamp_min(MIN_SCALE)
             stretch.index_add_(0, row, ratio.log())
             count.index_add_(0, row, torch.ones_like(ratio[:, :1]))
         self._parameters["scales"][:, 3:] += stretch / count.clamp_min(1)
 
     @torch.no_grad()
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
-        """[N]: the most opaque that any splat of an anchor gets in a sample of the `views`, whether it lies inside their images or not."""
+        """The largest opacity of any splat of each anchor, [N], over a sample of the `views`, including splats outside their images."""
         needs_views(views)
         most = torch.zeros_like(self._parameters["means"][:, 0])
         for view in every_nth(views, OPACITY_VIEWS):
-            shown, row = self._decode_all(view)
-            most.scatter_reduce_(0, row, shown.opacities, "amax")
+            splats, row = self._decode_all(view)
+            most.scatter_reduce_(0, row, splats.opacities, "amax")
         return most
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
-        """Write a PLY where `path` ends in .ply, else a model folder, with the networks beside the PLY; return the PLY written.
+        """Write a PLY if `path` ends in .ply, else a model folder, with the networks beside the PLY; return the PLY written.
 
-        Networks that did not move are copied byte for byte; others are written in the form they came in. Raises OutputExists, and
-        OutputError when the disk refuses.
+        Networks that did not change are copied byte for byte; others are written in the format they were read from. Raises
+        OutputExists, and OutputError if a file cannot be written.
         """
         path, companions = Path(path), packed(self._weights, self._read.weights, self._read.companions)
         self.refuse_output(path, overwrite=overwrite)
@@ -159,31 +160,28 @@ class AnchorModel(ABC):
         return write_folder(path, self.folder, cfg_args, self._read.origin.iteration, overwrite, fill)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
-        """What `save` would refuse about `path`, before anything is done for it; `networks_move`: they will differ from what they are now.
-
-        Raises OutputExists, OutputError.
-        """
+        """Check `path` as `save` would. `networks_move`: the networks will change. Raises OutputExists, OutputError."""
         lone = path.suffix.lower() == ".ply"
         refuse_parts(path, overwrite, self.source, self.folder, None if lone else "point_cloud")
         if lone:
-            held = packed(self._weights, self._read.weights, self._read.companions)
-            refuse_others(path, dict.fromkeys(held, b"") if networks_move else held, self.source, overwrite)
+            companions = packed(self._weights, self._read.weights, self._read.companions)
+            refuse_others(path, dict.fromkeys(companions, b"") if networks_move else companions, self.source, overwrite)
 
     def _chosen(self, camera: Camera) -> Tensor:
-        """[N] bool: the anchors that are there at all for this camera; a family with levels chooses."""
+        """Which anchors exist for this camera, [N] bool; families with levels of detail override it."""
         return torch.ones_like(self._parameters["means"][:, 0], dtype=torch.bool)
 
     def _anchors(self, rows: Tensor | slice, camera: Camera | None) -> Anchors:
-        """The anchors at `rows`; a family with levels adds theirs. Without a camera no level fades."""
+        """The anchors at `rows`; families with levels of detail add the levels. Without a camera no level fades."""
         raw = self._parameters
         return Anchors(raw["means"][rows], raw["offsets"][rows], raw["features"][rows], raw["scales"][rows])
 
     @abstractmethod
     def _second_columns(self) -> dict[str, np.ndarray]:
-        """The columns that the family's PLY has behind the position."""
+        """The columns that follow the position in the family's PLY."""
 
     def _cfg_options(self) -> dict[str, Any]:
-        """The options, for a model that came without cfg_args, that make the original build these networks."""
+        """Options for a model without cfg_args, from which the original builds these networks."""
         takes = {name: f"add_{name.removesuffix('_mlp')}_dist" for name in ("opacity_mlp", "cov_mlp", "color_mlp")}
         offsets, features = self._parameters["offsets"], self._parameters["features"]
         sizes = {"feat_dim": features.shape[1], "n_offsets": offsets.shape[1], "appearance_dim": appearance_size(self._weights)}
@@ -191,7 +189,7 @@ class AnchorModel(ABC):
         return {**sizes, "use_feat_bank": "feature_bank_mlp" in self._weights, **distances}
 
     def _column(self, *names: str) -> Tensor:
-        """[N, len(names)] carried columns."""
+        """The carried columns `names`, [N, len(names)]."""
         return self._parameters[CARRIED].detach()[:, [self._read.carried.index(name) for name in names]]
 
     def _in_view(self, camera: Camera) -> Tensor:
@@ -199,7 +197,7 @@ class AnchorModel(ABC):
         return in_view(raw["means"].detach(), raw["scales"].detach()[:, :3].exp(), unit_quaternions(self._column(*QUATERNION)), camera)
 
     def _decode_all(self, camera: Camera) -> tuple[Gaussians, Tensor]:
-        """Every anchor as `camera` would meet it, and the anchor of each splat."""
+        """The splats of all anchors, decoded for `camera`, and the anchor of each splat."""
         return decode(self._anchors(slice(None), None), self._weights, self._inputs, camera)
 
     def _layout_notes(self) -> list[str]:
@@ -209,13 +207,13 @@ class AnchorModel(ABC):
                 notes.append(f"{extra} goes into {', '.join(takers)}")
         if "appearance" in self._weights:
             count = len(self._weights["appearance"]["embedding.weight"])
-            told = "its project gives the n-th test view the appearance of the n-th training view (evaluate --appearance upstream)"
-            notes.append(f"it knows the appearance of {count} training views; a camera that is none of them sees their mean, where {told}")
+            upstream = "its project gives the n-th test view the appearance of the n-th training view (evaluate --appearance upstream)"
+            notes.append(f"it has an appearance for each of {count} training views; any other camera gets their mean, where {upstream}")
         return notes
 
-    def _each(self, change: Callable[[Tensor], Tensor]) -> AnchorModel:
+    def _map(self, change: Callable[[Tensor], Tensor]) -> AnchorModel:
         other = copy.copy(self)
         other._parameters = {name: change(tensor) for name, tensor in self._parameters.items()}
-        other._weights = {name: {key: change(held) for key, held in state.items()} for name, state in self._weights.items()}
+        other._weights = {name: {key: change(tensor) for key, tensor in state.items()} for name, state in self._weights.items()}
         other.notes = list(self.notes)
         return other

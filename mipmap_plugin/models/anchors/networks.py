@@ -1,4 +1,4 @@
-"""The networks that all anchors of a Scaffold-GS or Octree-GS model share: files, shapes, and what each of them takes."""
+"""The networks that all anchors of a Scaffold-GS or Octree-GS model share: their files, shapes and inputs."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
 
-Weights = dict[str, dict[str, Tensor]]  # of each network, by the name in its state dict
+Weights = dict[str, dict[str, Tensor]]  # network -> its state dict
 
-# The files of a split checkpoint; those of NEEDED are always there.
+# The files of a split checkpoint; those of NEEDED are required.
 FILES = {
     **{"opacity_mlp": "opacity_mlp.pt", "cov_mlp": "cov_mlp.pt", "color_mlp": "color_mlp.pt"},
     **{"feature_bank_mlp": "feature_bank_mlp.pt", "appearance": "embedding_appearance.pt"},
 }
 NEEDED = ("opacity_mlp", "cov_mlp", "color_mlp")
 
-# All networks in one file, which the original writes in its other mode.
+# One file with all networks, the original's other format.
 UNITED = "checkpoints.pth"
 
 LAYERS = {"0.weight", "0.bias", "2.weight", "2.bias"}
@@ -33,12 +33,12 @@ LAST: dict[str, nn.Module] = {"opacity_mlp": nn.Tanh(), "color_mlp": nn.Sigmoid(
 
 
 def missing_networks(folder: Path) -> list[str]:
-    """The files without which the anchors in `folder` cannot be decoded."""
+    """The required network files that are missing in `folder`."""
     return [] if (folder / UNITED).is_file() else [FILES[name] for name in NEEDED if not (folder / FILES[name]).is_file()]
 
 
 def read_networks(folder: Path) -> tuple[Weights, dict[str, bytes]]:
-    """The weights beside an anchor PLY, and the files that they were read from. Raises CheckpointError."""
+    """The weights beside an anchor PLY, and the contents of the files they were read from. Raises CheckpointError."""
     if missing := missing_networks(folder):
         raise CheckpointError(f"{folder} is an incomplete checkpoint: {', '.join(missing)} must lie beside the PLY; copy the whole folder")
     split = {name: folder / file for name, file in FILES.items() if (folder / file).is_file()}
@@ -50,54 +50,56 @@ def read_networks(folder: Path) -> tuple[Weights, dict[str, bytes]]:
 
 
 def check_networks(weights: Weights, features: int, splats: int, folder: Path | str) -> None:
-    """Raise CheckpointError unless the networks are sound and fit anchors of `features` numbers and `splats` splats each."""
+    """Raise CheckpointError unless the networks are valid and fit anchors with `features` features and `splats` splats each."""
     for name, state in weights.items():
         _check(name, state, folder)
     rows = {"opacity_mlp": splats, "cov_mlp": 7 * splats, "color_mlp": 3 * splats, "feature_bank_mlp": 3}
     for name, count in rows.items():
         if name in weights and len(weights[name]["2.weight"]) != count:
-            found = len(weights[name]["2.weight"])
-            raise CheckpointError(f"{folder}: {name} gives {found} numbers, but anchors with {splats} splats need {count}; the files do not match")
+            outputs = len(weights[name]["2.weight"])
+            raise CheckpointError(f"{folder}: {name} gives {outputs} numbers, but anchors with {splats} splats need {count}; the files do not match")
     if "feature_bank_mlp" in weights and features % 4:
         raise CheckpointError(f"{folder}: a feature bank needs features in fours, but the anchors have {features}; the files do not match")
 
 
 def refuse_infinite(name: str, state: Mapping[str, Tensor]) -> None:
-    """Raise SettingsError for a network that is not finite, which nobody could read again."""
-    if not all(bool(held.isfinite().all()) for held in state.values()):
+    """Raise SettingsError for a network that is not finite, which could not be loaded again."""
+    if not all(bool(tensor.isfinite().all()) for tensor in state.values()):
         raise SettingsError(f"{name} holds weights that are not finite, so nothing is saved; adapt less boldly, or to another scale")
 
 
 def surplus(weights: Weights, name: str, features: int) -> int:
-    """How many numbers a network takes besides an anchor's features, the direction of view, and the appearance."""
+    """The number of a network's inputs besides the anchor's features, the viewing direction, and the appearance."""
     known = features if name != "feature_bank_mlp" else 0
     return weights[name]["0.weight"].shape[1] - known - 3 - (appearance_size(weights) if name == "color_mlp" else 0)
 
 
 def appearance_size(weights: Weights) -> int:
+    """The length of an appearance embedding; 0 if the model has none."""
     return weights["appearance"][EMBEDDING].shape[1] if "appearance" in weights else 0
 
 
 def packed(weights: Weights, read: Weights, files: Mapping[str, bytes]) -> dict[str, bytes]:
-    """The `files` of `weights`, of which those whose network is still as it was `read` stay byte for byte.
+    """The files of `weights`, by name. Networks that equal those `read` keep the bytes of their `files`.
 
-    Others take the form that they had: one file of state dicts, or the TorchScript that the original loads, for which networks
-    are built and traced here, so that no program of the original files runs. Those that came from no file become TorchScript.
+    Others keep their format: one file of state dicts, or the TorchScript that the original loads, which is built and traced from
+    modules of this package, so that no code of the original files runs. Networks without a file become TorchScript.
     """
-    moved = {name for name, state in weights.items() if any(not torch.equal(held.cpu(), read[name][key].cpu()) for key, held in state.items())}
+    changed = {name for name, state in weights.items() if any(not torch.equal(tensor.cpu(), read[name][key].cpu()) for key, tensor in state.items())}
     if UNITED in files:
-        return {UNITED: _united(weights)} if moved else dict(files)
-    return {FILES[name]: _traced(name, state) if name in moved or FILES[name] not in files else files[FILES[name]] for name, state in weights.items()}
+        return {UNITED: _united(weights)} if changed else dict(files)
+    kept = {FILES[name] for name in weights if name not in changed and FILES[name] in files}
+    return {FILES[name]: files[FILES[name]] if FILES[name] in kept else _traced(name, state) for name, state in weights.items()}
 
 
 def _united(weights: Weights) -> bytes:
     content = io.BytesIO()
-    torch.save({name: {key: held.detach().cpu() for key, held in state.items()} for name, state in weights.items()}, content)
+    torch.save({name: {key: tensor.detach().cpu() for key, tensor in state.items()} for name, state in weights.items()}, content)
     return content.getvalue()
 
 
 class _Appearance(nn.Module):
-    """One vector for each training view, under the name that the original gives it."""
+    """One embedding per training view, under the original's name."""
 
     def __init__(self, count: int, size: int) -> None:
         super().__init__()
@@ -115,10 +117,10 @@ def _traced(name: str, state: dict[str, Tensor]) -> bytes:
         (hidden, width), count = state["0.weight"].shape, len(state["2.weight"])
         last = [LAST[name]] if name in LAST else []
         network, example = nn.Sequential(nn.Linear(width, hidden), nn.ReLU(True), nn.Linear(hidden, count), *last), torch.zeros(1, width)
-    network.load_state_dict({key: held.detach().cpu() for key, held in state.items()})
+    network.load_state_dict({key: tensor.detach().cpu() for key, tensor in state.items()})
     content = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of torch.jit, which is the only writer of what the original reads
+        warnings.simplefilter("ignore", DeprecationWarning)  # of torch.jit, the only way to write the original's format
         torch.jit.save(torch.jit.trace(network, example), content)
     return content.getvalue()
 
@@ -132,7 +134,7 @@ def _read_united(path: Path) -> Weights:
 
 def _check(name: str, state: dict[str, Tensor], folder: Path | str) -> None:
     wanted = {EMBEDDING} if name == "appearance" else LAYERS
-    if state.keys() != wanted or not all(isinstance(held, Tensor) and held.dtype == torch.float32 for held in state.values()):
+    if state.keys() != wanted or not all(isinstance(tensor, Tensor) and tensor.dtype == torch.float32 for tensor in state.values()):
         raise CheckpointError(f"{folder}: {name} holds {', '.join(sorted(map(str, state))) or 'nothing'}, not {', '.join(sorted(wanted))} in 32 bits")
     if name == "appearance":
         fits = state[EMBEDDING].dim() == 2
@@ -141,5 +143,5 @@ def _check(name: str, state: dict[str, Tensor], folder: Path | str) -> None:
         fits = first.dim() == second.dim() == 2 and len(first) == second.shape[1] == hidden and state["2.bias"].shape == second.shape[:1]
     if not fits:
         raise CheckpointError(f"{folder}: the layers of {name} do not fit together; copy the checkpoint again")
-    if not all(bool(held.isfinite().all()) for held in state.values()):
+    if not all(bool(tensor.isfinite().all()) for tensor in state.values()):
         raise CheckpointError(f"{folder}: {name} holds weights that are not finite; the training failed")

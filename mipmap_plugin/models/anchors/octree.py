@@ -1,4 +1,4 @@
-"""Octree-GS (Ren et al. 2024): anchors in levels of detail, of which a camera sees those as coarse as its distance asks for."""
+"""Octree-GS (Ren et al. 2024): anchors in levels of detail, which are chosen by the camera's distance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mipmap_plugin.models.anchors.files import AnchorFile, read_anchors
 from mipmap_plugin.models.anchors.model import AnchorModel
 from mipmap_plugin.models.anchors.networks import NEEDED, surplus
 
-# How a distance becomes a level: `dist2level` of cfg_args. Progressive levels fade in.
+# Rounding of a distance to a level, by `dist2level` of cfg_args. Progressive levels fade in.
 TO_LEVEL = {"floor": torch.floor, "round": torch.round, "ceil": torch.ceil}
 PROGRESSIVE = "progressive"
 MAX_LEVELS, MAX_FORK = 100, 1000  # published models have 5 to 20 levels, each 2 times finer
@@ -33,10 +33,10 @@ class OctreeModel(AnchorModel):
     family = "octree"
 
     def __init__(self, read: AnchorFile, inputs: dict[str, tuple[str, ...]], fork: float, to_level: str) -> None:
-        """`fork`: how many times finer each level is; `to_level`: a key of TO_LEVEL or PROGRESSIVE."""
+        """`fork`: ratio of resolutions of successive levels; `to_level`: a key of TO_LEVEL, or PROGRESSIVE."""
         self._fork, self._to_level = fork, to_level
         # The original keeps two constants in the first rows of a column (scene/gaussian_model.py, save_ply).
-        self._voxel_size, self._standard_distance = (float(each) for each in read.first["info"])
+        self._voxel_size, self._standard_distance = (float(value) for value in read.first["info"])
         super().__init__(read, inputs)
         levels = self._column("level")
         self._levels = int(levels.max() - levels.min()) + 1
@@ -45,11 +45,11 @@ class OctreeModel(AnchorModel):
         self.notes.append(f"{self._levels} levels of detail, chosen by distance and zoom ({to_level}, each {fork:g} times finer)")
 
     def _effects(self) -> tuple[Effect, ...]:
-        told = f"{self._levels} of them, chosen by distance and zoom ({self._to_level})"
-        return (*super()._effects(), Effect("levels of detail", self._levels > 1, told, f"a distance and a logarithm an anchor, of {len(self):,}"))
+        reason = f"{self._levels} of them, chosen by distance and zoom ({self._to_level})"
+        return (*super()._effects(), Effect("levels of detail", self._levels > 1, reason, f"a distance and a logarithm an anchor, of {len(self):,}"))
 
     def wanted_levels(self, camera: Camera) -> Tensor:
-        """[N] the level that `camera` asks for at each anchor, with a fraction where levels fade."""
+        """The level that `camera` requires at each anchor, [N], fractional if levels fade."""
         level, extra = self._column("level", "extra_level").unbind(1)
         corner = self._parameters["means"].detach() + (self._voxel_size / 2) / self._fork ** level[:, None]
         distance = (corner - camera.center.to(corner)).norm(dim=1) / camera.zoom
@@ -59,10 +59,10 @@ class OctreeModel(AnchorModel):
         return TO_LEVEL[self._to_level](wanted).clamp(0, self._levels - 1)
 
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
-        """[N] as for any anchors, but that of one anchor of the coarsest level is 1, and that of two in all, so that they are never pruned.
+        """As for other anchors, [N], but 1 for one anchor of the coarsest level, and for two in all, so that they are never pruned.
 
-        The original counts its levels from the coarsest that a file has (scene/gaussian_model.py, load_ply_sparse_gaussian), and shows
-        none that is finer than their number: without the coarsest it would lose the finest. Its constants need two rows.
+        The original numbers levels from the coarsest in the file (scene/gaussian_model.py, load_ply_sparse_gaussian) and shows none
+        above their count: without the coarsest level it would lose the finest. Its constants need two rows.
         """
         opacities, levels = super().row_opacities(views), self._column("level")[:, 0]
         opacities[opacities.where(levels == levels.min(), -1.0).argmax()] = 1.0
@@ -89,7 +89,7 @@ class OctreeModel(AnchorModel):
         return {"level": levels[:, 0], "extra_level": levels[:, 1], "info": info}
 
     def _cfg_options(self) -> dict[str, Any]:
-        level = any("level" in taken for taken in self._inputs.values())
+        level = any("level" in names for names in self._inputs.values())
         grid = {"fork": self._fork, "extend": 1.1, "dist2level": self._to_level, "base_layer": -1, "levels": self._levels, "extra_ratio": 0.25}
         return {**super()._cfg_options(), "add_level": level, **grid, "resolution_scales": [1.0], "random_background": False}
 
@@ -97,11 +97,11 @@ class OctreeModel(AnchorModel):
 def load_octree(path: str | Path, *, iteration: int | None = None) -> OctreeModel:
     """Load an Octree-GS model folder, or its PLY with the networks beside it.
 
-    Which networks take a distance or a level follows from their shapes and, where these leave a doubt, from cfg_args.
+    Which networks take a distance or a level follows from their shapes and, if these are ambiguous, from cfg_args.
     Raises CheckpointError.
     """
     read = read_anchors(path, "octree", iteration)
-    if len(read.first["info"]) < 2 or not all(math.isfinite(each) and each > 0 for each in read.first["info"]):
+    if len(read.first["info"]) < 2 or not all(math.isfinite(value) and value > 0 for value in read.first["info"]):
         raise CheckpointError(f"{read.origin.source}: the first two values of `info` are no voxel size and standard distance; export it again")
     fork, to_level = read.options.get("fork", 2), read.options.get("dist2level", "round")
     if not isinstance(fork, (int, float)) or not 1 < fork <= MAX_FORK or to_level not in (*TO_LEVEL, PROGRESSIVE):
@@ -113,7 +113,7 @@ def load_octree(path: str | Path, *, iteration: int | None = None) -> OctreeMode
 
 
 def _inputs(read: AnchorFile) -> dict[str, tuple[str, ...]]:
-    """What each network takes: features, direction, and as widths and options tell, distance, level and appearance."""
+    """The inputs of each network: features, direction and, depending on widths and options, distance, level and appearance."""
     features = read.parameters["features"].shape[1]
     extras = {name: surplus(read.weights, name, features) for name in NEEDED}
     level = _takes_level(read, extras)
@@ -131,7 +131,7 @@ def _inputs(read: AnchorFile) -> dict[str, tuple[str, ...]]:
 
 
 def _takes_level(read: AnchorFile, extras: dict[str, int]) -> bool:
-    """Whether levels go into the networks, into all or none. One number more may be a distance or a level; what can decide, does."""
+    """Whether all networks take the level, or none. One additional input may be a distance or a level; other facts may decide."""
     if "feature_bank_mlp" in read.weights:
         return surplus(read.weights, "feature_bank_mlp", 0) == 1
     if 0 in extras.values():

@@ -1,4 +1,4 @@
-"""The voxel prefilter of anchor models: which anchors a camera decodes at all. The original's culling in pure torch."""
+"""The voxel prefilter of anchor models: which anchors are decoded for a camera. The original's culling in pure torch."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, FRUSTUM_MARGIN, NEAR_PLANE
 
-TILE = 16  # px: the original draws in tiles of this size, and an anchor that touches the outermost tile is in view
-
-# The share of the half field of view beyond which the projection's slope is frozen (diff-gaussian-rasterization, forward.cu).
+TILE = 16  # px: the original renders in tiles of this size, and an anchor that touches the outermost tile is in view
 
 
 @torch.no_grad()
 def in_view(means: Tensor, scales: Tensor, quats: Tensor, camera: Camera) -> Tensor:
-    """[N] bool: the anchors whose ellipse of three standard deviations touches a tile of the image.
+    """Which anchors' ellipses of three standard deviations touch a tile of the image, [N] bool.
 
     `means` [N, 3], `scales` [N, 3] (lengths) and unit `quats` [N, 4] wxyz are the anchors' own, in world units.
     """
@@ -24,14 +22,14 @@ def in_view(means: Tensor, scales: Tensor, quats: Tensor, camera: Camera) -> Ten
     depth = z.clamp_min(NEAR_PLANE)
     u, v = x / depth, y / depth
     radius = _radius(_axes(scales, quats) @ viewmat[:3, :3].T, u, v, depth, camera)
-    # The original's pixel centers lie at whole numbers; a tile more than half beyond the border still counts on the far side.
+    # The original's pixel centers lie at integers; on the far sides, whole tiles count although they extend beyond the border.
     right, down = camera.fx * u + camera.cx - 0.5, camera.fy * v + camera.cy - 0.5
     far_x, far_y = (TILE * -(-side // TILE) for side in (camera.width, camera.height))
     return (z > NEAR_PLANE) & (right + radius >= 1) & (right - radius < far_x) & (down + radius >= 1) & (down - radius < far_y)
 
 
 def _axes(scales: Tensor, quats: Tensor) -> Tensor:
-    """[N, 3, 3]: in each row one axis of the ellipsoid, turned by its quaternion."""
+    """The axes of each ellipsoid, rotated by its quaternion, as rows [N, 3, 3]."""
     axes = torch.diag_embed(scales)
     w, xyz = quats[:, None, :1], quats[:, None, 1:].expand_as(axes)
     turned = torch.linalg.cross(xyz, axes)
@@ -39,9 +37,9 @@ def _axes(scales: Tensor, quats: Tensor) -> Tensor:
 
 
 def _radius(axes: Tensor, u: Tensor, v: Tensor, depth: Tensor, camera: Camera) -> Tensor:
-    """[N] whole px: three standard deviations along the longer axis of the dilated ellipse."""
-    u = _frozen(u, camera.cx / camera.fx, camera.width / camera.fx)
-    v = _frozen(v, camera.cy / camera.fy, camera.height / camera.fy)
+    """Three standard deviations along the longer axis of the dilated ellipse, rounded up, [N] px."""
+    u = _clamped(u, camera.cx / camera.fx, camera.width / camera.fx)
+    v = _clamped(v, camera.cy / camera.fy, camera.height / camera.fy)
     across = camera.fx / depth[:, None] * (axes[..., 0] - u[:, None] * axes[..., 2])
     along = camera.fy / depth[:, None] * (axes[..., 1] - v[:, None] * axes[..., 2])
     xx, yy = across.square().sum(1) + DILATION, along.square().sum(1) + DILATION
@@ -50,7 +48,7 @@ def _radius(axes: Tensor, u: Tensor, v: Tensor, depth: Tensor, camera: Camera) -
     return (3 * longest.sqrt()).ceil()
 
 
-def _frozen(slope: Tensor, left: float, whole: float) -> Tensor:
-    """Slopes outside the widened frustum become those of its border. `left`: of the image's left edge; `whole`: of its width."""
+def _clamped(slope: Tensor, left: float, whole: float) -> Tensor:
+    """Clamp slopes to the widened frustum. `left`: minus the slope of the image's left edge; `whole`: the slope of its width."""
     margin = FRUSTUM_MARGIN * whole / 2
     return slope.clamp(-left - margin, whole - left + margin)

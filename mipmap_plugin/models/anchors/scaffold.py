@@ -16,7 +16,7 @@ from mipmap_plugin.models.columns import NORMAL, QUATERNION
 
 
 class ScaffoldModel(AnchorModel):
-    """Anchors that are all there for every camera."""
+    """Anchors without levels of detail."""
 
     family = "scaffold"
 
@@ -41,13 +41,13 @@ def load_scaffold(path: str | Path, *, iteration: int | None = None) -> Scaffold
 
 
 def scaffold_in_memory(parameters: dict[str, Tensor], weights: Weights, name: str) -> ScaffoldModel:
-    """The model of raw tensors, whose `carried` are the opacity and the quaternion; `name` tells whose they are. Raises CheckpointError."""
+    """The model of raw tensors of the live object `name`, with opacity and quaternion in `carried`. Raises CheckpointError."""
     read = anchors_in_memory(parameters, ("opacity", *QUATERNION), weights, name)
     return ScaffoldModel(read, _inputs(read, name))
 
 
 def _inputs(read: AnchorFile, where: Path | str | None) -> dict[str, tuple[str, ...]]:
-    """What each network takes: features, direction, and as the widths tell, distance and appearance."""
+    """The inputs of each network: features, direction and, depending on the widths, distance and appearance."""
     features = read.parameters["features"].shape[1]
     inputs: dict[str, tuple[str, ...]] = {}
     for name in NEEDED:

@@ -1,4 +1,4 @@
-"""The world of a gsplat checkpoint: the scene's, normalized by a similarity that the trainer computes and does not save.
+"""The coordinate frame of a gsplat checkpoint: that of the scene, normalized by a similarity that the trainer computes but does not save.
 
 The formulas are those of gsplat's examples/datasets/normalize.py (Apache-2.0).
 """
@@ -13,22 +13,22 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 
-# The half turns that principal axes leave open: the signs of eigenvectors differ between machines, and later versions of gsplat
-# turn a scene that lies on its head.
+# Rotations by 180 degrees that principal axes leave undetermined: the signs of eigenvectors differ between machines, and later versions
+# of gsplat turn upside-down scenes over.
 HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
-# As many points and splats are compared: enough to tell a scene from its half turns.
+# Numbers of points and splats that are compared: enough to distinguish the half turns.
 POINTS, SPLATS = 1000, 20_000
 
-# The median point lies this near to a splat, in a world whose cameras stand around 1 from its center; else it is another scene.
+# Largest median distance from points to splats, in a frame whose cameras are about 1 from the center; above it, it is another scene.
 NEAR_ENOUGH = 0.2
 
 
 def normalized_frame(cameras: Sequence[Camera], points: Tensor, means: Tensor) -> Tensor:
-    """[4, 4] float64 similarity from the scene's world to the checkpoint's.
+    """The similarity [4, 4] float64 from the world of the scene to that of the checkpoint.
 
-    Found from all cameras of the COLMAP scene and its points [P, 3]; of the half turns that are left open, the one is taken
-    that brings the points nearest to the splats at `means` [N, 3]. Raises SceneError when none does.
+    Computed from all cameras of the COLMAP scene and its points [P, 3]. Among the undetermined half turns, the one that brings the
+    points closest to the splats at `means` [N, 3] is chosen. Raises SceneError if they are too far apart.
     """
     points, means = points.double(), means.detach().to("cpu", torch.float64)
     upright = _around_cameras(cameras)
@@ -36,12 +36,12 @@ def normalized_frame(cameras: Sequence[Camera], points: Tensor, means: Tensor) -
     frames = [torch.diag(torch.tensor([*turn, 1], dtype=torch.float64)) @ aligned for turn in HALF_TURNS]
     gaps = [_median_gap(_moved(points, frame), means) for frame in frames]
     if min(gaps) > NEAR_ENOUGH:
-        raise SceneError("the points of the COLMAP scene do not lie at the splats, so that it is another than gsplat trained on; give that one")
+        raise SceneError("the points of the COLMAP scene do not match the splats; give the scene that gsplat was trained on")
     return frames[gaps.index(min(gaps))]
 
 
 def _around_cameras(cameras: Sequence[Camera]) -> Tensor:
-    """[4, 4]: up is -y, the point that the cameras look at is the origin, and they stand 1 from it (medians)."""
+    """[4, 4]: up is -y, the point that the cameras look at is the origin, and their median distance from it is 1."""
     to_world = torch.stack([camera.viewmat[:3, :3].T for camera in cameras])
     centers = torch.stack([camera.center for camera in cameras])
     up = -to_world[:, :, 1].mean(0)
@@ -54,11 +54,11 @@ def _around_cameras(cameras: Sequence[Camera]) -> Tensor:
 
 
 def _turn_to_minus_y(up: Tensor) -> Tensor:
-    """[3, 3] rotation that takes the unit vector `up` to -y, by Rodrigues' formula."""
+    """The rotation [3, 3] that takes the unit vector `up` to -y, by Rodrigues' formula."""
     down = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     cosine = down @ up
     if cosine <= -1:
-        return torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))  # gsplat has a mirror here, in which no camera can stand
+        return torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))  # gsplat has a reflection here, which is no valid camera transform
     x, y, z = torch.linalg.cross(up, down).tolist()
     skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + skew + skew @ skew / (1 + cosine)

@@ -22,11 +22,11 @@ from mipmap_plugin.formats.yaml_scalars import read_scalars, with_scalar
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.gsplat.frame import normalized_frame
-from mipmap_plugin.models.hosts import Taken
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.places import GSPLAT
 from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
-from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_poison
+from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_invalid
 
 NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 
@@ -38,19 +38,19 @@ UNKNOWN = (
     " splats (2DGS), whose files look the same"
 )
 
-# What float32 holds; a text may have any number of digits.
+# Larger numbers overflow float32; a text may have any number of digits.
 MAX_OPTION = 1e38
 
 
 @dataclass(frozen=True, eq=False)
 class GsplatHost:
-    """What a gsplat checkpoint has besides its splats."""
+    """The contents of a gsplat checkpoint other than its splats."""
 
     family = "gsplat"
     folder: Path | None = None  # the result folder
     options: dict[str, Any] = field(default_factory=dict)  # of its cfg.yml
     siblings: dict[str, Any] = field(default_factory=lambda: {"step": 0})  # of "splats" in the file: the step, poses, ...
-    means: str = "means"  # what the file calls them; "means3d" in gsplat 1.0.0
+    means: str = "means"  # name of the means in the file; "means3d" in gsplat 1.0.0
 
     def write(self, path: Path, parameters: dict[str, Tensor], comments: Sequence[str], *, overwrite: bool) -> Path:
         """Write one .pt file, or a result folder with the cfg of the source; return the .pt file. Raises OutputExists."""
@@ -67,14 +67,14 @@ class GsplatHost:
     def holds(self, path: Path) -> str | None:
         return None if path.suffix == ".pt" else "ckpts"
 
-    def as_trained(self, cameras: Sequence[Camera], taken: Taken, means: Tensor) -> list[Camera]:
-        """Resized by `data_factor`, and moved into the normalized world, which is found again from the cameras and points."""
-        points, resized = taken.points, _shrunk(cameras, int(_positive(self.options, "data_factor", 1)), taken)
+    def as_trained(self, cameras: Sequence[Camera], capture: Capture, means: Tensor) -> list[Camera]:
+        """The cameras resized by `data_factor`, in the normalized frame, which is recomputed from the cameras and points."""
+        points, resized = capture.points, _shrunk(cameras, int(_positive(self.options, "data_factor", 1)), capture)
         if not self.options.get("normalize_world_space", True):  # always on before version 1.4, which had no such option
             return resized
         if points is None:
             advice = "give the COLMAP scene that it was trained on"
-            raise SceneError(f"gsplat trained in a normalized world, whose place is found from the points of COLMAP: {advice}")
+            raise SceneError(f"gsplat trained in a normalized coordinate frame, which is computed from the points of COLMAP: {advice}")
         frame = normalized_frame(cameras, points, means)
         return [camera.moved(frame) for camera in resized]
 
@@ -92,15 +92,15 @@ class GsplatHost:
 
 def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     """Load a .pt file with all ranks of its step, or the newest step (or step `iteration`) of a result folder. Raises CheckpointError."""
-    found = detect(path, iteration=iteration)
-    files = rank_files(found.path)
+    checkpoint = detect(path, iteration=iteration)
+    files = rank_files(checkpoint.path)
     shards = [_read(file) for file in files]
-    options, notes = _options(found.folder)
+    options, notes = _options(checkpoint.folder)
     means = "means3d" if "means3d" in shards[0]["splats"] else "means"
     siblings = {name: value for name, value in shards[0].items() if name not in ("splats", "comments", "step")}
     step, comments = step_and_comments(shards[0], files[0])
-    host = GsplatHost(found.folder, options, {"step": step, **siblings}, means)
-    origin = Origin(files[0], sha256(*files), found.folder, found.iteration, comments, host=host)
+    host = GsplatHost(checkpoint.folder, options, {"step": step, **siblings}, means)
+    origin = Origin(files[0], sha256(*files), checkpoint.folder, checkpoint.iteration, comments, host=host)
     parts = [_parameters(shard["splats"], file) for shard, file in zip(shards, files, strict=True)]
     try:
         parameters = {name: torch.cat([part[name] for part in parts]) for name in NAMES}
@@ -108,20 +108,20 @@ def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaMod
         kind, trained = (SurfelModel, flat_trained(_trained(options, None))) if flat else (VanillaModel, _trained(options, render_mode(comments)))
         model = kind(parameters, trained, origin, [*notes, *[FLAT_NOTE] * flat])
     except (ShapeError, RuntimeError) as error:  # what torch.cat raises for ranks that do not fit together
-        raise CheckpointError(f"{found.path} holds tensors that do not fit together: {error}; copy it again") from error
+        raise CheckpointError(f"{checkpoint.path} holds tensors that do not fit together: {error}; copy it again") from error
     if len(files) > 1:
         model.notes.append(f"the splats of {len(files)} ranks are put together: {', '.join(file.name for file in files)}")
-    model.notes += _oddities(options, siblings, model.sh_degree)
-    return without_poison(model)
+    model.notes += _unusual_options(options, siblings, model.sh_degree)
+    return without_invalid(model)
 
 
 def rank_files(path: Path) -> list[Path]:
-    """The files of the same step as `path`, in the order of their ranks. Raises CheckpointError when one between is missing."""
+    """The files of the same step as `path`, in the order of their ranks. Raises CheckpointError if a rank in between is missing."""
     name = re.fullmatch(GSPLAT[1], path.name)
     if not name or name["rank"] is None:
         return [path]
     siblings = (re.fullmatch(GSPLAT[1], file.name) for file in path.absolute().parent.iterdir())
-    ranks = {int(each["rank"]): path.with_name(each.string) for each in siblings if each and each["rank"] and each["step"] == name["step"]}
+    ranks = {int(file["rank"]): path.with_name(file.string) for file in siblings if file and file["rank"] and file["step"] == name["step"]}
     if len(ranks) <= max(ranks):
         missing = next(rank for rank in count() if rank not in ranks)
         raise CheckpointError(f"{path} is one of the files of several GPUs, and rank {missing} of step {name['step']} is missing; copy it there")
@@ -136,7 +136,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """The tensors by gsplat's present names, float32. Raises CheckpointError."""
+    """The tensors with the names of current gsplat versions, float32. Raises CheckpointError."""
     named = {"means" if name == "means3d" else name: tensor for name, tensor in splats.items()}
     if {"features", "colors"} & set(named):
         advice = "train without app_opt, or export a PLY from gsplat (save_ply), which bakes one appearance"
@@ -146,13 +146,13 @@ def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
     return {name: named[name].detach().float() for name in NAMES}
 
 
-def _shrunk(cameras: Sequence[Camera], factor: int, taken: Taken) -> list[Camera]:
-    """The cameras as simple_trainer has them (examples/datasets/colmap.py): intrinsics over `factor`, then times what the first photograph
-    of images_<factor> measures over a size that was rounded off. Without photographs they are taken to be rounded to the nearest."""
+def _shrunk(cameras: Sequence[Camera], factor: int, capture: Capture) -> list[Camera]:
+    """The cameras as in simple_trainer (examples/datasets/colmap.py): intrinsics divided by `factor`, then multiplied by the size of the
+    first photograph of images_<factor> divided by the truncated size. Without photographs, their size is assumed to be rounded."""
     if factor < 2 or not cameras:
         return list(cameras)
     first = cameras[0]
-    actual = (taken.smaller(factor) if taken.smaller else None) or (max(1, round(first.width / factor)), max(1, round(first.height / factor)))
+    actual = (capture.smaller(factor) if capture.smaller else None) or (max(1, round(first.width / factor)), max(1, round(first.height / factor)))
     across, down = (size / max(1, whole // factor) for size, whole in zip(actual, (first.width, first.height), strict=True))
     return [_divided(camera, factor, across, down) for camera in cameras]
 
@@ -192,7 +192,7 @@ def _positive(options: dict[str, Any], key: str, default: float) -> float:
     return value if isinstance(value, (int, float)) and 0 < value < MAX_OPTION else default
 
 
-def _oddities(options: dict[str, Any], siblings: dict[str, Any], sh_degree: int) -> list[str]:
+def _unusual_options(options: dict[str, Any], siblings: dict[str, Any], sh_degree: int) -> list[str]:
     notes = []
     if options.get("sh_degree", sh_degree) != sh_degree:
         notes.append(f"the cfg says SH degree {options['sh_degree']}, but the splats have degree {sh_degree}; the splats are trusted")

@@ -1,4 +1,4 @@
-"""Deformable 3D Gaussians (Yang et al. 2024): canonical splats, and a network that shifts, turns and scales them at a time."""
+"""Deformable 3D Gaussians (Yang et al. 2024): canonical splats, and a network that translates, rotates and scales them over time."""
 
 from __future__ import annotations
 
@@ -20,41 +20,42 @@ from mipmap_plugin.models.vanilla import VanillaModel
 POSITION_FREQUENCIES, TIME_FREQUENCIES = 10, 10
 POSITION_INPUTS, TIME_INPUTS = 3 + 6 * POSITION_FREQUENCIES, 1 + 2 * TIME_FREQUENCIES
 
-# The published code adds it to each component of the screw axis, to no end of its own; the network was trained with it.
+# The published code adds this to each component of the screw axis, without need; the network was trained with it.
 SCREW_OFFSET = 1e-5
 
-# Radians: below it (angle - sin(angle)) / angle**3 is taken from its series, which is exact there to 1e-9.
+# Radians: below it (angle - sin(angle)) / angle**3 is computed from its series, which is exact there to 1e-9.
 SMALL_ANGLE = 0.5
 
-# Splats that go through the network together: a few hundred numbers for each are held at a time.
+# Splats that are evaluated together: a few hundred numbers each are in memory at a time.
 CHUNK = 65_536
 
 
 class DeformNetwork:
-    """A multilayer perceptron of position and time. Its variants are told from its weights: `timenet` (for synthetic scenes), 6-DoF."""
+    """A multilayer perceptron of position and time. Its variants, `timenet` (for synthetic scenes) and 6-DoF, are recognized by its weights."""
 
     changes_opacities = False
 
     def __init__(self, weights: Mapping[str, Tensor], where: str = "the network") -> None:
-        """Take the tensors of a `deform.pth` by name. Raises CheckpointError, with `where` as its subject."""
+        """`weights`: the tensors of a `deform.pth` by name. Raises CheckpointError, whose message begins with `where`."""
         self._weights = {name: tensor.detach().float() for name, tensor in weights.items()}
         self.depth = sum(bool(re.fullmatch(r"linear\.\d+\.weight", name)) for name in weights)
         self.has_timenet = "timenet.0.weight" in weights
         self.is_6dof = "branch_w.weight" in weights
         if self.depth == 0:
-            held = ", ".join(sorted({name.partition(".")[0] for name in weights})[:4]) or "nothing"
-            raise CheckpointError(f"{where}: it has no layers linear.0, linear.1, ..., but {held}, so a changed copy of the project trained it")
-        told_by = ["linear.0.weight", *(["timenet.0.weight", "timenet.2.weight"] if self.has_timenet else [])]
-        require(self._weights, dict.fromkeys(told_by, (-1, -1)), where)
+            layers = ", ".join(sorted({name.partition(".")[0] for name in weights})[:4]) or "nothing"
+            raise CheckpointError(f"{where}: it has no layers linear.0, linear.1, ..., but {layers}, so a changed copy of the project trained it")
+        first_layers = ["linear.0.weight", *(["timenet.0.weight", "timenet.2.weight"] if self.has_timenet else [])]
+        require(self._weights, dict.fromkeys(first_layers, (-1, -1)), where)
         self._refuse_other_inputs(where)
         require(self._weights, self._shapes(), where)
         self.is_still = not any(self._weights[f"{head}.{part}"].any() for head in self._heads for part in ("weight", "bias"))
         self.cost = f"{sum(w.numel() for name, w in self._weights.items() if name.endswith('weight')):,} multiplications a splat and moment"
 
     def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
-        """The splats as the original's kernel sees them: scales grow linearly and may turn negative, quaternions do not stay of length 1."""
+        """The splats as the original's kernel receives them: scales are changed additively and may become negative, quaternions are not
+        normalized."""
         still = canonical.gaussians()
-        # Detached: the original's means have no gradient through the network either, and no graph is kept for it.
+        # Detached: in the original, too, means have no gradient through the network.
         motion, turn, growth = self.motion(still.means.detach(), time)
         means = move_along_screw(still.means, *motion.split(3, dim=1)) if self.is_6dof else still.means + motion
         quats, scales = still.quats + turn, still.scales + growth
@@ -62,16 +63,17 @@ class DeformNetwork:
 
     @torch.no_grad()
     def motion(self, means: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Shifts [N, 3], or screws [N, 6] with 6-DoF; changes of quaternions [N, 4] and of scales [N, 3]."""
+        """Translations [N, 3], or screws [N, 6] with 6-DoF; changes of quaternions [N, 4] and of scales [N, 3]."""
         moment = embed(means.new_tensor([[time]]), self._frequencies_of_time)
         if self.has_timenet:
             moment = self._layer("timenet.2", relu(self._layer("timenet.0", moment)))
         hidden = [self._hidden(part, moment) for part in means.split(CHUNK)]
-        each = [[self._layer(head, h) for head in self._heads] for h in hidden]
-        *motion, turn, growth = (torch.cat(parts) for parts in zip(*each, strict=True))
+        chunks = [[self._layer(head, h) for head in self._heads] for h in hidden]
+        *motion, turn, growth = (torch.cat(parts) for parts in zip(*chunks, strict=True))
         return torch.cat(motion, dim=1), turn, growth
 
     def to(self, device: torch.device | str) -> DeformNetwork:
+        """The same network on another device."""
         return DeformNetwork({name: tensor.to(device) for name, tensor in self._weights.items()})
 
     @property
@@ -92,7 +94,7 @@ class DeformNetwork:
 
     @property
     def _heads(self) -> dict[str, int]:
-        """The last layers by name, and how many numbers each gives."""
+        """The output layers by name, with the number of outputs of each."""
         motion = {"branch_w": 3, "branch_v": 3} if self.is_6dof else {"gaussian_warp": 3}
         return {**motion, "gaussian_rotation": 4, "gaussian_scaling": 3}
 
@@ -100,11 +102,11 @@ class DeformNetwork:
         inputs = self._weights["linear.0.weight"].shape[-1]
         moment = len(self._weights["timenet.2.weight"]) if self.has_timenet else TIME_INPUTS
         if inputs != POSITION_INPUTS + moment:
-            told = f"its first layer takes {inputs} numbers, not {POSITION_INPUTS} of the position and {moment} of the time"
-            raise CheckpointError(f"{where}: {told}, so a changed copy of the project trained it, with frequencies that the file does not tell")
+            reason = f"its first layer takes {inputs} numbers, not {POSITION_INPUTS} of the position and {moment} of the time"
+            raise CheckpointError(f"{where}: {reason}, so a changed copy of the project trained it, with frequencies that the file does not tell")
 
     def _shapes(self) -> dict[str, tuple[int, ...]]:
-        """What each layer must be like, from the first one."""
+        """The expected shapes of all layers, given the first."""
         width, inputs = self._weights["linear.0.weight"].shape
         layers: dict[str, tuple[int, ...]] = {f"linear.{i}": (width, width) for i in range(1, self.depth)}
         layers[f"linear.{self.depth // 2 + 1}"] = (width, width + inputs)
@@ -117,22 +119,22 @@ class DeformNetwork:
 
 
 def load_deformable(path: str | Path, *, iteration: int | None = None) -> MovingModel:
-    """Load a model folder of Deformable 3D Gaussians. Raises CheckpointError for what is damaged, incomplete, or of another family."""
+    """Load a model folder of Deformable 3D Gaussians. Raises CheckpointError if it is damaged, incomplete, or of another family."""
     canonical, network = read_canonical(path, iteration, "deformable")
     return MovingModel("deformable", canonical, DeformNetwork(read_state_dict(network), f"{network} is not a network as the project publishes it"))
 
 
 def embed(values: Tensor, frequencies: int) -> Tensor:
-    """[N, D] -> [N, D·(1 + 2·frequencies)]: the values, then sine and cosine of them times 1, 2, 4, ..."""
+    """Positional encoding of [N, D] as [N, D·(1 + 2·frequencies)]: the values, then sine and cosine of the values times 1, 2, 4, ..."""
     waves = [wave(values * 2**octave) for octave in range(frequencies) for wave in (torch.sin, torch.cos)]
     return torch.cat([values, *waves], dim=1)
 
 
 def move_along_screw(points: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
-    """Points [N, 3] after a rigid motion by the exponential of the screws (turns [N, 3], shifts [N, 3]), finite without any turn.
+    """Points [N, 3] after a rigid motion, the exponential of the screws (turns [N, 3], shifts [N, 3]); finite for an angle of 0.
 
-    The original divides both by the angle and multiplies them with it again (utils/rigid_utils.py; Lynch and Park, Modern
-    Robotics, 3.88), which is 0/0 where the angle is 0. Here the powers of the angle are in the coefficients, which are finite.
+    The original divides both by the angle and multiplies by it again (utils/rigid_utils.py; Lynch and Park, Modern Robotics,
+    3.88), which is 0/0 for an angle of 0. Here the powers of the angle are part of the coefficients, which are finite.
     """
     angles = turns.norm(dim=1, keepdim=True)
     turns, shifts = turns + SCREW_OFFSET * angles, shifts + SCREW_OFFSET * angles
@@ -143,12 +145,12 @@ def move_along_screw(points: Tensor, turns: Tensor, shifts: Tensor) -> Tensor:
 
 
 def kernel_covariances(quats: Tensor, scales: Tensor) -> Tensor:
-    """[N, 3, 3] world units², as the kernel of 3DGS makes them from quaternions wxyz [N, 4] that it never normalizes, and scales [N, 3]."""
+    """Covariances [N, 3, 3], world units², as 3DGS's kernel computes them from scales [N, 3] and quaternions wxyz [N, 4], not normalized."""
     w, x, y, z = quats.unbind(-1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
-    factors = torch.stack(rows, -1).unflatten(-1, (3, 3)) * scales[:, None, :]
+    entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+               2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+               2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    factors = torch.stack(entries, -1).unflatten(-1, (3, 3)) * scales[:, None, :]
     return factors @ factors.mT
 
 

@@ -1,4 +1,4 @@
-"""4D Gaussians (Wu et al. 2024): canonical splats, and planes of features over space and time that change their parameters."""
+"""4D Gaussians (Wu et al. 2024): canonical splats, and feature planes over space and time from which changes of parameters are decoded."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from mipmap_plugin.models.places import is_coarse
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 from mipmap_plugin.splatting.rotations import quaternion_product
 
-NET = "deformation_net."  # what the names of all weights in use begin with
+NET = "deformation_net."  # prefix of the names of all weights in use
 
-# The heads by name: how many numbers each gives, the option that switches it off, and the option's default (arguments/__init__.py).
+# The heads by name: number of outputs, the option that disables it, and the option's default (arguments/__init__.py).
 HEADS = {
     "pos_deform": (3, "no_dx", False),
     "scales_deform": (3, "no_ds", False),
@@ -35,15 +35,15 @@ HEADS = {
 # The two coordinates of each plane of a scale: xy, xz, xt, yz, yt, zt.
 PLANES = list(combinations(range(4), 2))
 
-# Options that the published code calls useless, and that nothing published was trained with.
+# Options that the published code describes as useless; no published model was trained with them.
 UNREAD = ("empty_voxel", "grid_pe")
 
 
 class HexPlane:
-    """Features of a position and a time, looked up in planes at several scales, and what small networks make of them."""
+    """Features of a position and a time, looked up in planes at several scales, and small networks that decode them."""
 
     def __init__(self, weights: Mapping[str, Tensor], options: Mapping[str, Any], where: str = "the network") -> None:
-        """Take the tensors of a `deformation.pth` by name, and the `options` of cfg_args. Raises CheckpointError, with `where` as its subject."""
+        """`weights`: the tensors of a `deformation.pth` by name; `options`: cfg_args. Raises CheckpointError, beginning with `where`."""
         for name in UNREAD:
             if options.get(name):
                 raise CheckpointError(f"{where}: it was trained with {name}, which is not read by this version")
@@ -58,7 +58,7 @@ class HexPlane:
         self.cost = self._cost()
 
     def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
-        """The splats at `time`. Every change is made to the raw parameters, before they are activated."""
+        """The splats at `time`. Changes apply to the raw parameters, before activation."""
         raw = canonical.parameters()
         hidden = self.features(raw["means"], time)
         mask = self._head("static_mlp", hidden) if self._options.get("static_mlp") else torch.ones_like(hidden[:, :1])
@@ -78,7 +78,7 @@ class HexPlane:
         return VanillaModel(moved).gaussians()
 
     def features(self, means: Tensor, time: float) -> Tensor:
-        """[N, width]: what the heads read, at positions [N, 3] and one time."""
+        """The inputs of the heads, [N, width], at positions [N, 3] and one time."""
         moment = torch.full_like(means[:, :1], time)
         if self._options.get("no_grid"):
             hidden = torch.cat([means, moment], dim=1)
@@ -91,15 +91,16 @@ class HexPlane:
         return hidden
 
     def to(self, device: torch.device | str) -> HexPlane:
+        """The same field on another device."""
         return HexPlane({NET + name: tensor.to(device) for name, tensor in self._weights.items()}, self._options)
 
     def _look_up(self, scale: int, place: Tensor) -> Tensor:
-        """[N, channels]: the product over the planes of a scale. Outside of the box their edge goes on."""
+        """The product over the planes of one scale, [N, channels]. Positions outside the box are clamped to it."""
         product = torch.ones_like(place[:, :1])
         for number, axes in enumerate(PLANES):
             plane = self._weights[f"grid.grids.{scale}.{number}"]
-            found = grid_sample(plane, place[None, None, :, axes], mode="bilinear", padding_mode="border", align_corners=True)
-            product = product * found[0, :, 0].T
+            sampled = grid_sample(plane, place[None, None, :, axes], mode="bilinear", padding_mode="border", align_corners=True)
+            product = product * sampled[0, :, 0].T
         return product
 
     def _head(self, name: str, hidden: Tensor) -> Tensor:
@@ -109,18 +110,18 @@ class HexPlane:
         return linear(inputs, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
 
     def _is_still(self) -> bool:
-        """Whether every change is a sum with 0; products with what the network makes never are."""
+        """Whether the field changes nothing: all heads add 0, and none multiplies by an output of the network."""
         multiplies = self.heads and (self._options.get("static_mlp") or ("rotations_deform" in self.heads and self._options.get("apply_rotation")))
         return not multiplies and not any(self._weights[f"{head}.3.{part}"].any() for head in self.heads for part in ("weight", "bias"))
 
     def _cost(self) -> str:
         parts = ("feature_out", *self.heads)
-        products = sum(held.numel() for name, held in self._weights.items() if name.split(".")[0] in parts and name.endswith("weight"))
+        products = sum(tensor.numel() for name, tensor in self._weights.items() if name.split(".")[0] in parts and name.endswith("weight"))
         return f"{len(PLANES) * self.scales} look-ups and {products:,} multiplications a splat and moment"
 
     def _check(self, where: str) -> None:
-        told_by = {f"grid.grids.{scale}.0": (1, -1, -1, -1) for scale in range(max(1, self.scales))}
-        require(self._weights, {"grid.aabb": (2, 3), "feature_out.0.weight": (-1, -1), **told_by}, where)
+        grids = {f"grid.grids.{scale}.0": (1, -1, -1, -1) for scale in range(max(1, self.scales))}
+        require(self._weights, {"grid.aabb": (2, 3), "feature_out.0.weight": (-1, -1), **grids}, where)
         width = len(self._weights["feature_out.0.weight"])
         channels = {scale: self._weights[f"grid.grids.{scale}.0"].shape[1] for scale in range(self.scales)}
         layers = {f"feature_out.{2 * layer}": (width, width) for layer in range(1, self.depth)}
@@ -135,9 +136,9 @@ class HexPlane:
 
 def load_hexplane(path: str | Path, *, iteration: int | None = None) -> MovingModel | VanillaModel:
     """Load a model folder of 4D Gaussians; a PLY of its coarse stage, in which nothing moves, is plain 3DGS. Raises CheckpointError."""
-    found = detect(path, iteration=iteration)
-    if found.family == "4dgs" and is_coarse(found.path):
-        model = read_vanilla(found)
+    checkpoint = detect(path, iteration=iteration)
+    if checkpoint.family == "4dgs" and is_coarse(checkpoint.path):
+        model = read_vanilla(checkpoint)
         model.notes.append("it is of the coarse stage of 4D Gaussians, in which nothing moves yet")
         return model
     canonical, network = read_canonical(path, iteration, "4dgs")
@@ -146,6 +147,6 @@ def load_hexplane(path: str | Path, *, iteration: int | None = None) -> MovingMo
         canonical.notes.append("no cfg_args tells which of the network's changes are in use: opacities and colors are taken to stay, as published")
     field = HexPlane(read_state_dict(network), options, f"{network} is not a network as the project publishes it")
     if "shs_deform" in field.heads and canonical.sh_degree != 3:
-        told = f"{network} changes colors of SH degree 3, but its PLY has {canonical.sh_degree}"
-        raise CheckpointError(f"{told}; give the two that were saved together")
+        mismatch = f"{network} changes colors of SH degree 3, but its PLY has {canonical.sh_degree}"
+        raise CheckpointError(f"{mismatch}; give the two that were saved together")
     return MovingModel("4dgs", canonical, field)

@@ -1,4 +1,4 @@
-"""A moving scene: canonical splats, which adapt, and a frozen field that takes them to a moment of time."""
+"""Moving scenes: canonical splats, which are adapted, and a frozen deformation field that moves them to a point in time."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.places import network_of
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 
-# Views whose moments tell how opaque a splat ever gets; each costs one pass through the field.
+# Number of views at whose times opacities are evaluated; each costs one pass through the field.
 ENOUGH_MOMENTS = 8
 
 TIMELESS = "a camera without a time shows the moment 0; a cameras.json holds no times, so adaptation then spreads them over its views"
 
 
 class Field(Protocol):
-    """What takes canonical splats to a moment. Its weights require no gradient and never change."""
+    """A deformation field: maps canonical splats to a point in time. Its weights require no gradient and never change."""
 
     changes_opacities: bool
-    is_still: bool  # no splat ever changes: the field need not be asked
-    cost: str  # of one moment, counted
+    is_still: bool  # the field changes no splat, and need not be evaluated
+    cost: str  # of one evaluation, counted
 
     def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
         """The splats at `time` (0..1), differentiable in the canonical parameters."""
@@ -42,7 +42,7 @@ class Field(Protocol):
 
 
 class MovingModel:
-    """Canonical splats, stored and named as 3DGS does, seen through a frozen field at the time of each camera."""
+    """Canonical splats, stored as in 3DGS, deformed by a frozen field at the time of each camera."""
 
     def __init__(self, family: str, canonical: VanillaModel, field: Field) -> None:
         self.family, self.canonical, self.field = family, canonical, field
@@ -61,13 +61,13 @@ class MovingModel:
 
     @property
     def moves(self) -> bool:
-        """Whether time changes anything; `adaptation.views` then spreads times over cameras that have none."""
+        """Whether the splats depend on time; `adaptation.views` then distributes times over cameras that have none."""
         return not self.field.is_still
 
     @property
     def traits(self) -> Traits:
         effect = Effect("time", self.moves, "a field moves the splats" if self.moves else "the field changes no splat", self.field.cost)
-        why = "a network moves its splats, which no viewer of the list does"
+        why = "a network moves its splats, which none of the viewers supports"
         return Traits(moves=self.moves, no_viewer=why, exposures=self.canonical.traits.exposures, effects=(effect,))
 
     def gaussians(self, camera: Camera) -> Gaussians:
@@ -77,7 +77,7 @@ class MovingModel:
         return self.field(self.canonical, camera.time or 0.0)
 
     def parameters(self) -> dict[str, Tensor]:
-        """Those of the canonical splats, named as `VanillaModel` does."""
+        """The parameters of the canonical splats, with the names of `VanillaModel`."""
         return self.canonical.parameters()
 
     def copy(self) -> MovingModel:
@@ -91,32 +91,32 @@ class MovingModel:
         self.canonical.replace_parameters(parameters)
 
     def shared_parameters(self) -> dict[str, Tensor]:
-        """None: the field stays as it was trained."""
+        """None: the field is frozen."""
         return {}
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
-        """Reshape the canonical splats, in place; the field's changes are added to them as before."""
+        """Reshape the canonical splats in place; the field deforms the result."""
         self.canonical.reshape(form, views)
 
     @torch.no_grad()
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:
-        """[N], 0..1: how opaque each splat gets at the times of some of `views`, of which there must be one."""
+        """The largest opacity of each splat, [N], 0..1, at the times of some of `views`, of which at least one is required."""
         if not (self.moves and self.field.changes_opacities):
             return self.canonical.row_opacities()
         some = every_nth(views, ENOUGH_MOMENTS)
         return torch.stack([self.gaussians(view).opacities for view in some]).amax(0)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
-        """What `save` would refuse about `path`, before anything is done for it. Raises SettingsError, OutputExists, OutputError."""
+        """Check `path` as `save` would. Raises SettingsError, OutputExists, OutputError."""
         if path.suffix.lower() == ".ply" or is_written(path):
-            told = f"has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}"
-            raise SettingsError(f"{path}: {'a PLY' if path.suffix.lower() == '.ply' else 'this format'} {told}")
+            reason = f"has no room for the network that moves its splats; give a folder, such as {path.with_suffix('')}"
+            raise SettingsError(f"{path}: {'a PLY' if path.suffix.lower() == '.ply' else 'this format'} {reason}")
         self.canonical.refuse_output(path, overwrite=overwrite)
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
-        """Write a model folder, the network copied byte for byte to the iteration of the splats; return the PLY written.
+        """Write a model folder, with a byte-for-byte copy of the network for the iteration of the splats; return the PLY written.
 
-        Raises SettingsError for a path that ends in .ply, OutputExists, and OutputError when the disk refuses.
+        Raises SettingsError for a path that ends in .ply, OutputExists, and OutputError if a file cannot be written.
         """
         self.refuse_output(Path(path), overwrite=overwrite)
         return self.canonical.save(path, provenance=provenance, overwrite=overwrite, companions=self._copy_network)
@@ -130,11 +130,11 @@ class MovingModel:
 
 
 def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:
-    """The splats of a moving scene before anything moves them, and the file of their network. Raises CheckpointError."""
-    found = detect_as(path, (family,), iteration=iteration)
+    """The canonical splats of a moving scene, and the file of their network. Raises CheckpointError."""
+    checkpoint = detect_as(path, (family,), iteration=iteration)
     if Path(path).is_file():
         raise CheckpointError(f"{path} is one part of a moving scene, whose network lies beside it; give the model folder that holds both")
-    canonical = read_vanilla(found)
+    canonical = read_vanilla(checkpoint)
     title = find_family(family).title
     canonical.notes += [f"the network that moves the splats ({title}) is frozen: they adapt as they are before they move", TIMELESS]
-    return canonical, network_of(found.path, family)
+    return canonical, network_of(checkpoint.path, family)

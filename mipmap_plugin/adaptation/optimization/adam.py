@@ -1,0 +1,63 @@
+"""Adam (Kingma and Ba 2015) by torch's fused kernel, with the state and the bits of torch.optim.Adam.
+
+torch.optim imports torch's compiler with the first optimizer, which takes over a second of every process and is of no use here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+class Adam:
+    """Groups are dictionaries with `params`, `lr` and whatever else a caller keeps there. Tensors without a gradient stay."""
+
+    def __init__(self, groups: Iterable[dict[str, Any]], betas: tuple[float, float], eps: float) -> None:
+        self.param_groups, self.betas, self.eps = [dict(group) for group in groups], betas, eps
+        self.state: dict[Tensor, dict[str, Any]] = {}
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move every tensor that has a gradient."""
+        for group in self.param_groups:
+            moving = [tensor for tensor in group["params"] if tensor.grad is not None]
+            if not moving:
+                continue
+            states = [self._state_of(tensor) for tensor in moving]
+            first, second, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
+            torch._foreach_add_(steps, 1)
+            torch._fused_adam_(
+                moving, [tensor.grad for tensor in moving], first, second, [], steps, lr=group["lr"], beta1=self.betas[0], beta2=self.betas[1],
+                weight_decay=0.0, eps=self.eps, amsgrad=False, maximize=False,
+            )  # fmt: skip
+
+    def zero_grad(self) -> None:
+        """Forget all gradients."""
+        for group in self.param_groups:
+            for tensor in group["params"]:
+                tensor.grad = None
+
+    def _state_of(self, tensor: Tensor) -> dict[str, Any]:
+        state = self.state.setdefault(tensor, {})
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32, device=tensor.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(tensor), torch.zeros_like(tensor)
+        return state
+
+    def state_dict(self) -> dict[str, Any]:
+        """The groups, with numbers in place of their tensors, and the state by these numbers."""
+        tensors = [tensor for group in self.param_groups for tensor in group["params"]]
+        place = {tensor: number for number, tensor in enumerate(tensors)}
+        groups = [{**group, "params": [place[tensor] for tensor in group["params"]]} for group in self.param_groups]
+        return {"param_groups": groups, "state": {place[tensor]: state for tensor, state in self.state.items()}}
+
+    def load_state_dict(self, held: dict[str, Any]) -> None:
+        """Go on from a `state_dict` of an optimizer whose groups held as many tensors, in the same order."""
+        tensors = [tensor for group in self.param_groups for tensor in group["params"]]
+        self.param_groups = [{**group, "params": [tensors[number] for number in group["params"]]} for group in held["param_groups"]]
+        self.state = {
+            tensors[number]: {name: value.to(tensors[number].device) for name, value in state.items()} for number, state in held["state"].items()
+        }

@@ -1,0 +1,38 @@
+"""Long work that has no steps to count says on a terminal what it is and how long it has taken."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from tqdm import tqdm
+
+# Seconds before anything is shown, and between two looks at the clock.
+PATIENCE, PERIOD = 1.0, 0.5
+
+
+@contextmanager
+def announced(what: str) -> Iterator[None]:
+    """Show `what` and its seconds on standard error while the block runs, once it has taken a second; nothing where that is no terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    ended = threading.Event()
+    clock = threading.Thread(target=_show, args=(what, ended), daemon=True)
+    clock.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        clock.join()
+
+
+def _show(what: str, ended: threading.Event) -> None:
+    if ended.wait(PATIENCE):
+        return
+    with tqdm(bar_format="{desc}: {elapsed}", desc=what, leave=False) as line:
+        line.start_t -= PATIENCE
+        while not ended.wait(PERIOD):
+            line.refresh()
