@@ -32,13 +32,13 @@ def blend(alpha, bright, limits, color, n, at, state):
     alpha = minimum(alpha, max_alpha)
     before = load(state, TRANSMITTANCE + at)
     after = before * (1 - alpha)
-    shown = both(bright, after >= min_transmittance)
+    visible = both(bright, after >= min_transmittance)
     stopping = both(both(bright, before >= min_transmittance), after < min_transmittance)
-    weight = select(shown, before * alpha, 0)
+    weight = select(visible, before * alpha, 0)
     store(state, at, fma(weight, color[0], load(state, at)))
     store(state, PLANE + at, fma(weight, color[1], load(state, PLANE + at)))
     store(state, 2 * PLANE + at, fma(weight, color[2], load(state, 2 * PLANE + at)))
-    store(state, TRANSMITTANCE + at, select(shown, after, select(stopping, 0 - before, before)))
+    store(state, TRANSMITTANCE + at, select(visible, after, select(stopping, 0 - before, before)))
     if bits(stopping) != 0:
         store(state, STOPS + at, select(stopping, n, load(state, STOPS + at)))
 
@@ -50,8 +50,8 @@ def unblend(alpha, bright, limits, color, n, at, state):
     Returns alpha · dLoss/dalpha, dLoss/dalpha, the blend weight, and dLoss/dimage.
     """
     max_alpha, _, _ = limits
-    shown = both(bright, n < load(state, STOPS + at))
-    clamped = select(shown, minimum(alpha, max_alpha), 0)
+    visible = both(bright, n < load(state, STOPS + at))
+    clamped = select(visible, minimum(alpha, max_alpha), 0)
     before = load(state, TRANSMITTANCE + at) / (1 - clamped)
     d_red, d_green, d_blue = load(state, at), load(state, PLANE + at), load(state, 2 * PLANE + at)
     behind = load(state, BEHIND_DOT_GRAD + at)
@@ -59,14 +59,14 @@ def unblend(alpha, bright, limits, color, n, at, state):
     weight = before * clamped
     store(state, TRANSMITTANCE + at, before)
     store(state, BEHIND_DOT_GRAD + at, fma(clamped, slope, behind))
-    d_alpha = select(both(shown, alpha < max_alpha), before * slope, 0)
+    d_alpha = select(both(visible, alpha < max_alpha), before * slope, 0)
     return select(alpha < max_alpha, weight * slope, 0), d_alpha, weight, d_red, d_green, d_blue
 
 
 @inner
 def grad_culled(alpha, bright, color, n, at, state):
     """alpha · dLoss/dalpha of the n-th splat of a tile, which is culled, at the 16 pixels at `at`, in the limit of a faint splat."""
-    shown = both(bright, n < load(state, STOPS + at))
+    visible = both(bright, n < load(state, STOPS + at))
     d_red, d_green, d_blue = load(state, at), load(state, PLANE + at), load(state, 2 * PLANE + at)
     slope = fma(d_red, color[0], fma(d_green, color[1], d_blue * color[2])) - load(state, BEHIND_DOT_GRAD + at)
-    return select(shown, load(state, TRANSMITTANCE + at) * alpha * slope, 0)
+    return select(visible, load(state, TRANSMITTANCE + at) * alpha * slope, 0)

@@ -1,4 +1,4 @@
-"""Threads for kernels, after dismissing torch's own idle ones."""
+"""Threads for kernels, after dismissing torch's idle ones."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ def chunks(first: int, last: int, min_chunk: int) -> Iterator[tuple[int, int]]:
 
 
 def team(work: int) -> Team:
-    """As many threads as there are for kernels if `work`, splats plus pixels, is large enough; else one."""
-    most = threads.count() if work >= MIN_WORK else 1
-    if most > 1 and torch.get_num_threads() > 1:
+    """As many threads as kernels may use if `work`, splats plus pixels, is large enough; else one."""
+    count = threads.count() if work >= MIN_WORK else 1
+    if count > 1 and torch.get_num_threads() > 1:
         _dismiss_idle_threads()
-    return Team(most)
+    return Team(count)
 
 
 def _dismiss_idle_threads() -> None:
