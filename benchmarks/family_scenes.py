@@ -27,7 +27,7 @@ import torch_checkpoints
 from mipmap_plugin import Camera, Effects, load_model
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.optimization.validation import unjudged
+from mipmap_plugin.adaptation.optimization.validation import no_validation
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
@@ -162,7 +162,7 @@ def trained(world: SplatModel, train: Sequence[Camera], pictures: Pictures) -> S
     def render(gaussians: Gaussians, camera: Camera) -> Tensor:
         return backend.render(gaussians, camera, effects).image
 
-    task = Task(train, 1.0, pictures, render, False, unjudged(pictures, render))
+    task = Task(train, 1.0, pictures, render, False, no_validation(pictures, render))
     run = Run.start(student, task, TRAINING)
     adapt(run, task, TRAINING, lambda run: sys.exit(130))
     return run.student

@@ -15,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mipmap_plugin.adaptation.optimization.loop import Run, Task, adapt
-from mipmap_plugin.adaptation.optimization.validation import unjudged
+from mipmap_plugin.adaptation.optimization.validation import no_validation
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera
@@ -56,7 +56,7 @@ def train(model: VanillaModel, views: list[Camera], truth: dict[Camera, Tensor],
         return backend.render(gaussians, camera, effects).image
 
     # The loop zooms each view by the scale; at scale 1 that is a copy, so truth is looked up by the view itself.
-    task = Task(views, 1.0, truth.__getitem__, render, True, unjudged(truth.__getitem__, render))
+    task = Task(views, 1.0, truth.__getitem__, render, True, no_validation(truth.__getitem__, render))
     adapt(Run.start(student, task, config), task, config, on_interrupt=lambda run: None)
     return student
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, TypedDict, cast
 import torch
 
 from mipmap_plugin import threads
-from mipmap_plugin.adaptation.adapted import Adapted, shown
+from mipmap_plugin.adaptation.adapted import Adapted, render_model
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
-from mipmap_plugin.adaptation.session import Base, Observer, Session
+from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.target.portable import for_several
+from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend, device_for
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
@@ -72,8 +72,8 @@ class Wrapped:
         if viewer is not None:
             if screen_filter is not None:
                 raise SettingsError(f"viewer {viewer} has a screen filter of its own; leave the screen filter {screen_filter} out")
-            shown = Effects(degree, background=self.background, supersampling=supersampling, near_plane=trained.near_plane)
-            return find_viewer(viewer).effects(shown)
+            render_model = Effects(degree, background=self.background, supersampling=supersampling, near_plane=trained.near_plane)
+            return find_viewer(viewer).effects(render_model)
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
@@ -114,7 +114,7 @@ class Wrapped:
         effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(drawn.get("outputs", ())), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if drawn.get("filter_3d") else None
-        return shown(self._read_by(viewer), backend, camera, effects, form)
+        return render_model(self._read_by(viewer), backend, camera, effects, form)
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
         """Raises SettingsError where no splat can be smoothed, or nothing says by how much."""
@@ -156,7 +156,7 @@ class Wrapped:
             raise SettingsError("the images were exposed differently, which adapting to them does not know (exposure.json); leave them out")
         config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
         if len(targets) > 1:
-            config = make_config(recipe, scale, **(for_several(config) | settings))
+            config = make_config(recipe, scale, **(settings_for_several(config) | settings))
         real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = real.cameras if real else self.cameras
@@ -168,9 +168,9 @@ class Wrapped:
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
         read = self._read_by(viewer)
         given = model if read is self.model else read
-        base = Base(model, self.effects(), targets, viewer, backend, why, not any(backend.lacking(each) for each in needs), given)
+        request = AdaptationRequest(model, self.effects(), targets, viewer, backend, why, not any(backend.lacking(each) for each in needs), given)
         with threads.shared(self.threads):
-            return Session(base, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
+            return Session(request, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
         """Raise what saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be known, before any work."""

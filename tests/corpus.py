@@ -90,11 +90,11 @@ def _quick_run(state: Path) -> Adapted:
 
 def _state(path: Path) -> Path:
     path.mkdir()
-    kept, resume.KEEP_EVERY_S = resume.KEEP_EVERY_S, 0.0
+    kept, resume.SAVE_EVERY_S = resume.SAVE_EVERY_S, 0.0
     try:
         _quick_run(path / "state")
     finally:
-        resume.KEEP_EVERY_S = kept
+        resume.SAVE_EVERY_S = kept
     return path / "state"
 
 

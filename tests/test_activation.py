@@ -21,7 +21,7 @@ def gradients(model, views, *, share):
     for view in views:
         seen = splats(view)
         backend.render(seen, view, Effects(1)).image.square().sum().backward()
-        splats.gather(seen)
+        splats.accumulate(seen)
     splats.backward()
     return {name: tensor.grad for name, tensor in student.parameters().items()}, len(asked)
 

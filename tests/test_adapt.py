@@ -13,7 +13,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
-from mipmap_plugin.adaptation.report import Peak
+from mipmap_plugin.adaptation.report import PeakMemory
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
@@ -186,7 +186,7 @@ def test_a_resumed_default_run_equals_an_uninterrupted_one(tmp_path, ctrl_c, nth
     whole = wrapped().adapt(1 / 4, **BRIEF)
     ctrl_c(nth)
     state = tmp_path / "run.resume"
-    with pytest.raises(Interrupted, match=rf"interrupted at step {(nth + 1) // 2}; run the same command again to go on from .*run.resume"):
+    with pytest.raises(Interrupted, match=rf"interrupted at step {(nth + 1) // 2}; run the same command again to continue from .*run.resume"):
         wrapped().adapt(1 / 4, resume=state, **BRIEF)
     resumed = wrapped().adapt(1 / 4, resume=state, **BRIEF)
     assert state.exists()  # should the disk be full, nothing is lost
@@ -259,20 +259,20 @@ def test_a_state_is_refused_with_anything_else_than_its_own_run(tmp_path, ctrl_c
         (wrapped(41), 1 / 4, BRIEF),
     ]
     for model, scale, settings in others:
-        with pytest.raises(SettingsError, match="belongs to another base, other settings or other views; repeat those, or delete the file"):
+        with pytest.raises(SettingsError, match="belongs to another base, settings or views; repeat the run with those, or delete it"):
             model.adapt(scale, resume=state, **settings)
     assert state.exists()
 
 
 def test_a_file_that_is_no_state_is_refused(tmp_path):
     (tmp_path / "state").write_text("no state")
-    with pytest.raises(SettingsError, match=r"state: this is not the state of an interrupted run \(\w+\); delete it to start anew"):
+    with pytest.raises(SettingsError, match=r"state: not the state of an interrupted run \(\w+\); delete it to start anew"):
         wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
 
 
 def test_ctrl_c_without_a_file_to_resume_from_says_so(ctrl_c):
     ctrl_c(2)
-    with pytest.raises(Interrupted, match="interrupted at step 1; nothing was written, for no file to resume from was named"):
+    with pytest.raises(Interrupted, match="interrupted at step 1; nothing was written, because no file to resume from was named"):
         wrapped().adapt(1 / 4, **BRIEF)
 
 
@@ -399,8 +399,8 @@ def test_a_scale_that_is_no_zoom_is_refused(scale):
         (dict(views="some"), "setting views: Input should be 'given'"),
         (dict(time_budget_s=0), "setting time_budget_s: Input should be greater than 0"),
         (dict(rates={"means": -1}), "setting rates.means: Input should be greater than or equal to 0"),
-        (dict(upsampler="swin"), "there is no upsampler 'swin'; known are bicubic, lanczos"),
-        (dict(views="test"), "there are no test views among the 4 cameras; ask for the views 'given'"),
+        (dict(upsampler="swin"), "there is no upsampler 'swin'; choose from bicubic, lanczos"),
+        (dict(views="test"), "there are no test views among the 4 cameras; use the view policy 'given'"),
         (dict(resize="box", scale=0.3, steps=1), "is not a whole multiple of"),
     ],
 )
@@ -484,8 +484,8 @@ def test_memory_is_counted_on_a_gpu_and_from_its_beginning(monkeypatch):
     device, most = torch.device("cuda"), {"bytes": 5 << 30}
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda which: most.update(bytes=0 if which == device else None))
     monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda which: most["bytes"])
-    peak = Peak(device)
+    peak = PeakMemory(device)
     most["bytes"] += 3 << 20
     assert peak.mib() == 3
-    assert Peak(torch.device("cpu")).mib() is None
+    assert PeakMemory(torch.device("cpu")).mib() is None
     assert wrapped().adapt(1 / 4, recipe="instant").report.peak_memory_mib is None

@@ -162,7 +162,7 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
     monkeypatch.setattr(ReferenceBackend, "render", interrupting)
     code, out, err = run(*command, "--output", tmp_path / "new.ply")
     assert (code, out) == (130, "")
-    assert "interrupted at step 1; run the same command again to go on from" in err and "Traceback" not in err
+    assert "interrupted at step 1; run the same command again to continue from" in err and "Traceback" not in err
     assert (tmp_path / "new.ply.resume").exists() and not (tmp_path / "new.ply").exists()
     assert run(*command, "--output", tmp_path / "new.ply")[0] == 0
     assert (tmp_path / "new.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
@@ -355,12 +355,12 @@ def test_a_damaged_photograph_ends_in_one_sentence(run, model_folder, tmp_path):
 
 def test_a_damaged_state_ends_in_one_sentence(run, model_folder, tmp_path):
     (tmp_path / "new.ply.resume").write_bytes(b"PK\x03\x04 not quite")
-    refused(run("adapt", model_folder, "--scale", "1/4", "--output", tmp_path / "new.ply", *QUICK), "is not the state of an interrupted run")
+    refused(run("adapt", model_folder, "--scale", "1/4", "--output", tmp_path / "new.ply", *QUICK), "not the state of an interrupted run")
 
 
 def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
     refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no 'gpu'; known are", "reference")
-    refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no upsampler 'swin'; known are bicubic, lanczos")
+    refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no upsampler 'swin'; choose from bicubic, lanczos")
     refused(run("adapt", model_folder, "--scale", "4", "--steps", "-1"), "setting steps: Input should be greater than or equal to 0")
     refused(run("adapt", model_folder), "no scale is given; pass --scale 1/4")
     refused(run("evaluate", model_folder, "--images", model_folder), "no scale is given; pass --scale 1/4")

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mipmap_plugin.adaptation.start.closed_form import CLEAR_OF_CULLS, THINNEST, Form, closed_form, needs_nothing, pixel_size
-from mipmap_plugin.adaptation.start.surfel_form import shown_area
+from mipmap_plugin.adaptation.start.closed_form import CULL_MARGIN, MIN_AXIS, FormSettings, closed_form, filter_suffices, pixel_size
+from mipmap_plugin.adaptation.start.surfel_form import visible_area
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -37,7 +37,7 @@ def show(gaussians: Gaussians, scale: float, eps2d: float = DILATION, screen_fil
 
 
 def adapted(gaussians: Gaussians, scale: float, base: Effects = Effects(0), target: Effects = Effects(0), crispness: float = 0.0) -> Gaussians:  # noqa: B008
-    scales, opacities = closed_form(gaussians, [VIEW], scale, base, target, Form(crispness=crispness))
+    scales, opacities = closed_form(gaussians, [VIEW], scale, base, target, FormSettings(crispness=crispness))
     return replace(gaussians, scales=scales, opacities=opacities)
 
 
@@ -81,7 +81,7 @@ def test_the_crispest_surfels_keep_their_size_and_add_as_much_light():
     splat, surfel = disc(0.3, 0.05, opacity=0.02), Effects(0, SURFEL)
     plain, crisp = (adapted(splat, 4, surfel, surfel, crispness) for crispness in (0.0, 1.0))
     torch.testing.assert_close(crisp.scales, splat.scales)
-    areas = [shown_area(project(each, VIEW.zoomed(4), 0.2), surfel.eps2d) for each in (plain, crisp)]
+    areas = [visible_area(project(each, VIEW.zoomed(4), 0.2), surfel.eps2d) for each in (plain, crisp)]
     torch.testing.assert_close(crisp.opacities * areas[1], plain.opacities * areas[0])
 
 
@@ -103,7 +103,7 @@ def test_zoom_out_of_splats_below_a_pixel_trades_opacity_for_area(scale):
     splat = disc(0.05, 0.02)
     new = adapted(splat, scale)
     assert 0 < new.opacities < 0.5 * splat.opacities
-    assert (new.scales >= THINNEST * PIXEL / scale * (1 - 1e-9)).all()
+    assert (new.scales >= MIN_AXIS * PIXEL / scale * (1 - 1e-9)).all()
     assert new.scales.isfinite().all()
 
 
@@ -209,14 +209,14 @@ MIP = Effects(0, "mip", 0.1)
 )
 @pytest.mark.parametrize("scale", [1 / 4, 4])
 def test_what_needs_nothing(base, target, nothing, scale):
-    assert needs_nothing(scale, base, target) == nothing
+    assert filter_suffices(scale, base, target) == nothing
 
 
 @pytest.mark.parametrize("size", [(0.8, 0.8), (3.0, 0.05), (0.01, 0.01)])
 def test_the_two_longer_axes_stay_clear_of_a_viewers_cull(size):
     target = drawn_by("playcanvas")
     variances = (adapted(disc(*size), 1 / 8, target=target).scales[0] / (8 * PIXEL)).square()
-    least = CLEAR_OF_CULLS * (target.settings.min_variance - target.eps2d)
+    least = CULL_MARGIN * (target.settings.min_variance - target.eps2d)
     assert (variances[:2] >= least * (1 - 1e-9)).all() and variances[2] < least
 
 

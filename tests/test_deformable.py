@@ -170,7 +170,7 @@ def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, scale, settin
     adapted = wrapped.adapt(scale, **settings)
     base, now = moving.decibels(wrapped, adapted, [moving.at(time) for time in (0.0, 0.5, 1.0)])
     assert now > base + 1
-    assert "without a time, which are spread over 0..1" in adapted.report.views
+    assert "without a time of their own, spread over 0..1" in adapted.report.views
     assert all(torch.equal(before[name], tensor) for name, tensor in wrapped.model.parameters().items())
     adapted.save(tmp_path / "out")
     frozen, kept = (read_state_dict(folder / "deform/iteration_40000/deform.pth") for folder in (tmp_path / "m", tmp_path / "out"))

@@ -21,7 +21,7 @@ from mipmap_plugin.adaptation.optimization.density import (
     strongest,
 )
 from mipmap_plugin.adaptation.optimization.loop import adapt as optimize
-from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, put_back, set_rates
+from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, restore_parameters, set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -143,7 +143,7 @@ def test_the_halves_of_a_flat_splat_stay_in_its_plane():
 def test_what_is_put_back_is_as_it_was_bit_by_bit_and_starts_anew(student, optimizer):
     before = {name: tensor.detach().clone() for name, tensor in student.parameters().items()}
     grow(student, optimizer, mask(1, 3), extent=1e6)
-    put_back(student, optimizer, before)
+    restore_parameters(student, optimizer, before)
     assert all(torch.equal(tensor, before[name]) for name, tensor in student.parameters().items())
     optimizer.param_groups[0]["lr"] = 0.1
     for tensor in student.parameters().values():

@@ -5,7 +5,7 @@ import tiny
 import torch
 from skimage.metrics import structural_similarity
 
-from mipmap_plugin.adaptation.target.detail import SURE, Detail
+from mipmap_plugin.adaptation.target.detail import CONTRAST_POWER, DetailLoss
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.structure import similarity
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
@@ -30,13 +30,13 @@ def picture(height, width, seed=0):
 
 
 def detail(base, **settings):
-    return Detail(lambda view: base, 2, AdaptConfig(upsampler="mine", compare_at="both", **settings))
+    return DetailLoss(lambda view: base, 2, AdaptConfig(upsampler="mine", compare_at="both", **settings))
 
 
 def test_up_to_what_the_base_samples_the_target_is_the_base(upsampler):
     base = picture(24, 32)
     upsampler(lambda image, size: (resize(image, size, "pil-bicubic") + 0.1).clamp(0, 1))
-    target, _ = detail(base)._make(VIEW)
+    target, _ = detail(base)._make_target(VIEW)
     assert psnr(resize(target, (24, 32), "pil-bicubic"), base) > 45
 
 
@@ -44,7 +44,7 @@ def test_finer_detail_is_the_upsamplers(upsampler):
     truth = (picture(*SIZE) + 0.1 * (torch.arange(64) % 2)[None, :, None] - 0.05).clamp(0, 1)
     base = resize(truth, (24, 32), "pil-bicubic")
     upsampler(lambda image, size: truth)
-    target, confidence = detail(base)._make(VIEW)
+    target, confidence = detail(base)._make_target(VIEW)
     torch.testing.assert_close(target, truth, atol=1e-3, rtol=0)
     assert confidence.min() > 0.99
 
@@ -54,7 +54,7 @@ def test_a_pixel_is_believed_as_far_as_it_agrees_with_the_base(upsampler):
     wrong = torch.zeros(*SIZE, 1)
     wrong[:, 40:] = 0.5
     upsampler(lambda image, size: resize(image, size, "pil-bicubic") - wrong)
-    _, confidence = detail(base)._make(VIEW)
+    _, confidence = detail(base)._make_target(VIEW)
     assert confidence.shape == (24, 32, 1)
     assert confidence[:, :18].min() > 0.9 and confidence[:, 22:].max() < 0.1
 
@@ -75,10 +75,10 @@ def test_the_loss_mixes_differences_structure_and_contrast_where_the_target_is_b
     upsampler(lambda image, size: (resize(image, size, "pil-bicubic") + 0.2 * (torch.arange(64) > 40)[None, :, None]).clamp(0, 1))
     settings = dict(detail_structure=structure, detail_contrast=contrast, detail_weight=1.0)
     part, image = detail(picture(24, 32), **settings), picture(*SIZE, seed=1)
-    target, confidence = part._make(VIEW)
+    target, confidence = part._make_target(VIEW)
     confidence = resize(confidence, SIZE, "bilinear")
     ssim, as_strong = similarity(image, target)
-    mixed = (1 - structure) * (image - target).abs() + structure * (1 - ssim) + contrast * confidence**SURE * (1 - as_strong)
+    mixed = (1 - structure) * (image - target).abs() + structure * (1 - ssim) + contrast * confidence**CONTRAST_POWER * (1 - as_strong)
     torch.testing.assert_close(part(VIEW, image), (confidence * mixed).mean(), atol=4e-4, rtol=0)  # kept in half precision
     assert confidence.std() > 0.1
 

@@ -9,7 +9,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.growing import still as frozen
+from mipmap_plugin.adaptation.optimization.growing import frozen_parameters
 from mipmap_plugin.adaptation.optimization.run import Task, Trial
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.target.resize import resize
@@ -62,7 +62,7 @@ def test_a_growth_that_views_do_not_get_over_is_undone_and_was_the_last(judged):
     run = adapted()
     sizes = counts(run)
     assert sizes[1] < sizes[3] and sizes[5:] == [sizes[1]] * 3
-    assert run.report.ended_by == "8 steps; growing was undone at step 6, for it left views farther from the base than at the start"
+    assert run.report.ended_by == "8 steps; growth was undone at step 6: the views were farther from the base than at the start"
 
 
 def test_centers_move_once_something_has_grown(judged):
@@ -77,11 +77,11 @@ def test_centers_move_once_something_has_grown(judged):
 
 
 def test_centers_go_on_moving_when_a_growth_has_passed_and_stand_when_the_first_was_undone():
-    def still(**trial):
-        return frozen(SimpleNamespace(trial=Trial(30.0, **trial)))
+    def names(**trial):
+        return frozen_parameters(SimpleNamespace(trial=Trial(30.0, **trial)))
 
-    assert still() == still(undone_at=4) == ("means",)
-    assert still(before={}) == still(passed=True) == still(passed=True, undone_at=6) == ()
+    assert names() == names(undone_at=4) == ("means",)
+    assert names(before={}) == names(passed=True) == names(passed=True, undone_at=6) == ()
 
 
 @pytest.mark.parametrize("ending", [dict(steps=3), dict(target_db=1.0, check_every=2)])
@@ -89,7 +89,7 @@ def test_a_growth_is_judged_when_the_run_ends(judged, ending):
     judged(30.0, 10.0)
     run = adapted(**ending)
     assert run.report.gaussians_after == len(tiny.model())
-    assert "growing was undone at step" in run.report.ended_by
+    assert "growth was undone at step" in run.report.ended_by
 
 
 def test_what_is_no_number_is_undone(judged):

@@ -136,7 +136,7 @@ def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, scale, settin
 def test_a_folder_without_cameras_adapts_on_an_orbit_at_all_times(tmp_path):
     (moving.write_hexplane(tmp_path / "m") / "cameras.json").unlink()  # which the project never writes
     adapted = wrap_model(tmp_path / "m", backend="reference").adapt(1 / 32, recipe="instant", extra_views=3)
-    assert adapted.report.views.endswith("(the checkpoint came without cameras), 3 of them without a time, which are spread over 0..1")
+    assert adapted.report.views.endswith("(the checkpoint came without cameras), 3 of them without a time of their own, spread over 0..1")
 
 
 def test_the_coarse_stage_is_plain_splats(tmp_path):

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mipmap_plugin.adaptation.start.blend_weights import light
-from mipmap_plugin.adaptation.start.matching import MOST, ROUNDS, matched
+from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, ROUNDS, matched_opacities
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -25,7 +25,7 @@ def walls(*opacities: float) -> Gaussians:
 
 
 def weigh(opacities: torch.Tensor) -> torch.Tensor:
-    return light(replace(walls(*opacities.tolist()), opacities=opacities), [VIEW], ReferenceBackend(), Effects(0))
+    return blend_weights(replace(walls(*opacities.tolist()), opacities=opacities), [VIEW], ReferenceBackend(), Effects(0))
 
 
 HALF = torch.tensor([PIXELS / 2, PIXELS / 4], dtype=torch.float64)  # px: of two walls that cover half of what they are before
@@ -37,32 +37,32 @@ def test_the_weights_of_two_walls_are_known():
 
 @pytest.mark.parametrize("opacities", [(0.9, 0.9), (0.8, 0.2), (0.3, 0.3), (0.3, 0.9)])
 def test_opacities_become_those_that_were_wanted(opacities):
-    new = matched(torch.tensor(opacities, dtype=torch.float64), HALF, weigh)
+    new = matched_opacities(torch.tensor(opacities, dtype=torch.float64), HALF, weigh)
     torch.testing.assert_close(new, torch.full_like(new, 0.5), rtol=1e-3, atol=0)
 
 
 def test_every_round_comes_closer():
     tried = []
-    matched(torch.tensor([0.95, 0.05], dtype=torch.float64), HALF, lambda opacities: tried.append(opacities) or weigh(opacities))
+    matched_opacities(torch.tensor([0.95, 0.05], dtype=torch.float64), HALF, lambda opacities: tried.append(opacities) or weigh(opacities))
     far = [float((weigh(each) - HALF).abs().sum()) for each in tried]
     assert len(far) == ROUNDS and far == sorted(far, reverse=True)
 
 
 def test_no_opacity_rises_above_one():
-    new = matched(torch.tensor([0.5, 0.5], dtype=torch.float64), 10 * HALF, weigh)
+    new = matched_opacities(torch.tensor([0.5, 0.5], dtype=torch.float64), 10 * HALF, weigh)
     assert (new == 1).all()
 
 
 def test_unseen_splats_stay_as_they_are():
     opacities = torch.tensor([0.3, 0.0])
-    assert torch.equal(matched(opacities, torch.zeros(2), torch.zeros_like), opacities)
+    assert torch.equal(matched_opacities(opacities, torch.zeros(2), torch.zeros_like), opacities)
 
 
 def test_what_is_wanted_of_the_unseen_and_what_nobody_wants_stay_finite():
-    unseen, unwanted = matched(torch.tensor([1e-6, 0.5]), torch.tensor([9.0, 0.0]), lambda tried: torch.tensor([0.0, 9.0])).tolist()
-    assert unseen == pytest.approx(1e-6 * MOST**ROUNDS) and unwanted == pytest.approx(0.5 / MOST**ROUNDS)
+    unseen, unwanted = matched_opacities(torch.tensor([1e-6, 0.5]), torch.tensor([9.0, 0.0]), lambda tried: torch.tensor([0.0, 9.0])).tolist()
+    assert unseen == pytest.approx(1e-6 * MAX_FACTOR**ROUNDS) and unwanted == pytest.approx(0.5 / MAX_FACTOR**ROUNDS)
 
 
 def test_nothing_changes_where_weights_match():
     opacities = torch.tensor([0.7, 0.2], dtype=torch.float64)
-    torch.testing.assert_close(matched(opacities, weigh(opacities), weigh), opacities, rtol=1e-9, atol=0)
+    torch.testing.assert_close(matched_opacities(opacities, weigh(opacities), weigh), opacities, rtol=1e-9, atol=0)

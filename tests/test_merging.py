@@ -9,7 +9,7 @@ import torch
 from tiny import cameras
 from tiny import model as tiny_model
 
-from mipmap_plugin.adaptation.start.merging import FARTHEST, merge
+from mipmap_plugin.adaptation.start.merging import MAX_DISTANCE, merge
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.recipes import recipe
@@ -90,7 +90,7 @@ def test_a_pair_that_costs_too_much_stays_two():
 
 
 def test_splats_that_are_far_apart_stay_two():
-    far = replace(cloud(2), means=torch.tensor([[0.0, 0.0, 0.0], [1.01 * FARTHEST, 0.0, 0.0]]))
+    far = replace(cloud(2), means=torch.tensor([[0.0, 0.0, 0.0], [1.01 * MAX_DISTANCE, 0.0, 0.0]]))
     assert len(merged(far, 0.5)) == 2
 
 

@@ -18,7 +18,7 @@ def test_views_without_a_time_get_all_times_evenly_in_random_order():
     views, told = with_times(tiny.cameras(11), seed=0)
     times = [view.time for view in views]
     assert sorted(times) == pytest.approx([step / 10 for step in range(11)]) and times != sorted(times)
-    assert told == "11 of them without a time, which are spread over 0..1"
+    assert told == "11 of them without a time of their own, spread over 0..1"
     assert [view.time for view in with_times(tiny.cameras(11), seed=0)[0]] == times
     assert [view.time for view in with_times(tiny.cameras(11), seed=1)[0]] != times
 
@@ -37,7 +37,7 @@ def test_jittered_views_take_the_times_of_the_cameras():
 
 def test_the_report_says_how_a_moving_scene_was_sampled_and_a_still_one_has_no_times(tmp_path):
     moves = wrap_model(moving.write_deformable(tmp_path / "m"), backend="reference").adapt(4, recipe="instant")
-    assert moves.report.views == "4 train views and 100 around them, 104 of them without a time, which are spread over 0..1"
+    assert moves.report.views == "4 train views and 100 around them, 104 of them without a time of their own, spread over 0..1"
     still = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(4, recipe="instant")
     assert "time" not in still.report.views
 

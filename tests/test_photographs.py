@@ -56,7 +56,7 @@ def test_adapting_to_images_says_so_and_leads_elsewhere(scene):
 def test_images_that_cannot_take_part_are_refused(scene):
     model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
     for scale, settings in ((1 / 2, {}), (2, dict(compare_at="target"))):
-        with pytest.raises(SettingsError, match="real images take part only in a zoom-in"):
+        with pytest.raises(SettingsError, match="real images can be used only for a zoom-in"):
             model.adapt(scale, images=scene, **settings)
     with pytest.raises(SettingsError, match="the checkpoint has no cameras, so that the scale of the images is not known"):
         wrap_model(tiny.model(), backend="reference").adapt(2, images=scene)

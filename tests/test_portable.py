@@ -13,7 +13,7 @@ import torch
 from mipmap_plugin import cli, register_viewer, wrap_model
 from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import Validation
-from mipmap_plugin.adaptation.target.portable import FEWER, extremes, middle
+from mipmap_plugin.adaptation.target.portable import MERGE_FACTOR, extreme_targets, median_target
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -87,14 +87,14 @@ def test_a_model_is_drawn_by_the_viewers_that_it_is_for():
 
 def test_the_extremes_speak_for_all():
     every = {name: find_viewer(name).effects(Effects(3)) for name in viewers_for("portable")}
-    assert list(extremes(every)) == ["classic", "antialiased", "playcanvas-webgpu", "gaussian-splats-3d", "antimatter15"]
-    assert middle(every) is every["playcanvas"]
+    assert list(extreme_targets(every)) == ["classic", "antialiased", "playcanvas-webgpu", "gaussian-splats-3d", "antimatter15"]
+    assert median_target(every) is every["playcanvas"]
 
 
 @pytest.mark.parametrize("name", ["classic", "spark", "mip"])
 def test_one_viewer_speaks_for_itself(name):
     alone = {name: find_viewer(name).effects(Effects(3))}
-    assert extremes(alone) == alone and middle(alone) is alone[name]
+    assert extreme_targets(alone) == alone and median_target(alone) is alone[name]
 
 
 def test_settings_for_several_give_way_to_those_that_are_asked_for():
@@ -102,7 +102,7 @@ def test_settings_for_several_give_way_to_those_that_are_asked_for():
         return wrapped().adapt(1 / 4, viewer=viewer, steps=1, extra_views=1, **asked).report.settings
 
     alone, several, asked = settings("spark"), settings("portable"), settings("portable", merge_to=0.5, loss="l1")
-    assert several.merge_to == pytest.approx(alone.merge_to * FEWER) and (alone.loss, several.loss) == ("psnr", "l2")
+    assert several.merge_to == pytest.approx(alone.merge_to * MERGE_FACTOR) and (alone.loss, several.loss) == ("psnr", "l2")
     assert (asked.merge_to, asked.loss) == (0.5, "l1")
 
 
@@ -111,8 +111,8 @@ def test_settings_for_several_give_way_to_those_that_are_asked_for():
 
 def test_viewers_take_turns():
     first, *others = colored(0.0, 0.5, 1.0)
-    task = Task([], 1.0, first, first, False, Validation([], [], 1.0, first, first, "area"), others=others)
-    assert [task.drawn(draw) for draw in range(5)] == [first, *others, first, others[0]]
+    task = Task([], 1.0, first, first, False, Validation([], [], 1.0, first, first, "area"), further_renders=others)
+    assert [task.renderer(draw) for draw in range(5)] == [first, *others, first, others[0]]
 
 
 def test_each_viewer_draws_for_the_gradient(monkeypatch, pair):
@@ -134,7 +134,7 @@ def test_the_mean_square_over_viewers_steers_and_the_worst_chooses():
     cameras, shows = tiny.cameras(2), colored(0.4, 0.1, 0.49)
     judge = Validation(cameras, cameras, 1.0, lambda view: torch.full((*view.size, 3), 0.5), shows[0], "area", shows[1:])
     model = SimpleNamespace(gaussians=lambda camera: None)
-    assert judge.in_each(model, cameras) == pytest.approx([20.0, 7.9588, 40.0], abs=1e-3)
+    assert judge.viewer_psnrs(model, cameras) == pytest.approx([20.0, 7.9588, 40.0], abs=1e-3)
     assert judge.steer(model) == pytest.approx(-10 * math.log10((0.1**2 + 0.4**2 + 0.01**2) / 3), abs=1e-3)
     assert judge.choose({"it": model})[1] == pytest.approx({"it": 7.9588}, abs=1e-3)
 
@@ -167,7 +167,8 @@ def test_the_report_has_each_viewer_and_the_file_says_what_it_is(tmp_path):
     adapted = wrapped().adapt(1 / 4, viewer="portable", **BRIEF)
     assert tuple(adapted.report.viewers) == tuple(adapted.viewers) == viewers_for("portable")
     returned = next(name for name in adapted.report.validation if adapted.report.returned.startswith(name))
-    assert min(adapted.report.viewers[name] for name in extremes(adapted.viewers)) == pytest.approx(adapted.report.validation[returned], abs=1e-6)
+    worst = min(adapted.report.viewers[name] for name in extreme_targets(adapted.viewers))
+    assert worst == pytest.approx(adapted.report.validation[returned], abs=1e-6)
     assert {effect.name: effect.on for effect in adapted.report.effects}["contribution cull"]  # of one of them
     assert adapted.effects == Effects(1)  # classic
     comments = read_ply(adapted.save(tmp_path / "new.ply")).comments

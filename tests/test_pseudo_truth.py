@@ -10,7 +10,7 @@ from mipmap_plugin.adaptation import views as views_module
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
-from mipmap_plugin.adaptation.views import Order, Rounds, choose_views, extent
+from mipmap_plugin.adaptation.views import ShuffledRounds, ViewSchedule, choose_views, extent
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
@@ -142,7 +142,7 @@ def test_views_follow_from_the_seed():
 def test_an_orbit_that_is_asked_for_samples_as_densely_as_the_cameras():
     (views, which), cameras = chosen("orbit", extra_views=5)
     assert len(views) == 5 and all(math.isclose(view.fx, cameras[0].fx, rel_tol=0.05) for view in views)
-    assert which == f"5 views of a generated orbit at {views[0].width} px (asked for)"
+    assert which == f"5 views of a generated orbit at {views[0].width} px (as requested)"
 
 
 @pytest.mark.parametrize("policy", ["given", "train", "test", "orbit", "jittered"])
@@ -153,19 +153,19 @@ def test_without_cameras_there_is_an_orbit(policy):
 
 
 def test_a_split_without_views_is_refused():
-    with pytest.raises(SettingsError, match="there are no test views among the 4 cameras; ask for the views 'given'"):
+    with pytest.raises(SettingsError, match="there are no test views among the 4 cameras; use the view policy 'given'"):
         chosen("test", cameras=tiny.cameras(4))
 
 
 def test_rounds_show_every_view_once_and_start_anywhere():
     views = tiny.cameras(5)
-    rounds = Rounds(views, seed=2)
+    rounds = ShuffledRounds(views, seed=2)
     drawn = [rounds(draw) for draw in range(15)]
     for start in (0, 5, 10):
         assert set(drawn[start : start + 5]) == set(views)
     assert drawn[:5] != drawn[5:10]
-    assert [Rounds(views, seed=2)(draw) for draw in range(15)] == drawn
-    assert [Rounds(views, seed=3)(draw) for draw in range(15)] != drawn
+    assert [ShuffledRounds(views, seed=2)(draw) for draw in range(15)] == drawn
+    assert [ShuffledRounds(views, seed=3)(draw) for draw in range(15)] != drawn
 
 
 def test_views_are_spread_over_their_order():
@@ -176,7 +176,7 @@ def test_views_are_spread_over_their_order():
 
 def test_views_are_gathered_evenly_and_then_come_in_rounds():
     views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=20, views_per_step=3, gathering=0.5, warm_up=0)
-    order, known, growth = Order(views, config), set(), []
+    order, known, growth = ViewSchedule(views, config), set(), []
     for step in range(10):
         taken = order(step, step / 20)
         assert len(taken) == len(set(taken)) == 3
@@ -185,12 +185,12 @@ def test_views_are_gathered_evenly_and_then_come_in_rounds():
     assert growth[0] == 3 and max(growth[1:]) <= 2 and known == set(views)
     later = [view for step in range(12, 20) for view in order(step, step / 20)]
     assert set(later[:12]) == set(later[12:]) == set(views)
-    assert [Order(views, config)(step, step / 20) for step in range(20)] == [order(step, step / 20) for step in range(20)]
+    assert [ViewSchedule(views, config)(step, step / 20) for step in range(20)] == [order(step, step / 20) for step in range(20)]
 
 
 def test_a_step_takes_few_views_at_first_and_later_rounds_miss_none():
     views, config = tiny.cameras(12), recipe("default", 1 / 4, steps=40, views_per_step=4, gathering=0.2, warm_up=0.4)
-    order = Order(views, config)
+    order = ViewSchedule(views, config)
     taken = [order(step, step / 40) for step in range(40)]
     assert [len(step) for step in taken] == [1] * 4 + [2] * 4 + [3] * 4 + [4] * 28
     assert {view for step in taken[:8] for view in step} == set(views)
@@ -199,24 +199,24 @@ def test_a_step_takes_few_views_at_first_and_later_rounds_miss_none():
 
 
 def test_where_time_is_short_views_come_in_faster():
-    order = Order(tiny.cameras(12), recipe("default", 1 / 4, steps=400, views_per_step=3, warm_up=0, time_budget_s=1.0))
+    order = ViewSchedule(tiny.cameras(12), recipe("default", 1 / 4, steps=400, views_per_step=3, warm_up=0, time_budget_s=1.0))
     early, late = ({view for step in range(3) for view in order(step, progress)} for progress in (0.0, 0.25))
     assert len(early) == 3 and len(late) > 5
 
 
 def test_no_more_views_come_in_than_steps_take():
-    order = Order(tiny.cameras(9), recipe("default", 1 / 4, steps=4, views_per_step=2, gathering=0.5, warm_up=0))
+    order = ViewSchedule(tiny.cameras(9), recipe("default", 1 / 4, steps=4, views_per_step=2, gathering=0.5, warm_up=0))
     assert [len(set(order(0, 0))), len(set(order(0, 0) + order(1, 0.25)))] == [2, 4]
 
 
 def test_a_step_takes_no_view_twice_where_there_are_few():
-    order = Order(tiny.cameras(2), recipe("default", 1 / 4, steps=4, views_per_step=3, gathering=0.5, warm_up=0))
+    order = ViewSchedule(tiny.cameras(2), recipe("default", 1 / 4, steps=4, views_per_step=3, gathering=0.5, warm_up=0))
     assert [len(set(order(step, step / 4))) for step in range(4)] == [len(order(step, step / 4)) for step in range(4)] == [2, 2, 2, 2]
 
 
 def test_steps_and_rounds_meet_again_after_the_warm_up():
     views = tiny.cameras(4)
-    order = Order(views, recipe("default", 1 / 4, steps=400, views_per_step=4, gathering=0.1, warm_up=0.025))
+    order = ViewSchedule(views, recipe("default", 1 / 4, steps=400, views_per_step=4, gathering=0.1, warm_up=0.025))
     assert all(set(order(step, step / 400)) == set(views) for step in range(40, 60))
 
 

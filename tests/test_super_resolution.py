@@ -87,19 +87,19 @@ def test_what_is_no_enlarging_network_is_refused_in_a_sentence(spandrel, network
     (tmp_path / "text.safetensors").write_text("no tensors")
     for name, sentence in {
         "hostile.pth": "is not executed",
-        "other.pth": "is no network that spandrel knows",
+        "other.pth": "not a network that spandrel supports",
         "text.safetensors": "is damaged; download it again",
     }.items():
         with pytest.raises(CheckpointError, match=sentence):
             Network(tmp_path / name)
-    with pytest.raises(SettingsError, match="does not enlarge; give one that does"):
+    with pytest.raises(SettingsError, match="does not enlarge images; give one that does"):
         Network(network_file(scale=1))
 
 
 def test_a_file_that_is_not_there_and_a_name_that_nobody_registered():
     with pytest.raises(SettingsError, match=r"there is no upsampler file nowhere\.pth; check the path"):
         find_upsampler("nowhere.pth")
-    with pytest.raises(SettingsError, match="there is no upsampler 'swin'; known are bicubic, lanczos, or give the file of a network"):
+    with pytest.raises(SettingsError, match="there is no upsampler 'swin'; choose from bicubic, lanczos, or give the file of a network"):
         find_upsampler("swin")
 
 

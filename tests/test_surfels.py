@@ -13,7 +13,7 @@ import torch
 from oracle import color_one
 from samples import camera, gaussians, leaves
 
-from mipmap_plugin.adaptation.start.surfel_form import shown_area
+from mipmap_plugin.adaptation.start.surfel_form import visible_area
 from mipmap_plugin.backends import choose_backend, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -167,7 +167,7 @@ def test_the_area_is_that_of_the_larger_of_both(axes):
     spread = turn @ torch.diag(torch.tensor([a * a, b * b], dtype=torch.float64)) @ turn.T
     entries = (spread[i, j].reshape(1) for i, j in ((0, 0), (0, 1), (1, 1)))
     shown = Projected(torch.zeros(1, 2), torch.ones(1), *entries, torch.tensor([a * a * b * b]))
-    assert float(2 * math.pi * shown_area(shown, 0.5)) == pytest.approx(float(torch.exp(-squared / 2).sum()) * cell, rel=1e-3)
+    assert float(2 * math.pi * visible_area(shown, 0.5)) == pytest.approx(float(torch.exp(-squared / 2).sum()) * cell, rel=1e-3)
 
 
 def columns(count=50):

@@ -10,9 +10,19 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization import loop
-from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, take_back
+from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, restore_snapshot
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
-from mipmap_plugin.adaptation.optimization.validation import FIRST, GENTLER, HARDLY, HARM, KEPT_BACK, WINDOW, Steering, Validation, hold_back
+from mipmap_plugin.adaptation.optimization.validation import (
+    FIRST_RATE_FACTOR,
+    HARM_DB,
+    RATE_REDUCTION,
+    TIE_DB,
+    VALIDATION_EVERY,
+    WINDOW,
+    Steering,
+    Validation,
+    split_validation,
+)
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import choose_views
@@ -28,7 +38,7 @@ SCALE = 1 / 4
 # So bold that every step does harm.
 BOLD = {name: 1000 * rate for name, rate in recipe("default", SCALE).rates.model_dump().items()}
 HARMFUL = dict(steps=6, extra_views=2, check_every=2, merge_to=1.0, warm_up=0, patience=None, rates=BOLD)
-MANY = 2 * KEPT_BACK  # cameras, of which two are kept back
+MANY = 2 * VALIDATION_EVERY  # cameras, of which two are kept back
 
 
 def wrapped(count=40, cameras=None):
@@ -45,7 +55,7 @@ def same(model, other) -> bool:
 def held_back(cameras, policy, scale=SCALE, **settings):
     config = recipe("default", scale, **{"views": policy, "extra_views": 8, **settings})
     views, _ = choose_views(cameras, MEANS, config)
-    return hold_back(cameras, views, MEANS, scale, config)
+    return split_validation(cameras, views, MEANS, scale, config)
 
 
 def poses(views):
@@ -69,8 +79,8 @@ def test_given_cameras_are_kept_back_only_where_the_choice_is_ours(policy, kept)
 
 
 def test_few_cameras_are_all_adapted_to():
-    left, judged = held_back(tiny.cameras(KEPT_BACK - 1), "train")
-    assert len(left) == KEPT_BACK - 1 and len(judged) == 16
+    left, judged = held_back(tiny.cameras(VALIDATION_EVERY - 1), "train")
+    assert len(left) == VALIDATION_EVERY - 1 and len(judged) == 16
 
 
 def test_cameras_that_are_kept_back_choose_and_do_not_steer():
@@ -136,7 +146,7 @@ def test_the_best_state_is_chosen_and_every_score_is_told():
     assert found == pytest.approx({"base": 20.0, "best": 40.0, "last": 0.0}, abs=1e-3)
 
 
-@pytest.mark.parametrize(("worse_db", "chosen"), [(0.0, "later"), (HARDLY / 2, "later"), (2 * HARDLY, "earlier")])
+@pytest.mark.parametrize(("worse_db", "chosen"), [(0.0, "later"), (TIE_DB / 2, "later"), (2 * TIE_DB, "earlier")])
 def test_of_equals_the_later_is_chosen(worse_db, chosen):
     later = 0.1 * 10 ** (worse_db / 20)
     assert judge(0.0).choose({"earlier": shows(0.1, 0.1), "later": shows(later, later)})[0] == chosen
@@ -151,26 +161,26 @@ def steering(**more) -> Steering:
 
 def test_boldness_rises_by_the_same_factor_in_each_step_of_the_warm_up():
     config = recipe("default", SCALE, warm_up=0.5)
-    risen = [steering().boldness(progress, config) for progress in (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)]
-    assert risen == pytest.approx([FIRST, FIRST**0.75, FIRST**0.5, FIRST**0.25, 1, 1, 1])
-    assert steering().boldness(0.0, recipe("default", SCALE, warm_up=0)) == 1
+    risen = [steering().rate_factor(progress, config) for progress in (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)]
+    assert risen == pytest.approx([FIRST_RATE_FACTOR, FIRST_RATE_FACTOR**0.75, FIRST_RATE_FACTOR**0.5, FIRST_RATE_FACTOR**0.25, 1, 1, 1])
+    assert steering().rate_factor(0.0, recipe("default", SCALE, warm_up=0)) == 1
 
 
 def test_boldness_does_not_rise_above_the_ceiling():
     config, capped = recipe("default", SCALE, warm_up=0.5), steering(ceiling=0.25)
-    assert [capped.boldness(progress, config) for progress in (0.0, 0.5, 1.0)] == pytest.approx([FIRST, 0.25, 0.25])
+    assert [capped.rate_factor(progress, config) for progress in (0.0, 0.5, 1.0)] == pytest.approx([FIRST_RATE_FACTOR, 0.25, 0.25])
 
 
 def test_harm_is_less_than_the_start_by_more_than_a_choice_of_views_makes():
-    assert not steering().harms(30 - HARM + 1e-6)
-    assert steering().harms(30 - HARM - 1e-6)
+    assert not steering().is_harmful(30 - HARM_DB + 1e-6)
+    assert steering().is_harmful(30 - HARM_DB - 1e-6)
 
 
 def test_what_is_taken_back_goes_on_with_gentler_steps():
     run = steering()
-    run.take_back(0.5)
-    run.take_back(run.ceiling)
-    assert run.ceiling == 0.5 * GENTLER**2
+    run.reduce_rates(0.5)
+    run.reduce_rates(run.ceiling)
+    assert run.ceiling == 0.5 * RATE_REDUCTION**2
 
 
 @pytest.mark.parametrize("rows", [5, 3])
@@ -185,16 +195,16 @@ def test_what_is_taken_back_is_held_and_adam_begins_anew(rows):
 
     for _ in range(3):
         step()
-    take_back(student, optimizer, Snapshot.of(other))
+    restore_snapshot(student, optimizer, Snapshot.of(other))
     assert same(other, student) and (student.parameters()["opacities"] is before) == (rows == 5)
     step()
     torch.testing.assert_close(student.parameters()["opacities"].detach(), wanted - 0.1)  # the first step of Adam is its rate
 
 
-@pytest.mark.parametrize(("found", "best_db", "step"), [(31.0, 31.0, 7), (30 - HARDLY / 2, 30.0, 7), (30 - 2 * HARDLY, 30.0, 0)])
-def test_a_state_is_kept_unless_it_is_worse(found, best_db, step):
+@pytest.mark.parametrize(("psnr", "best_db", "step"), [(31.0, 31.0, 7), (30 - TIE_DB / 2, 30.0, 7), (30 - 2 * TIE_DB, 30.0, 0)])
+def test_a_state_is_kept_unless_it_is_worse(psnr, best_db, step):
     run, student = steering(), tiny.model(2, seed=1)
-    run.keep(found, 7, student)
+    run.update_best(psnr, 7, student)
     assert (run.best_db, run.best_step) == (best_db, step)
     assert torch.equal(run.best.rows["means"], student.parameters()["means"]) == (step == 7)
 
@@ -213,23 +223,23 @@ def from_the_base(model, image, camera, scale):
 @pytest.mark.parametrize("scale", [1 / 4, 4])
 def test_harmful_steps_return_nothing_worse_than_the_base_and_the_start(monkeypatch, scale, steered):
     if not steered:
-        monkeypatch.setattr(Steering, "harms", lambda self, found: False)
+        monkeypatch.setattr(Steering, "is_harmful", lambda self, psnr: False)
     model = wrapped()
     started, adapted = model.adapt(scale, **{**HARMFUL, "steps": 0}), model.adapt(scale, **HARMFUL)
     for camera in tiny.cameras(3, seed=9):  # of neither set
         small = camera.zoomed(scale)
         images = model.render(small).image, started.render(small).image, adapted.render(small).image
         base, first, final = (from_the_base(model, image, camera, scale) for image in images)
-        assert final >= max(base, first) - HARM
+        assert final >= max(base, first) - HARM_DB
 
 
 def test_a_report_says_which_state_was_returned_and_why(monkeypatch):
-    monkeypatch.setattr(Steering, "harms", lambda self, found: False)
+    monkeypatch.setattr(Steering, "is_harmful", lambda self, psnr: False)
     report = wrapped().adapt(SCALE, **HARMFUL).report
     found, name = report.validation, "the start, the closed form"
     assert list(found) == ["the base as it is", name, "the last state"]
     assert found["the last state"] < found[name] - 3
-    assert report.returned == f"{name}, for the last state shows {found['the last state']:.2f} dB where it shows {found[name]:.2f}"
+    assert report.returned == f"{name}: {found[name]:.2f} dB on validation views, the last state {found['the last state']:.2f} dB"
 
 
 def test_steps_that_were_taken_back_are_marked():
@@ -309,8 +319,8 @@ def test_the_closed_form_alone_is_judged_too(monkeypatch):
 
 
 def test_a_start_that_is_worse_than_the_base_is_not_returned(monkeypatch):
-    monkeypatch.setattr(start.Start, "best", lambda self: (tiny.model(40, seed=5), "another scene"))
+    monkeypatch.setattr(start.StartSearch, "best", lambda self: (tiny.model(40, seed=5), "another scene"))
     model = wrapped()
     adapted = model.adapt(SCALE, recipe="instant")
-    assert adapted.report.returned.startswith("the base as it is, for the start, another scene shows ")
+    assert adapted.report.returned.startswith("the base as it is: ")
     assert same(adapted.model, model.model)

@@ -92,7 +92,7 @@ def test_a_run_for_one_viewer_is_not_resumed_for_another(tmp_path):
 
     with pytest.raises(Interrupted):
         wrapped().adapt(1 / 4, viewer="spark", resume=tmp_path / "run", observe=stop, **BRIEF)
-    with pytest.raises(SettingsError, match="belongs to another base, other settings or other views"):
+    with pytest.raises(SettingsError, match="belongs to another base, settings or views"):
         wrapped().adapt(1 / 4, viewer="playcanvas", resume=tmp_path / "run", **BRIEF)
 
 

@@ -1,4 +1,4 @@
-"""What an adaptation returns: the model, its report, and how it is shown and saved."""
+"""The result of an adaptation: the model and its report, with methods to render and save it."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from mipmap_plugin.models.outputs import REPORT
 
 @dataclass(frozen=True, eq=False)
 class Adapted:
-    """A model that looks right at its scale, and the report of how it came to."""
+    """A model that looks right at its scale, and the report of how it was made."""
 
     model: SplatModel
     report: Report
     backend: Backend
     effects: Effects
-    viewers: Mapping[str, Effects] = field(default_factory=dict)  # how each viewer that the file is for renders it
-    state: StateFile | None = None  # of the run, which is of use until the model is saved
-    views: Sequence[Camera] = ()  # of the base scale, that were adapted to or selected on
+    viewers: Mapping[str, Effects] = field(default_factory=dict)  # how each viewer that the file is made for renders it
+    state: StateFile | None = None  # the state of the run, which is needed until the model is saved
+    views: Sequence[Camera] = ()  # the cameras of the base scale that the model was adapted to or selected on
 
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
-        """The view of a camera of the new scale; `outputs` and `exposure` as of `Wrapped.render`. `viewer`: one of `viewers`."""
+        """Render the view of a camera of the new scale, in one of the `viewers`; `outputs` and `exposure` as in `Wrapped.render`."""
         if viewer is not None and viewer not in self.viewers:
-            made_for = ", ".join(filter(None, self.viewers)) or "none by name"
-            raise SettingsError(f"this model is not made for the viewer {viewer!r}, but for {made_for}")
+            available = ", ".join(filter(None, self.viewers)) or "no viewer by name"
+            raise SettingsError(f"this model was not made for the viewer {viewer!r}, but for {available}")
         effects = self.effects if viewer is None else self.viewers[viewer]
-        return shown(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
+        return render_model(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
-        with together(Path(path)):  # no new model without its report
+        with together(Path(path)):  # a new model never appears without its report
             saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
             write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=True)
         if self.state is not None:
@@ -53,8 +53,10 @@ class Adapted:
 
 
 @torch.no_grad()
-def shown(model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None) -> Rendered:
-    """What the model, its splats changed by `form`, shows to a camera, and the effects that it called for. Raises SettingsError."""
+def render_model(
+    model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None
+) -> Rendered:
+    """Render a model, its splats first changed by `form`, and report the effects that were simulated. Raises SettingsError."""
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
     gaussians = model.gaussians(camera) if form is None else form(model.gaussians(camera))
     rendered = supersample.render(backend, gaussians, camera, effects)

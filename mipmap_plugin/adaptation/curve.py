@@ -1,4 +1,4 @@
-"""What was gained by when: the clock, the curve, and the reasons to stop."""
+"""Accuracy against time during a run: the clock, the points of the curve, and the reasons to stop."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ class CurvePoint(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     step: int
-    seconds: float  # of adapting, what came before the first step included; an observer's measuring is not billed
+    seconds: float  # of adapting, including the time before the first step, excluding the time that an observer takes
     psnr_db: float | None  # against the pseudo truth, over the views since the last point; None where no step was taken since
-    validation_db: float  # of the state that the run goes on with, on views that nothing is adapted to
+    validation_db: float  # of the state that the run continues from, on views that nothing is adapted to
     gaussians: int
-    taken_back: bool = False  # the steps since the best state had done harm, and are undone
+    taken_back: bool = False  # the steps since the best state did harm, and were undone
 
 
 class Stopwatch:
-    """Seconds spent inside `with`, so that measuring quality is not billed as adapting.
+    """Counts the seconds spent inside `with`, so that measuring quality does not count as adapting.
 
-    With a `device` its work is waited for at both ends; without, whoever uses the watch waits where it is right to.
+    With a `device`, the watch synchronizes with it at both ends; without, its user has to synchronize where needed.
     """
 
     def __init__(self, device: torch.device | None = None, seconds: float = 0.0) -> None:
@@ -42,7 +42,7 @@ class Stopwatch:
         self.seconds, self._start = self.read(), None
 
     def read(self) -> float:
-        """Seconds until now, inside `with` too."""
+        """Return the seconds so far, also inside `with`."""
         return self.seconds if self._start is None else self.seconds + self._now() - self._start
 
     def _now(self) -> float:
@@ -52,23 +52,23 @@ class Stopwatch:
 
 
 def progress(step: int, seconds: float, config: AdaptConfig) -> float:
-    """0..1: how much of its steps or of its time budget a run has used, whichever is more."""
+    """Fraction (0..1) of its steps or of its time budget that a run has used, whichever is larger."""
     return min(1.0, max(step / max(1, config.steps), seconds / (config.time_budget_s or math.inf)))
 
 
 def decibel(mean_square: float) -> float:
-    """PSNR of images in 0..1."""
+    """PSNR in dB for the mean square error of images in 0..1."""
     return -10 * math.log10(max(mean_square, 1e-12))  # 120 dB: beyond single precision
 
 
 def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig) -> str | None:
-    """Why adapting ends before its last step: the budget is spent, the target reached, or the knee passed."""
+    """Why a run ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue."""
     if config.time_budget_s is not None and seconds >= config.time_budget_s:
         return f"time budget of {config.time_budget_s:g} s"
-    found = [point.psnr_db for point in curve if point.psnr_db is not None]
-    if config.target_db is not None and found and found[-1] >= config.target_db:
+    psnrs = [point.psnr_db for point in curve if point.psnr_db is not None]
+    if config.target_db is not None and psnrs and psnrs[-1] >= config.target_db:
         return f"target of {config.target_db:g} dB against the pseudo truth"
-    waited = config.patience is not None and len(found) > config.patience
-    if waited and max(found[-config.patience :]) < max(found[: -config.patience]) + config.min_gain_db:  # type: ignore[operator]
-        return f"knee: {config.patience} checks in a row gained less than {config.min_gain_db:g} dB"
+    patience = config.patience
+    if patience is not None and len(psnrs) > patience and max(psnrs[-patience:]) < max(psnrs[:-patience]) + config.min_gain_db:
+        return f"knee: {patience} checks in a row gained less than {config.min_gain_db:g} dB"
     return None

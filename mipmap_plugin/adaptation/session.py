@@ -1,4 +1,4 @@
-"""One call of adapt: its pieces, the order they run in, and what comes out."""
+"""One call of `adapt`: it makes the parts, runs them in order, and returns the result."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
-from mipmap_plugin.adaptation.optimization.growing import verdict
+from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
-from mipmap_plugin.adaptation.optimization.resume import Keeper
+from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import HARM, WINDOW, Validation, hold_back
-from mipmap_plugin.adaptation.report import Peak, Report, filters, versions
-from mipmap_plugin.adaptation.start.candidates import Problem, Start, warm
-from mipmap_plugin.adaptation.target.detail import Detail
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
+from mipmap_plugin.adaptation.report import PeakMemory, Report, filters, versions
+from mipmap_plugin.adaptation.start.candidates import StartProblem, StartSearch, warm_up_backend
+from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.target.portable import extremes, middle
+from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.views import choose_views, with_times
 from mipmap_plugin.backends.base import Backend
@@ -36,67 +36,74 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.progress import announced
 
-# (step, seconds of adapting so far, what renders a camera of the new scale as the model is then) -> None. The clock stands meanwhile.
+# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> None. Its time is not counted.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
 
 AS_IT_IS = "the base as it is"
 
-# What a zoom-in is validated against: the base's own image, whatever it is adapted to.
-AS_THE_BASE = {"compare_at": "base", "quantize_truth": False}
+# A zoom-in is validated against the base's own image, whatever it is adapted to.
+COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}
 
 
 @dataclass(frozen=True)
-class Base:
-    """What is adapted: a model, how it was rendered in training, and what renders it."""
+class AdaptationRequest:
+    """What is adapted, for which viewers, and by which backend."""
 
     model: SplatModel
-    effects: Effects
-    targets: Mapping[str, Effects]  # how the adapted file is rendered, by the viewers that it is for; the first of them is the one that it says
-    viewer: str | None  # what it is made for; None: no viewer in particular
+    base_effects: Effects  # how the base was rendered in training
+    targets: Mapping[str, Effects]  # how the adapted file is rendered, by viewer; the file names the first of them
+    viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: no particular one
     backend: Backend
-    why: str  # this backend was taken
-    differentiates: bool  # whether it has gradients for what is asked
-    given: SplatModel  # what the viewer shows of the base's own file: the base, where it reads all of it
+    backend_note: str  # which backend was chosen, and why
+    has_gradients: bool  # whether the backend has gradients for this request
+    base_in_viewer: SplatModel  # what the viewer reads of the base's own file: the base itself, where the viewer reads all of it
 
 
 class Session:
-    """One call of adapt: the pieces, made once, and the order they run in."""
+    """One call of `adapt`: makes the parts, and runs them in order."""
 
-    def __init__(self, base: Base, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
-        self.base, self.backend, self.why, self.trained, self.targets = base.model, base.backend, base.why, base.effects, base.targets
-        self.differentiates, self.effects = base.differentiates, next(iter(self.targets.values()))
-        self.extremes, self.aim = extremes(self.targets), middle(self.targets)
-        self.scale, self.config, self.viewer, self._given = scale, config, base.viewer, base.given
-        self.seconds, self.peak = {"optimization": 0.0}, Peak(self.base.parameters()["means"].device)
-        views, self.which = choose_views(cameras, self.base.parameters()["means"], config)
-        self.views, validation = hold_back(cameras, views, self.base.parameters()["means"], scale, config)
-        self.which += f", {len(views) - len(self.views)} of them kept for validation" if len(self.views) < len(views) else ""
-        if self.base.traits.moves:
-            self.views, when = with_times(self.views, config.seed)
-            validation, _ = with_times(validation, config.seed)
-            self.which += f", {when}"
-        self.which += f", {len(real.cameras)} of them real images" if real else ""
-        self.truth = PseudoTruth(self.base, self.backend, self.trained, scale, config, real)
-        self.detail = Detail(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
+    def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
+        self.base, self.backend, self.backend_note = request.model, request.backend, request.backend_note
+        self.base_effects, self.targets, self.has_gradients = request.base_effects, request.targets, request.has_gradients
+        self.effects = next(iter(self.targets.values()))
+        self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
+        self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
+        self.seconds, self.peak = {"optimization": 0.0}, PeakMemory(self.base.parameters()["means"].device)
+        self.views, validation, self.views_note = self._choose_views(cameras)
+        self.views_note += f", {len(real.cameras)} of them real images" if real else ""
+        self.truth = PseudoTruth(self.base, self.backend, self.base_effects, scale, config, real)
+        self.detail = DetailLoss(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
         if self.detail is not None:
             self.views = evenly(self.views, config.upsampled_views)
-            self.which += f", {len(self.views)} of them upsampled"
+            self.views_note += f", {len(self.views)} of them upsampled"
         self.state: StateFile | None = None
-        asked = PseudoTruth(self.base, self.backend, self.trained, scale, config.model_copy(update=AS_THE_BASE if scale > 1 else {}))
-        first, *others = [_shows(self.backend, target) for target in self.extremes.values()]
-        self.validation = Validation(validation[::2], validation[1::2], scale, asked, first, config.resize, others)
+        truth = PseudoTruth(self.base, self.backend, self.base_effects, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
+        first, *further = [_renderer(self.backend, target) for target in self.extremes.values()]
+        self.validation = Validation(validation[::2], validation[1::2], scale, truth, first, config.resize, further)
+
+    def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
+        """The views to adapt to, the views for validation, and a description of the former."""
+        means = self.base.parameters()["means"]
+        chosen, note = choose_views(cameras, means, self.config)
+        views, validation = split_validation(cameras, chosen, means, self.scale, self.config)
+        note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
+        if self.base.traits.moves:
+            views, times = with_times(views, self.config.seed)
+            validation, _ = with_times(validation, self.config.seed)
+            note += f", {times}"
+        return views, validation, note
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
-        if self.scale == 1 and all(target == self.trained for target in self.targets.values()):
-            why = "scale 1, at which the base is right as it is"
-            return Adapted(self.fresh(), self._report(self.fresh(), [], why, AS_IT_IS, {}), self.backend, self.effects, self.targets)
+        """Adapt the base, or continue the run that `resume` holds, and return the best state."""
+        if self.scale == 1 and all(target == self.base_effects for target in self.targets.values()):
+            reason = "scale 1, at which the base is right as it is"
+            return Adapted(self.copy_of_base(), self._report(self.copy_of_base(), [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         began = time.perf_counter()
         with self.phase("compilation"):
-            warm(self.backend, self.base.gaussians(self.views[0]), (self.trained, *self.targets.values()), gradients=self.config.steps > 0)
-        as_it_is = self._to_be_shown(self._given)
-        weighs = self.differentiates and self.base.traits.same_for_all_views
-        problem = Problem(self.fresh, self.views, self.scale, self.trained, self.aim, self.config, self.backend, weighs, self.steer, self.phase)
-        student, start = Start(problem).best()
+            effects = (self.base_effects, *self.targets.values())
+            warm_up_backend(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0)
+        as_it_is = self._for_target(self._base_in_viewer)
+        student, start = StartSearch(self._start_problem()).best()
         initial = student.copy()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
         curve: list[CurvePoint] = []
@@ -104,81 +111,89 @@ class Session:
         self.seconds["total"] = time.perf_counter() - began
         if self.config.steps:
             run, ended_by = self._optimize(student, resume, observe)
-            curve, states = run.curve, states | self._reached(run, initial)
-        return self._returned(states, curve, ended_by)
+            curve, states = run.curve, states | self._run_states(run, initial)
+        return self._select(states, curve, ended_by)
 
-    def _reached(self, run: Run, initial: SplatModel) -> dict[str, SplatModel]:
-        """The best state of a run and its last, where these are others than the start, the `initial` model, and than each other."""
+    def _start_problem(self) -> StartProblem:
+        has_blend_weights = self.has_gradients and self.base.traits.same_for_all_views
+        return StartProblem(
+            self.copy_of_base, self.views, self.scale, self.base_effects, self.start_target, self.config, self.backend, has_blend_weights, self.steer,
+            self.phase,
+        )  # fmt: skip
+
+    def _run_states(self, run: Run, initial: SplatModel) -> dict[str, SplatModel]:
+        """The best and the last state of a run, where they differ from the start (the `initial` model) and from each other."""
         step, states = run.steering.best_step, {}
         if 0 < step < run.step:
             states[f"the state after step {step}"] = run.steering.best.over(initial)
-        if not run.curve[-1].taken_back:  # else it is the best
+        if not run.curve[-1].taken_back:  # otherwise the last state is the best one
             states["the last state"] = run.student
         return states
 
-    def _returned(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
-        """The best of the states on views that have not steered the run, or the last where that is asked for."""
+    def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
+        """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
         began, last = time.perf_counter(), next(reversed(states))
         with self.phase("validation"):
-            best, found = self.validation.choose(states)
+            best, psnrs = self.validation.choose(states)
         self.seconds["total"] += time.perf_counter() - began
         if self.config.returns == "last":
             best = last
-        elif self.detail is not None and found[last] >= max(found[name] for name in list(states)[:2]) - HARM:
-            best = last  # what the base's own image cannot tell is what a network is asked for
-        why = "" if best == last else f", for {last} shows {found[last]:.2f} dB where it shows {found[best]:.2f}"
-        curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=found[last], gaussians=_rows(states[last]))]
+        elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in list(states)[:2]) - HARM_DB:
+            best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
+        note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
+        curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=psnrs[last], gaussians=_rows(states[last]))]
         if not self.validation.choosing:
-            why, found = f", not judged: at this scale one pixel of the base is more than {WINDOW} px", {}
-        report = self._report(states[best], curve, ended_by, f"{best}{why}", found)
-        seen = [*self.views, *self.validation.steering, *self.validation.choosing]
-        return Adapted(states[best], report, self.backend, self.effects, self.targets, self.state, seen)
+            note, psnrs = f", not validated: at this scale one pixel of the base is more than {WINDOW} px wide", {}
+        report = self._report(states[best], curve, ended_by, f"{best}{note}", psnrs)
+        used_views = [*self.views, *self.validation.steering, *self.validation.choosing]
+        return Adapted(states[best], report, self.backend, self.effects, self.targets, self.state, used_views)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
-        """Algorithm 1 on `student`, or the rest of it where `resume` exists, and what ended it."""
-        most = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
-        first, *others = [_shows(self.backend, _smooth(target)) for target in self.extremes.values()]
-        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, most, others)
-        keeper = Keeper(resume, self._fingerprint())
+        """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
+        max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
+        first, *further = [_renderer(self.backend, _unrounded(target)) for target in self.extremes.values()]
+        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further)
+        keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
-            unused.requires_grad_(False)  # no color follows the direction: its coefficients stay out of the gradient
+            unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
         if self.detail is not None:
             with self.phase("upsampling"):
                 self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
-        run = keeper.begin(student, task, self.config, self.seconds["total"])
+        run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
         before = run.watch.seconds if run.step == 0 else self.seconds["total"]
 
-        def look(run: Run) -> None:
-            keeper.now_and_then(run)
+        def after_step(run: Run) -> None:
+            keeper.save_if_due(run)
             if observe is not None:
                 observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
 
-        ended_by = adapt(run, task, self.config, keeper.stop, look)
-        self.state = keeper.left()
+        ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
+        self.state = keeper.remaining_file()
         self.seconds["optimization"] = run.watch.seconds - before
         self.seconds["total"] = run.watch.seconds
-        return run, ended_by + verdict(run)
+        return run, ended_by + growth_note(run)
 
-    def fresh(self) -> SplatModel:
-        """The base as it is, to be rendered as the target is."""
-        return self._to_be_shown(self.base)
+    def copy_of_base(self) -> SplatModel:
+        """A copy of the base that is rendered with the target's screen filter."""
+        return self._for_target(self.base)
 
-    def _to_be_shown(self, model: SplatModel) -> SplatModel:
-        """A copy, to be rendered as the target is."""
+    def _for_target(self, model: SplatModel) -> SplatModel:
+        """A copy of a model that is rendered with the target's screen filter."""
         model = model.copy()
         model.trained = replace(model.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
         return model
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
+        """Count the seconds spent inside under a phase of that name."""
         began = time.perf_counter()
         with announced(f"{name} x{self.scale:g}"):
             yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
     def steer(self, model: SplatModel) -> float:
-        """dB of a model on the views that steer the run."""
+        """PSNR (dB) of a model on the views that steer the run."""
         with self.phase("validation"):
             return self.validation.steer(model)
 
@@ -187,57 +202,57 @@ class Session:
         return self.effects.background == (1.0, 1.0, 1.0)
 
     def _fingerprint(self) -> str:
-        """Names what a run depends on, so that a state is never resumed as another run."""
+        """A hash of everything that a run depends on, so that a state is never resumed as another run."""
         poses = [[view.width, view.height, view.fx, view.fy, view.time, *view.viewmat.flatten().tolist()] for view in self.views]
         base = self.base.digest or _digest(self.base)
         targets = [asdict(target) for target in self.targets.values()]
-        facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.trained), targets, poses]
+        facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.base_effects), targets, poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
-    def _in_each(self, model: SplatModel) -> dict[str, float]:
-        """dB in each viewer, where the file is for several."""
+    def _psnr_per_viewer(self, model: SplatModel) -> dict[str, float]:
+        """PSNR (dB) in each viewer, where the file is made for several."""
         if len(self.targets) == 1:
             return {}
-        first, *others = [_shows(self.backend, target) for target in self.targets.values()]
-        found = replace(self.validation, render=first, others=others).in_each(model, self.validation.choosing)
-        return dict(zip(self.targets, found, strict=True))
+        first, *further = [_renderer(self.backend, target) for target in self.targets.values()]
+        psnrs = replace(self.validation, render=first, further_renders=further).viewer_psnrs(model, self.validation.choosing)
+        return dict(zip(self.targets, psnrs, strict=True))
 
-    def _explained(self) -> list[Effect]:
-        """Every effect, on where it is so in any viewer that the file is for."""
-        before, of_model = self.base.gaussians(self.views[0]), effects_of(self.base)
-        found = [explain(target, before, of_model, self.config, self.scale) for target in self.targets.values()]
-        return [next((effect for effect in same if effect.on), same[0]) for same in zip(*found, strict=True)]
+    def _effects(self) -> list[Effect]:
+        """Every effect; it is on where it is on in any viewer that the file is made for."""
+        gaussians, model_effects = self.base.gaussians(self.views[0]), effects_of(self.base)
+        per_viewer = [explain(target, gaussians, model_effects, self.config, self.scale) for target in self.targets.values()]
+        return [next((effect for effect in same if effect.on), same[0]) for same in zip(*per_viewer, strict=True)]
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         return Report(
             scale=self.scale,
             base=self.base.digest or _digest(self.base),
             settings=self.config,
-            backend=self.why,
-            views=self.which,
+            backend=self.backend_note,
+            views=self.views_note,
             viewer=self.viewer,
-            filters=filters(self.scale, self.config, self.trained, list(self.targets.values())),
-            effects=self._explained(),
+            filters=filters(self.scale, self.config, self.base_effects, list(self.targets.values())),
+            effects=self._effects(),
             gaussians_before=len(self.base.gaussians(self.views[0])),
             gaussians_after=len(student.gaussians(self.views[0])),
             seconds=self.seconds,
             ended_by=ended_by,
             returned=returned,
             validation=validation,
-            viewers=self._in_each(student) if validation else {},
+            viewers=self._psnr_per_viewer(student) if validation else {},
             peak_memory_mib=self.peak.mib(),
             curve=curve,
             versions=versions(),
         )
 
 
-def _shows(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
-    """What a camera sees. It knows of no session, which would else outlive its run, and hold on to the state's file."""
+def _renderer(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
+    """A function that renders the image of a camera. It holds no session, which would keep the state's file locked after the run."""
     return lambda gaussians, camera: backend.render(gaussians, camera, effects).image
 
 
-def _smooth(effects: Effects) -> Effects:
-    """What a step sees: without the rounding of a viewer's file and picture, which is noise to it and a third of its time."""
+def _unrounded(effects: Effects) -> Effects:
+    """The effects without the rounding of a viewer's file and picture, which is noise to an optimizer step and a third of its time."""
     return replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
 
 
@@ -246,7 +261,7 @@ def _rows(model: SplatModel) -> int:
 
 
 def _digest(model: SplatModel) -> str:
-    """The sha256 of a model that was made in memory."""
+    """The sha256 of the parameters of a model that was made in memory."""
     digest = hashlib.sha256()
     for tensor in {**model.parameters(), **model.shared_parameters()}.values():
         digest.update(tensor.detach().cpu().numpy().tobytes())

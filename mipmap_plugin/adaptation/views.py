@@ -1,4 +1,4 @@
-"""Which views are adapted to, and in which order: gathered in a shuffled order, then in rounds through all of them, from one seed."""
+"""Which views are adapted to, and in which order: introduced one after the other, then repeated in shuffled rounds. All follows from one seed."""
 
 from __future__ import annotations
 
@@ -16,51 +16,53 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import mixed
 from mipmap_plugin.scenes.trajectories import ORBIT_FOV, jittered, orbit
 
-# A checkpoint without cameras does not say how finely it was trained: this many px across 50 degrees is NeRF-Synthetic's density.
+# A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
 ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
 
 
-class Order:
-    """Which views each step takes. Remembers nothing, so that a run can be resumed at any."""
+class ViewSchedule:
+    """The views that each step uses. It has no state, so that a run can be resumed at any step."""
 
     def __init__(self, views: Sequence[Camera], config: AdaptConfig) -> None:
-        self._rounds, self._seed, self._steps = Rounds(views, config.seed), config.seed, config.steps
-        self._most, self._warm_up = min(config.views_per_step, len(views)), config.warm_up_steps
-        self._gathering = math.ceil(config.gathering * config.steps)
+        self._rounds, self._seed, self._steps = ShuffledRounds(views, config.seed), config.seed, config.steps
+        self._max_views, self._warm_up = min(config.views_per_step, len(views)), config.warm_up_steps
+        self._gathering = math.ceil(config.gathering * config.steps)  # steps during which new views are introduced
 
     def __call__(self, step: int, progress: float) -> list[Camera]:
-        """The views of a step: while they are gathered its new ones and some of those before, then rounds through all.
+        """Return the views of a step: at first its new views and some of the earlier ones, later the next ones of a round through all.
 
-        progress: 0..1, how much of the run is over; more than the steps tell where time is short.
+        progress: 0..1, how much of the run is over; with a time budget this may be more than the step number implies.
         """
-        pace, each = max(step, int(progress * self._steps)), self._each(step)
+        pace, count = max(step, int(progress * self._steps)), self._views_in_step(step)
         if pace >= self._gathering:
-            first = self._drawn(step)
-            return [self._rounds(first + nth) for nth in range(each)]
-        before, known = self._known(pace - 1), self._known(pace)
-        new = range(before, min(known, before + each))
+            first = self._draws_before(step)
+            return [self._rounds(first + number) for number in range(count)]
+        before, after = self._introduced(pace - 1), self._introduced(pace)
+        new = range(before, min(after, before + count))
         generator = torch.Generator().manual_seed(mixed(self._seed, step))
-        again = torch.randperm(before, generator=generator)[: each - len(new)].tolist()
-        return [self._rounds(place) for place in (*new, *again)]
+        repeated = torch.randperm(before, generator=generator)[: count - len(new)].tolist()
+        return [self._rounds(draw) for draw in (*new, *repeated)]
 
-    def _each(self, step: int) -> int:
-        """How many views a step takes: few at first, when any of them tells where to go."""
-        return self._most if self._warm_up <= max(0, step) else math.ceil(self._most * (step + 1) / self._warm_up)
+    def _views_in_step(self, step: int) -> int:
+        """The number of views of a step. It rises during the warm-up: the first gradients are alike in all views, so few views suffice."""
+        return self._max_views if self._warm_up <= max(0, step) else math.ceil(self._max_views * (step + 1) / self._warm_up)
 
-    def _drawn(self, step: int) -> int:
-        """How many the steps before took; those of the warm-up rounded up to whole steps, so that rounds and steps still meet."""
-        first = sum(self._each(before) for before in range(min(step, self._warm_up)))
-        return first if step < self._warm_up else math.ceil(first / self._most) * self._most + (step - self._warm_up) * self._most
+    def _draws_before(self, step: int) -> int:
+        """The number of draws of all earlier steps; that of the warm-up is rounded up to whole steps, so that rounds align with steps."""
+        first = sum(self._views_in_step(earlier) for earlier in range(min(step, self._warm_up)))
+        if step < self._warm_up:
+            return first
+        return math.ceil(first / self._max_views) * self._max_views + (step - self._warm_up) * self._max_views
 
-    def _known(self, step: int) -> int:
-        """How many views have come in with a step: evenly over the steps of gathering, at least one and no more in a step than it takes."""
-        come = max(self._each(step), step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
-        return min(come, self._drawn(step + 1), len(self._rounds.views))
+    def _introduced(self, step: int) -> int:
+        """The number of views introduced up to a step: spread evenly, at least one per step, and no more per step than it uses."""
+        count = max(self._views_in_step(step), step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
+        return min(count, self._draws_before(step + 1), len(self._rounds.views))
 
 
-class Rounds:
-    """Every view once per round, in an order that follows from (seed, round) alone, so that any step can be resumed."""
+class ShuffledRounds:
+    """Each view once per round, in an order that follows from (seed, round) alone, so that a run can be resumed at any step."""
 
     def __init__(self, views: Sequence[Camera], seed: int) -> None:
         self.views, self._seed = list(views), seed
@@ -68,18 +70,18 @@ class Rounds:
         self._order: list[int] = []
 
     def __call__(self, draw: int) -> Camera:
-        """The `draw`-th view since the beginning."""
-        turn, place = divmod(draw, len(self.views))
-        if turn != self._round:
-            generator = torch.Generator().manual_seed(mixed(self._seed, turn))
-            self._round, self._order = turn, torch.randperm(len(self.views), generator=generator).tolist()
-        return self.views[self._order[place]]
+        """The `draw`-th view since the beginning of the run."""
+        round_number, position = divmod(draw, len(self.views))
+        if round_number != self._round:
+            generator = torch.Generator().manual_seed(mixed(self._seed, round_number))
+            self._round, self._order = round_number, torch.randperm(len(self.views), generator=generator).tolist()
+        return self.views[self._order[position]]
 
 
 def extent(views: Sequence[Camera]) -> float:
-    """World units: 1.1 times the largest distance of a camera from their mean, INRIA's `spatial_lr_scale`.
+    """The extent of a scene in world units: 1.1 times the largest distance of a camera from the cameras' mean (INRIA's `spatial_lr_scale`).
 
-    A single camera, or several in one place, say nothing about size: then it is 1.
+    It is 1 for a single camera, or for several in one place, which tell nothing about the scene's size.
     """
     centers = torch.stack([view.center for view in views])
     radius = 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
@@ -87,22 +89,22 @@ def extent(views: Sequence[Camera]) -> float:
 
 
 def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: AdaptConfig) -> tuple[list[Camera], str]:
-    """The base-scale cameras to adapt on, and a sentence that says which. `means` [N, 3]: what an orbit goes around.
+    """Return the base-scale cameras to adapt to, and a description of them. `means` [N, 3]: the points that an orbit surrounds.
 
-    Raises SettingsError when the policy finds none.
+    Raises SettingsError when the policy finds no cameras.
     """
     generator = torch.Generator().manual_seed(config.seed)
     if config.views == "orbit" or not cameras:
         pixels = math.ceil(2 * math.tan(ORBIT_FOV / 2) * cameras[0].fx) if cameras else ORBIT_PIXELS  # the cameras' own focal length
         views = orbit(means, (pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
-        why = "asked for" if cameras else "the checkpoint came without cameras"
-        return views, f"{len(views)} views of a generated orbit at {pixels} px ({why})"
+        reason = "as requested" if cameras else "the checkpoint came without cameras"
+        return views, f"{len(views)} views of a generated orbit at {pixels} px ({reason})"
     if config.views == "given":
         return list(cameras), f"the {len(cameras)} given views"
     split = "test" if config.views == "test" else "train"
     views = [camera for camera in cameras if camera.split == split]
     if not views:
-        raise SettingsError(f"there are no {split} views among the {len(cameras)} cameras; ask for the views 'given'")
+        raise SettingsError(f"there are no {split} views among the {len(cameras)} cameras; use the view policy 'given'")
     if config.views == "jittered":
         extra = jittered(views, config.extra_views, generator)
         return views + extra, f"{len(views)} train views and {len(extra)} around them"
@@ -110,7 +112,7 @@ def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: A
 
 
 def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:
-    """The views of a moving scene, each at a time, and a sentence that says how.
+    """Give each view of a moving scene a time; return the views and a description of their times.
 
     Views without a time get times evenly spread over 0..1, both ends included, in a random order, so that the time does not
     follow the path of the cameras.
@@ -119,6 +121,6 @@ def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:
     if not timeless:
         return list(views), "at their own times"
     order = torch.randperm(len(timeless), generator=torch.Generator().manual_seed(seed)).tolist()
-    times = {number: place / max(1, len(timeless) - 1) for number, place in zip(timeless, order, strict=True)}
+    times = {number: position / max(1, len(timeless) - 1) for number, position in zip(timeless, order, strict=True)}
     timed = [replace(view, time=times.get(number, view.time)) for number, view in enumerate(views)]
-    return timed, f"{len(timeless)} of them without a time, which are spread over 0..1"
+    return timed, f"{len(timeless)} of them without a time of their own, spread over 0..1"

@@ -17,7 +17,7 @@ from typing import Protocol as TypingProtocol
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.target.photographs import as_sampled
+from mipmap_plugin.adaptation.target.photographs import at_density_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
@@ -125,7 +125,7 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to judge by")
     files = [scene.images[camera] for camera in cameras]
-    held = [(as_sampled(camera, base), scene.image(camera, background)) for camera in cameras]
+    held = [(at_density_of(camera, base), scene.image(camera, background)) for camera in cameras]
     return [TestView(*each, file, background, file in scene.lenses) for each, file in zip(held, files, strict=True)]
 
 

@@ -77,16 +77,16 @@ def test_a_full_disk_leaves_the_old_output_and_nothing_else(tmp_path, name):
 
 
 def test_a_full_disk_while_a_run_is_kept_does_not_end_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
     model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
-    goes_on = pytest.warns(UserWarning, match="the run goes on, but could not be resumed if it were killed: .* cannot be written")
+    goes_on = pytest.warns(UserWarning, match="the run continues, but could not be resumed if it were killed: .* cannot be written")
     with disk_that_holds(100), goes_on:
         done = model.adapt(1 / 4, steps=2, resume=tmp_path / "state")
     assert done.report.ended_by == "2 steps" and list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_when_the_finished_model_is_saved_leaves_its_state(tmp_path, monkeypatch):
-    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
     model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
     done = model.adapt(1 / 4, steps=3, resume=state)
     with disk_that_holds(100), pytest.raises(OutputError):
@@ -160,7 +160,7 @@ from mipmap_plugin.adaptation.optimization import resume
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.wrap import wrap_model
 torch.set_num_threads(1)
-resume.KEEP_EVERY_S = 0.0
+resume.SAVE_EVERY_S = 0.0
 render, calls = ReferenceBackend.render, []
 def counted(self, gaussians, *scene):
     calls.append(gaussians.means.requires_grad and torch.is_grad_enabled() and scene[0].width > 1)  # in a step
@@ -193,5 +193,5 @@ def test_a_killed_run_goes_on_from_its_last_state_to_the_same_bytes(tmp_path):
 def test_a_state_that_is_none_is_refused(tmp_path, content):
     torch.save(content, tmp_path / "state")
     model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
-    with pytest.raises(SettingsError, match="state: it belongs to another base, other settings or other views"):
+    with pytest.raises(SettingsError, match="state: this state belongs to another base, settings or views"):
         model.adapt(1 / 4, steps=1, resume=tmp_path / "state")

@@ -127,7 +127,7 @@ class Adapting:
 
 @pytest.mark.parametrize("name", some(WRITERS, ["ply"]))
 def test_a_run_killed_at_any_point_is_finished_by_the_same_command(tmp_path, monkeypatch, name, request):
-    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
     adapting = Adapting(tmp_path, name)
     adapting()
     whole = made(adapting.out)

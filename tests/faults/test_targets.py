@@ -13,7 +13,7 @@ from corpus import SAMPLES
 from test_interruptions import WRITERS, adapted, contents
 
 from mipmap_plugin.adaptation.optimization import resume
-from mipmap_plugin.adaptation.optimization.state_file import own_state_file
+from mipmap_plugin.adaptation.optimization.state_file import claim_state_file
 from mipmap_plugin.adaptation.target import disk_cache
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
@@ -191,7 +191,7 @@ def test_no_model_appears_without_its_report(tmp_path, monkeypatch):
 
 
 def test_runs_with_one_output_keep_their_states_in_files_of_their_own(tmp_path, monkeypatch):
-    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
     model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
     first = model.adapt(1 / 4, steps=1, resume=state)
     second = model.adapt(1 / 4, steps=2, resume=state)
@@ -203,13 +203,13 @@ def test_runs_with_one_output_keep_their_states_in_files_of_their_own(tmp_path, 
 
 
 def test_each_interrupted_run_goes_on_from_its_own_state(tmp_path, monkeypatch):
-    monkeypatch.setattr(resume, "KEEP_EVERY_S", 0.0)
+    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
     model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
     living = [model.adapt(1 / 4, steps=steps, resume=state) for steps in (1, 2)]
     curves = [each.report.curve for each in living]
     del living  # neither was saved
     assert model.adapt(1 / 4, steps=2, resume=state).report.curve == curves[1]
-    with pytest.raises(SettingsError, match="state: it belongs to another base, other settings or other views"):
+    with pytest.raises(SettingsError, match="state: this state belongs to another base, settings or views"):
         model.adapt(1 / 4, steps=3, resume=state)
 
 
@@ -225,17 +225,17 @@ def test_a_state_that_cannot_be_kept_costs_a_warning(tmp_path, monkeypatch):
     def refused(*_):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.own_state_file", refused)
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.claim_state_file", refused)
     model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
     with pytest.warns(UserWarning, match=r"state cannot be written \(Read-only file system\), so that this run could not be resumed"):
         assert model.adapt(1 / 4, steps=1, resume=tmp_path / "state").report.ended_by == "1 steps"
 
 
 def test_states_beyond_the_last_are_refused(tmp_path):
-    living = [own_state_file(tmp_path / "state", lambda _: False) for _ in range(staging.SLOTS)]
+    living = [claim_state_file(tmp_path / "state", lambda _: False) for _ in range(staging.SLOTS)]
     assert len({each.path for each in living}) == staging.SLOTS
     with pytest.raises(SettingsError, match="state"):
-        own_state_file(tmp_path / "state", lambda _: False)
+        claim_state_file(tmp_path / "state", lambda _: False)
 
 
 # The cache
@@ -245,7 +245,7 @@ def test_states_beyond_the_last_are_refused(tmp_path):
 def test_a_cache_that_cannot_be_written_costs_a_warning(tmp_path, monkeypatch, folder):
     (tmp_path / "a file").write_text("")
     monkeypatch.setenv(disk_cache.VARIABLE, str(tmp_path / folder))
-    with pytest.warns(UserWarning, match="the image is made again next time, for .* cannot be written"):
+    with pytest.warns(UserWarning, match="the image is not cached: .* cannot be written"):
         image = disk_cache.cached("ab", lambda: torch.ones(2, 2, 3))
     assert torch.equal(image, torch.ones(2, 2, 3))
 

@@ -1,1 +1,1 @@
-"""Algorithm 1 of Mipmap-GS, and what carries it: steps, density control, validation, resuming."""
+"""Algorithm 1 of Mipmap-GS: optimizer steps, density control, validation and resuming."""

@@ -1,4 +1,4 @@
-"""The splats of one step: activated once for all of its views where every camera sees the same ones."""
+"""The activated splats of one step: computed once for all of its views, where all cameras see the same splats."""
 
 from __future__ import annotations
 
@@ -13,58 +13,58 @@ from mipmap_plugin.models.base import SplatModel
 
 
 class Activation:
-    """A model's splats for the views of a step, and the way of their gradients back to its parameters.
+    """A model's activated splats for the views of a step; passes their gradients back to the model's parameters.
 
-    Shared, each view has leaves of its own, so that views can be drawn side by side; their gradients are gathered in the order of the
-    views, whatever order they were drawn in. Activations, about a tenth of the time of small images, are computed and differentiated once.
+    When shared, each view gets leaves of its own, so that views can be rendered in parallel; their gradients are summed in the order of the
+    views, whatever order they were rendered in. Activations, about a tenth of the time of small images, are computed and differentiated once.
     """
 
     def __init__(self, model: SplatModel, *, share: bool) -> None:
         self._model, self.shares = model, share and model.traits.same_for_all_views
         self._splats: Gaussians | None = None
         self._gradients: dict[str, Tensor] = {}
-        self._before: Tensor | None = None  # the gradient of the means from the views so far, where nothing is shared
+        self._before: Tensor | None = None  # the gradient of the means from the views so far, if not shared
 
     def activate(self, camera: Camera) -> None:
-        """Make the splats that are shared, before any view asks for them."""
+        """Activate the shared splats, before the first view."""
         self._splats = self._model.gaussians(camera) if self.shares else None
 
     def __call__(self, camera: Camera) -> Gaussians:
-        """What the camera sees."""
+        """Return the splats that the camera sees."""
         if self._splats is None:
             return self._model.gaussians(camera)
-        held = _tensors(self._splats)
-        return replace(self._splats, **{name: tensor.detach().requires_grad_(tensor.requires_grad) for name, tensor in held.items()})
+        leaves = {name: tensor.detach().requires_grad_(tensor.requires_grad) for name, tensor in _tensors(self._splats).items()}
+        return replace(self._splats, **leaves)
 
-    def gather(self, seen: Gaussians) -> None:
-        """Take the gradients of the splats that one view has `seen`."""
+    def accumulate(self, splats: Gaussians) -> None:
+        """Add the gradients of the `splats` that one view was rendered from."""
         if self._splats is None:
             return
-        for name, leaf in _tensors(seen).items():
+        for name, leaf in _tensors(splats).items():
             if leaf.grad is not None:
                 self._gradients[name] = self._gradients[name].add_(leaf.grad) if name in self._gradients else leaf.grad
 
-    def of_means(self, seen: Gaussians) -> tuple[Tensor, Tensor]:
-        """The means [N, 3] and their gradient from the one view that has `seen` these splats, the latest."""
+    def means_gradient(self, splats: Gaussians) -> tuple[Tensor, Tensor]:
+        """Return the means [N, 3] and their gradient in the latest view, which was rendered from `splats`."""
         if self._splats is not None:
-            return seen.means, torch.zeros_like(seen.means) if seen.means.grad is None else seen.means.grad
+            return splats.means, torch.zeros_like(splats.means) if splats.means.grad is None else splats.means.grad
         means = self._model.parameters()["means"]
         gradient = torch.zeros_like(means) if means.grad is None else means.grad if self._before is None else means.grad - self._before
         self._before = gradient.clone() if self._before is None else self._before + gradient
         return means, gradient
 
     def backward(self) -> None:
-        """Hand the gathered gradients on, once all views have left theirs."""
+        """Pass the accumulated gradients on to the parameters, after the backward pass of the last view."""
         if self._splats is None:
             return
         splats = _tensors(self._splats)
-        # Their product with what they are multiplied by has these very gradients. torch.autograd.backward, which takes gradients, loads sympy.
+        # The sum of splats times gradients has exactly these gradients. torch.autograd.backward would take them directly, but it loads sympy.
         products = [(splats[name] * gradient).sum() for name, gradient in self._gradients.items()]
-        self._splats, self._gradients = None, {}  # the optimizer and density control need the room
+        self._splats, self._gradients = None, {}  # free the memory for the optimizer and density control
         if products:
-            torch.stack(products).sum().backward()
+            torch.stack(products).sum().backward()  # type: ignore[no-untyped-call]  # torch's
 
 
 def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:
-    held = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
-    return {name: tensor for name, tensor in held.items() if tensor is not None}
+    values = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+    return {name: tensor for name, tensor in values.items() if tensor is not None}

@@ -1,6 +1,6 @@
-"""Adam (Kingma and Ba 2015) by torch's fused kernel, with the state and the bits of torch.optim.Adam.
+"""Adam (Kingma and Ba 2015) with torch's fused kernel; state and results are identical to those of torch.optim.Adam.
 
-torch.optim imports torch's compiler with the first optimizer, which takes over a second of every process and is of no use here.
+torch.optim imports torch's compiler with the first optimizer, which takes over a second in every process and is not needed here.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 class Adam:
-    """Groups are dictionaries with `params`, `lr` and whatever else a caller keeps there. Tensors without a gradient stay."""
+    """Adam over groups of tensors: dictionaries with `params`, `lr` and any other entries. Tensors without a gradient do not move."""
 
     def __init__(self, groups: Iterable[dict[str, Any]], betas: tuple[float, float], eps: float) -> None:
         self.param_groups, self.betas, self.eps = [dict(group) for group in groups], betas, eps
@@ -35,7 +35,7 @@ class Adam:
             )  # fmt: skip
 
     def zero_grad(self) -> None:
-        """Forget all gradients."""
+        """Set all gradients to None."""
         for group in self.param_groups:
             for tensor in group["params"]:
                 tensor.grad = None
@@ -48,16 +48,16 @@ class Adam:
         return state
 
     def state_dict(self) -> dict[str, Any]:
-        """The groups, with numbers in place of their tensors, and the state by these numbers."""
+        """Return the groups, with numbers in place of their tensors, and the state of each tensor by its number."""
         tensors = [tensor for group in self.param_groups for tensor in group["params"]]
-        place = {tensor: number for number, tensor in enumerate(tensors)}
-        groups = [{**group, "params": [place[tensor] for tensor in group["params"]]} for group in self.param_groups]
-        return {"param_groups": groups, "state": {place[tensor]: state for tensor, state in self.state.items()}}
+        number_of = {tensor: number for number, tensor in enumerate(tensors)}
+        groups = [{**group, "params": [number_of[tensor] for tensor in group["params"]]} for group in self.param_groups]
+        return {"param_groups": groups, "state": {number_of[tensor]: state for tensor, state in self.state.items()}}
 
-    def load_state_dict(self, held: dict[str, Any]) -> None:
-        """Go on from a `state_dict` of an optimizer whose groups held as many tensors, in the same order."""
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Continue from the `state_dict` of an optimizer with as many tensors in its groups, in the same order."""
         tensors = [tensor for group in self.param_groups for tensor in group["params"]]
-        self.param_groups = [{**group, "params": [tensors[number] for number in group["params"]]} for group in held["param_groups"]]
+        self.param_groups = [{**group, "params": [tensors[number] for number in group["params"]]} for group in saved["param_groups"]]
         self.state = {
-            tensors[number]: {name: value.to(tensors[number].device) for name, value in state.items()} for number, state in held["state"].items()
+            tensors[number]: {name: value.to(tensors[number].device) for name, value in state.items()} for number, state in saved["state"].items()
         }

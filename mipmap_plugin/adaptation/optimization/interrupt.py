@@ -1,4 +1,4 @@
-"""Ctrl-C between two steps instead of in the middle of one."""
+"""Ctrl-C takes effect between two steps instead of in the middle of one."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from contextlib import contextmanager
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Inside, Ctrl-C is only noted, and the yielded function says whether it was pressed. A second Ctrl-C raises at once."""
+    """Inside, Ctrl-C is only recorded, and the yielded function returns whether it was pressed. A second Ctrl-C raises at once."""
     pressed = False
 
-    def note(number: int, frame: object) -> None:
+    def record(number: int, frame: object) -> None:
         nonlocal pressed
         if pressed:
             raise KeyboardInterrupt
         pressed = True
 
-    if threading.current_thread() is not threading.main_thread():  # only the main thread is ever interrupted
+    if threading.current_thread() is not threading.main_thread():  # signals reach only the main thread
         yield lambda: False
         return
-    before = signal.signal(signal.SIGINT, note)
+    before = signal.signal(signal.SIGINT, record)
     try:
         yield lambda: pressed
     finally:

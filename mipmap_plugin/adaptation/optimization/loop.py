@@ -1,4 +1,4 @@
-"""Algorithm 1 of Mipmap-GS: optimize the splats against what the frozen base shows, resized to the new scale."""
+"""Algorithm 1 of Mipmap-GS: optimize the splats against the images of the frozen base, resized to the new scale."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from tqdm import tqdm
 from mipmap_plugin.adaptation.curve import CurvePoint, decibel, reason_to_stop
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
-from mipmap_plugin.adaptation.optimization.growing import control_density, judge, still
+from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
-from mipmap_plugin.adaptation.optimization.optimizer import set_rates, take_back
+from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.small import most_threads
+from mipmap_plugin.adaptation.parallel import max_threads
 from mipmap_plugin.adaptation.target.resize import difference_from
-from mipmap_plugin.adaptation.views import Order
+from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.threads import side_by_side
 
-# Of a mean square difference: half a step of an 8-bit image, squared. What is closer than a display can show counts no more.
-UNSEEN = (0.5 / 255) ** 2
+# The square of half a step of an 8-bit image: smaller mean square differences are invisible on a display, and hardly count.
+INVISIBLE_ERROR = (0.5 / 255) ** 2
 
-# While rates rise, a run is looked at so many times.
-CHECKS_RISING = 10
+# Number of checks during the warm-up, while the rates rise.
+CHECKS_IN_WARM_UP = 10
 
 
 def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], None] = lambda run: None) -> str:
-    """Optimize `run.student` in place until its steps, its budget, its target or its patience end; return which of them did.
+    """Optimize `run.student` in place until its steps, budget, target or patience end the run; return which of them did.
 
     `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise. `observe` is called before the first
-    step and after each, while the clock stands.
+    step and after each step; its time is not counted.
     """
-    order, cameras = Order(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
+    order, cameras = ViewSchedule(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
     bar = tqdm(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step")
     with bar, interruptible() as interrupted:
         observe(run)
@@ -51,47 +51,49 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             if interrupted():
                 on_interrupt(run)
         with run.watch:
-            judge(run, task, config)
+            undo_harmful_growth(run, task, config)
             if run.curve[-1].step < run.step:
                 _check(run, task, config)
     return reason or f"{config.steps} steps"
 
 
 def is_checked(step: int, config: AdaptConfig) -> bool:
-    """Whether the run is looked at after this step: more often while the rates rise."""
-    rising = config.warm_up_steps
-    return step % (config.check_every if step >= rising else max(1, min(config.check_every, rising // CHECKS_RISING))) == 0 or step == config.steps
+    """Whether the run is checked after this step: more often during the warm-up, while the rates rise."""
+    warm_up = config.warm_up_steps
+    every = config.check_every if step >= warm_up else max(1, min(config.check_every, warm_up // CHECKS_IN_WARM_UP))
+    return step % every == 0 or step == config.steps
 
 
-# Shown in docs/how_it_works.md, up to the next such line.
+# docs/how_it_works.md shows the code up to the next such line.
 # --8<-- [start:step]
 
 
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
-    now = run.progress(config)
-    set_rates(run.optimizer, config, now, run.steering.boldness(now, config), still=still(run))
+    progress = run.progress(config)
+    set_rates(run.optimizer, config, progress, run.steering.rate_factor(progress, config), frozen=frozen_parameters(run))
     splats = Activation(run.student, share=len(views) > 1)
     splats.activate(cameras[views[0]])
 
-    def compare(place: tuple[int, Camera]) -> tuple[Gaussians, Camera, Tensor]:
-        nth, view = place
-        seen, camera = splats(cameras[view]), cameras[view]
+    def render_and_compare(draw_and_view: tuple[int, Camera]) -> tuple[Gaussians, Camera, Tensor]:
+        draw, view = draw_and_view
+        camera = cameras[view]
+        gaussians = splats(camera)
         target = task.truth(view)  # r(x̂): the frozen base, resized
-        image = task.drawn(nth)(seen, camera)  # x: the student at the new scale
+        image = task.renderer(draw)(gaussians, camera)  # x: the student at the new scale
         difference = difference_from(target, image, config.resize)
         loss = _loss(difference, config.loss)
-        (loss if task.detail is None else loss + task.detail(view, image)).backward()
-        return seen, camera, difference.detach().square().mean()
+        (loss if task.detail is None else loss + task.detail(view, image)).backward()  # type: ignore[no-untyped-call]  # torch's
+        return gaussians, camera, difference.detach().square().mean()
 
-    places = list(enumerate(views, run.step * config.views_per_step))
-    at_once = most_threads(run.student.parameters()["means"], cameras[views[0]]) if splats.shares else 1
-    for seen, camera, square in side_by_side(compare, places, at_once):
-        run.square_error = run.square_error + square.double() / len(views)
-        splats.gather(seen)
+    draws = list(enumerate(views, run.step * config.views_per_step))
+    threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if splats.shares else 1
+    for gaussians, camera, square_error in side_by_side(render_and_compare, draws, threads):
+        run.square_error = run.square_error + square_error.double() / len(views)
+        splats.accumulate(gaussians)
         if run.gradients is not None:
-            run.gradients.add(*splats.of_means(seen), camera)
+            run.gradients.add(*splats.means_gradient(gaussians), camera)
     splats.backward()
     run.optimizer.step()
     run.optimizer.zero_grad()
@@ -104,27 +106,30 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
 
 
 def _loss(difference: Tensor, name: str) -> Tensor:
-    """Of one image. `psnr` is in nepers what PSNR is in decibels, so that no view that is far off outweighs the others."""
+    """The loss of one image. `psnr` is the logarithm of the mean square error, so that a view that is far off does not outweigh the others."""
     if name == "l1":
         return difference.abs().mean()
     square = difference.square().mean()
-    return (square + UNSEEN).log() if name == "psnr" else square
+    return (square + INVISIBLE_ERROR).log() if name == "psnr" else square
 
 
 def _check(run: Run, task: Task, config: AdaptConfig) -> None:
-    """Look at the run on validation views: keep its state or take it back, and note a point of the curve."""
+    """Measure the run on validation views: keep its state or undo the last steps, and append a point to the curve."""
     steering, steps = run.steering, run.step - run.curve[-1].step
-    found = task.validation.steer(run.student)
-    growing = run.trial is not None and run.trial.before is not None  # what grew is judged when it had time
-    harmed = config.returns == "best" and not growing and steering.harms(found)
-    if harmed:
-        steering.take_back(steering.boldness(run.progress(config), config))
+    validation_db = task.validation.steer(run.student)
+    growing = run.trial is not None and run.trial.before is not None  # a growth gets some steps before it is assessed
+    harmful = config.returns == "best" and not growing and steering.is_harmful(validation_db)
+    if harmful:
+        steering.reduce_rates(steering.rate_factor(run.progress(config), config))
         run.rows_changed |= len(steering.best.rows["means"]) != len(run.student.parameters()["means"])
-        take_back(run.student, run.optimizer, steering.best)
+        restore_snapshot(run.student, run.optimizer, steering.best)
         run.gradients = None if run.gradients is None else density.ScreenGradients.of(run.student.parameters()["means"], config)
     else:
-        steering.keep(found, run.step, run.student, run.rows_changed)
-    mean = float(run.square_error) / max(1, steps)  # here a GPU is waited for, so that the clock counts its work
-    facts = dict(psnr_db=decibel(mean) if steps else None, validation_db=steering.best_db if harmed else found, taken_back=harmed)
-    run.curve.append(CurvePoint(step=run.step, seconds=run.watch.read(), gaussians=len(run.student.parameters()["means"]), **facts))
+        steering.update_best(validation_db, run.step, run.student, run.rows_changed)
+    mean = float(run.square_error) / max(1, steps)  # this waits for a GPU, so that the clock counts its work
+    point = CurvePoint(
+        step=run.step, seconds=run.watch.read(), psnr_db=decibel(mean) if steps else None,
+        validation_db=steering.best_db if harmful else validation_db, gaussians=len(run.student.parameters()["means"]), taken_back=harmful,
+    )  # fmt: skip
+    run.curve.append(point)
     run.square_error = 0.0

@@ -1,4 +1,4 @@
-"""Adam over a model's parameters by name, and the surgery that keeps moments and rows together."""
+"""Adam over a model's parameters by name, and changes of rows that keep parameters and moments together."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import CARRIED, SplatModel
 
-# INRIA's: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
+# INRIA's value: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
 ADAM_EPS = 1e-15
 
 
 def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> Adam:
-    """One group per parameter that moves; that of means is in pixels of `pixel` world units."""
+    """One group per parameter; the learning rate of the means is in pixels of `pixel` world units."""
     rates = {**config.rates.model_dump(), CARRIED: 0.0}
     rates["means"] *= pixel
     groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]
@@ -27,28 +27,28 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> Adam
     return Adam(groups, betas=config.betas, eps=ADAM_EPS)
 
 
-def set_rates(optimizer: Adam, config: AdaptConfig, progress: float, boldness: float, still: Collection[str] = ()) -> None:
-    """Each rate at `progress` (0..1) of its fall, which is half a cosine (Loshchilov and Hutter 2017, SGDR, equation 5), times `boldness`.
+def set_rates(optimizer: Adam, config: AdaptConfig, progress: float, rate_factor: float, frozen: Collection[str] = ()) -> None:
+    """Set all learning rates for `progress` (0..1): cosine decay (Loshchilov and Hutter 2017, SGDR, equation 5) times `rate_factor`.
 
-    The groups in `still` stand.
+    The rates of the groups named in `frozen` are 0.
     """
-    share = boldness * (config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2)
+    factor = rate_factor * (config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2)
     for group in optimizer.param_groups:
-        group["lr"] = 0.0 if group["name"] in still else group["base_lr"] * share
+        group["lr"] = 0.0 if group["name"] in frozen else group["base_lr"] * factor
 
 
-def take_back(model: SplatModel, optimizer: Adam, snapshot: Snapshot) -> None:
-    """Let the model hold the snapshot, in its own leaves where it has as many rows; Adam begins anew."""
+def restore_snapshot(model: SplatModel, optimizer: Adam, snapshot: Snapshot) -> None:
+    """Set the model to the snapshot, in its own leaves where it has as many rows, and reset Adam's state."""
     if len(model.parameters()["means"]) != len(snapshot.rows["means"]):
-        put_back(model, optimizer, snapshot.rows)
+        restore_parameters(model, optimizer, snapshot.rows)
     snapshot.put_into(model)
     optimizer.state.clear()
 
 
-def put_back(model: SplatModel, optimizer: Adam, before: Mapping[str, Tensor]) -> None:
-    """Let the model hold the parameters that it had `before`; for them Adam begins anew.
+def restore_parameters(model: SplatModel, optimizer: Adam, before: Mapping[str, Tensor]) -> None:
+    """Set the model's parameters to those that it had `before`, and reset Adam's state of them.
 
-    Moments at 0 whose steps went on being counted would make the first step three times too long.
+    If only the moments were reset and not the step count, the first step would be three times too long.
     """
     change_rows(model, optimizer, lambda name, _: before[name], torch.zeros_like)
     for tensor in model.parameters().values():
@@ -58,7 +58,7 @@ def put_back(model: SplatModel, optimizer: Adam, before: Mapping[str, Tensor]) -
 def change_rows(
     model: SplatModel, optimizer: Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
 ) -> None:
-    """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in model and optimizer alike."""
+    """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in the model and in the optimizer."""
     fresh, moves = {}, {}
     names = model.parameters().keys()
     for group in (group for group in optimizer.param_groups if group["name"] in names):

@@ -1,4 +1,4 @@
-"""An interrupted run on disk: written atomically, read without executing anything, refused when it belongs to another run."""
+"""The state of a run on disk, to resume it: written atomically, read without executing code, refused if it belongs to another run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
-from mipmap_plugin.adaptation.optimization.state_file import StateFile, own_state_file
+from mipmap_plugin.adaptation.optimization.state_file import StateFile, claim_state_file
 from mipmap_plugin.adaptation.optimization.validation import Steering
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
@@ -23,83 +23,84 @@ from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.models.base import SplatModel
 
-# Seconds between two states of a long run: what a killed process loses at most. A state is about three times as large as the model,
-# four times where that grows on trial.
-KEEP_EVERY_S = 60.0
+# Seconds between two saved states: the most that a killed process loses. A state is about three times as large as the model, four times
+# with growth on trial.
+SAVE_EVERY_S = 60.0
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C during adaptation; the text says where the run can be resumed from."""
+    """Ctrl-C during adaptation; the message names the file that the run can be resumed from."""
 
 
-class Keeper:
-    """Keeps the state of one run in a file, if there is one to keep it in: every minute, and when the run is interrupted."""
+class StateKeeper:
+    """Saves the state of one run to a file, if one was requested: every minute, and when the run is interrupted."""
 
     def __init__(self, path: Path | None, fingerprint: str) -> None:
-        self._wanted, self._fingerprint = path, fingerprint
-        self.file: StateFile | None = None  # where this run keeps its state
-        self._kept = time.monotonic()
+        self._requested, self._fingerprint = path, fingerprint
+        self.file: StateFile | None = None  # where this run saves its state
+        self._saved_at = time.monotonic()
 
-    def begin(self, student: SplatModel, task: Task, config: AdaptConfig, spent: float) -> Run:
-        """A new run, `spent` seconds after it was asked for, or the one in the file.
+    def start_or_resume(self, student: SplatModel, task: Task, config: AdaptConfig, spent: float) -> Run:
+        """Return the run in the file, or a new one; `spent`: seconds used so far.
 
-        Raises SettingsError (`own_state_file`, `_read`), OutputError.
+        Raises SettingsError (`claim_state_file`, `_read`), OutputError.
         """
-        if self._wanted is None:
+        if self._requested is None:
             return Run.start(student, task, config, spent)
-        refuse_output(self._wanted, overwrite=True, is_file=True)
-        found: list[dict[str, Any]] = []
+        refuse_output(self._requested, overwrite=True, is_file=True)
+        states: list[dict[str, Any]] = []
         try:
-            self._wanted.parent.mkdir(parents=True, exist_ok=True)
-            self.file = own_state_file(self._wanted, lambda path: self._is_ours(path, found))
+            self._requested.parent.mkdir(parents=True, exist_ok=True)
+            self.file = claim_state_file(self._requested, lambda path: self._load_if_ours(path, states))
         except OSError as error:
-            warnings.warn(f"{self._wanted} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)
-        if not found:
+            warnings.warn(f"{self._requested} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)
+        if not states:
             return Run.start(student, task, config, spent)
         try:
-            return load_run(found[0], student, config)
+            return load_run(states[0], student, config)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-            raise SettingsError(f"{self._path}: this is not the whole state of a run; delete it to start anew ({error})") from error
+            raise SettingsError(f"{self._path}: this state of a run is incomplete; delete it to start anew ({error})") from error
 
-    def _is_ours(self, path: Path, found: list[dict[str, Any]]) -> bool:
+    def _load_if_ours(self, path: Path, states: list[dict[str, Any]]) -> bool:
+        """Append the state in a file to `states` if it belongs to this run, and return whether it does."""
         state = _read(path)
         if isinstance(state, dict) and state.get("fingerprint") == self._fingerprint:
-            found.append(state)
-        return bool(found)
+            states.append(state)
+        return bool(states)
 
     @property
     def _path(self) -> Path | None:
         return None if self.file is None else self.file.path
 
-    def now_and_then(self, run: Run) -> None:
-        """Write the state if the last one is old. A disk that has no room for it does not end the run."""
-        if self._path is None or time.monotonic() - self._kept < KEEP_EVERY_S:
+    def save_if_due(self, run: Run) -> None:
+        """Save the state if the last save was long ago. A full disk does not end the run."""
+        if self._path is None or time.monotonic() - self._saved_at < SAVE_EVERY_S:
             return
         try:
             save_run(run, self._path, self._fingerprint)
         except OutputError as error:
-            warnings.warn(f"the run goes on, but could not be resumed if it were killed: {error}", stacklevel=2)
-        self._kept = time.monotonic()
+            warnings.warn(f"the run continues, but could not be resumed if it were killed: {error}", stacklevel=2)
+        self._saved_at = time.monotonic()
 
-    def left(self) -> StateFile | None:
-        """The state of a run that has ended, which is of use until its model is saved; None where none was written."""
+    def remaining_file(self) -> StateFile | None:
+        """The state file of a run that has ended, which is needed until its model is saved; None if none was written."""
         if self.file is not None and not self.file.path.exists():
             self.file.release()
             self.file = None
         return self.file
 
-    def stop(self, run: Run) -> NoReturn:
-        """Write the state and raise Interrupted. Raises OutputError when the disk refuses."""
+    def save_and_stop(self, run: Run) -> NoReturn:
+        """Save the state and raise Interrupted. Raises OutputError if the state cannot be written."""
         if self._path is None:
-            raise Interrupted(f"interrupted at step {run.step}; nothing was written, for no file to resume from was named")
+            raise Interrupted(f"interrupted at step {run.step}; nothing was written, because no file to resume from was named")
         save_run(run, self._path, self._fingerprint)
-        assert self.file is not None  # `_path` is its
+        assert self.file is not None  # since `_path` is its path
         self.file.release()
-        raise Interrupted(f"interrupted at step {run.step}; run the same command again to go on from {self._path}")
+        raise Interrupted(f"interrupted at step {run.step}; run the same command again to continue from {self._path}")
 
 
 def save_run(run: Run, path: Path, fingerprint: str) -> None:
-    """Write all that `load_run` needs. `fingerprint` names the base, the settings and the views."""
+    """Save everything that `load_run` needs. `fingerprint` identifies the base, the settings and the views."""
     state = {
         "fingerprint": fingerprint,
         "step": run.step,
@@ -118,22 +119,22 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
 
 
 def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) -> Run:
-    """The run of a state that `save_run` wrote, over `student`'s own parameters."""
+    """Return the run of a state that `save_run` wrote; its parameters replace those of `student`."""
     for name, kind in (("step", int), ("seconds", float), ("square_error", float), ("rows_changed", bool)):
         if not isinstance(state[name], kind):
-            raise TypeError(f"its {name} is no {kind.__name__}")
+            raise TypeError(f"{name} must be of type {kind.__name__}")
     device = student.parameters()["means"].device
-    # On a GPU light is summed in any order, so that merging anew may leave a splat more or less than it did.
+    # A GPU sums blend weights in any order, so that merging again may leave another number of splats.
     if state["rows_changed"] or state["parameters"]["means"].shape != student.parameters()["means"].shape:
         student.replace_parameters({name: tensor.to(device).requires_grad_() for name, tensor in state["parameters"].items()})
-    else:  # the rows are those that the run began with, and so is whatever the model carries along by row
+    else:  # the rows are those that the run began with, so that the model's other data by row still match them
         with torch.no_grad():
             for name, tensor in student.parameters().items():
                 tensor.copy_(state["parameters"][name])
     with torch.no_grad():
         for name, tensor in student.shared_parameters().items():
             tensor.copy_(state["shared"][name])
-    optimizer = make_optimizer(student, config, pixel=1.0)  # the state knows the rates
+    optimizer = make_optimizer(student, config, pixel=1.0)  # the state holds the actual rates
     optimizer.load_state_dict(state["optimizer"])
     gradients = ScreenGradients.of(student.parameters()["means"], config) if state["gradients"] else None
     if gradients is not None:
@@ -157,4 +158,4 @@ def _read(path: Path) -> Any:
         return load_torch(path)
     except CheckpointError as error:
         kind = type(error.__cause__ or error).__name__
-        raise SettingsError(f"{path}: this is not the state of an interrupted run ({kind}); delete it to start anew") from error
+        raise SettingsError(f"{path}: not the state of an interrupted run ({kind}); delete it to start anew") from error

@@ -1,4 +1,4 @@
-"""A run of Algorithm 1 as data: what is to be optimized against what, and where it stands."""
+"""A run of Algorithm 1 as data: its task, and its current state."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 
-# Views that are asked how far they agree with the base.
-JUDGES = 8
+# Number of views on which a student is compared with the base to assess a growth.
+AGREEMENT_VIEWS = 8
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be optimized against what."""
+    """What is optimized: the views, their truth, and the renderers."""
 
     views: Sequence[Camera]  # at the base scale
     scale: float
     truth: Callable[[Camera], Tensor]  # a view of the base scale -> [h, w, 3] at the new scale
-    render: Callable[[Gaussians, Camera], Tensor]  # what a camera of the new scale sees, and it -> [h, w, 3]
+    render: Callable[[Gaussians, Camera], Tensor]  # splats and a camera of the new scale -> [h, w, 3]
     white_background: bool
     validation: Validation
-    detail: Callable[[Camera, Tensor], Tensor] | None = None  # what a view's image adds to the loss besides
-    most_splats: int = sys.maxsize  # where growing ends
-    others: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats have to be right in
+    detail: Callable[[Camera, Tensor], Tensor] | None = None  # a view and its image -> a further part of the loss
+    max_splats: int = sys.maxsize  # growing stops at this number
+    further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
 
-    def drawn(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
-        """What renders the `draw`-th view since the beginning: each viewer takes its turn."""
-        return (self.render, *self.others)[draw % (1 + len(self.others))]
+    def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
+        """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
+        return (self.render, *self.further_renders)[draw % (1 + len(self.further_renders))]
 
     def pixel(self, means: Tensor) -> float:
-        """World units: the size of a target pixel at the median of `means` [N, 3]."""
+        """The size of a target pixel at the median of `means` [N, 3], in world units."""
         return float(pixel_size(means.detach(), self.views).median()) / self.scale
 
     @torch.no_grad()
     def agreement(self, student: SplatModel, config: AdaptConfig) -> float:
-        """dB: how close some of the views are to the truth."""
+        """PSNR (dB) of the student against the truth over some of the views."""
         errors = []
-        for view in evenly(self.views, JUDGES):
+        for view in evenly(self.views, AGREEMENT_VIEWS):
             camera = view.zoomed(self.scale)
             image = self.render(student.gaussians(camera), camera)
             errors.append(difference_from(self.truth(view), image, config.resize).square().mean())
@@ -60,16 +60,16 @@ class Task:
 
 @dataclass(frozen=True)
 class Trial:
-    """What growths are judged by, and what the last one is undone to."""
+    """Growth on trial: the PSNR that it must not fall below, and the parameters to return to."""
 
-    least_db: float  # how close the views were to the truth when the run began
-    before: dict[str, Tensor] | None = None  # the parameters before a growth that is not judged yet
-    passed: bool = False  # a growth has been judged, and stays
-    undone_at: int | None = None  # the step at which one was undone
+    least_db: float  # the agreement of the views with the truth when the run began
+    before: dict[str, Tensor] | None = None  # the parameters before a growth that has not been assessed yet
+    passed: bool = False  # a growth has been assessed and kept
+    undone_at: int | None = None  # the step at which a growth was undone
 
     @classmethod
     def begin(cls, student: SplatModel, task: Task, config: AdaptConfig) -> Trial | None:
-        """Of a run that begins with `student`; None where whatever grows stays."""
+        """The trial of a run that begins with `student`; None if growth is never undone."""
         if config.densify_on_trial and config.densify_gradient is not None:
             return cls(task.agreement(student, config))
         return None
@@ -77,22 +77,22 @@ class Trial:
 
 @dataclass
 class Run:
-    """Where a run stands: all that is needed to go on with it."""
+    """The current state of a run: everything needed to continue it."""
 
     student: SplatModel
     optimizer: Adam
     watch: Stopwatch
-    gradients: ScreenGradients | None  # None: nothing is cloned or split (any more), so nobody asks for them
+    gradients: ScreenGradients | None  # None: nothing is cloned or split (any more), so they are not needed
     steering: Steering
-    trial: Trial | None = None  # None: whatever grows stays
+    trial: Trial | None = None  # None: growth is never undone
     step: int = 0
     curve: list[CurvePoint] = field(default_factory=list)
-    square_error: Tensor | float = 0.0  # summed over the steps since the last point of the curve, where the images are: no step waits for it
+    square_error: Tensor | float = 0.0  # summed since the last point of the curve, on the device of the images, so that no step waits for it
     rows_changed: bool = False  # splats were added or removed
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
-        """Before the first step; `spent`: the seconds that came before."""
+        """A run before its first step; `spent`: the seconds used so far."""
         means = student.parameters()["means"]
         optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch(seconds=spent)
         with watch:
@@ -101,4 +101,5 @@ class Run:
         return cls(student, optimizer, watch, ScreenGradients.of(means, config), steering, trial, curve=[first])
 
     def progress(self, config: AdaptConfig) -> float:
+        """Fraction (0..1) of the steps or of the time budget that is used, whichever is larger."""
         return progress(self.step, self.watch.seconds, config)

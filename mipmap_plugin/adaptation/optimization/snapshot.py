@@ -1,4 +1,4 @@
-"""What a model holds at one moment, to be put back later."""
+"""Copies of a model's parameters at one moment, to be restored later."""
 
 from __future__ import annotations
 
@@ -20,13 +20,16 @@ class Snapshot:
 
     @classmethod
     def of(cls, model: SplatModel, rows_changed: bool = False) -> Snapshot:
-        rows, shared = ({name: tensor.detach().clone() for name, tensor in held.items()} for held in (model.parameters(), model.shared_parameters()))
+        """A snapshot of the model as it is now."""
+        groups = (model.parameters(), model.shared_parameters())
+        rows, shared = ({name: tensor.detach().clone() for name, tensor in group.items()} for group in groups)
         return cls(rows, shared, rows_changed)
 
     def over(self, initial: SplatModel) -> SplatModel:
-        """A model that holds the snapshot; `initial`: the model as the run began with it.
+        """A model with the snapshot's parameters; `initial`: the model at the start of the run.
 
-        What that carries along by row besides, such as columns of its file, goes where rows have changed, even if they are as many.
+        Other data of the initial model by row, such as further columns of its file, are removed if rows have changed, even if their number
+        is the same.
         """
         model = initial.copy()
         if self.rows_changed:
@@ -36,16 +39,17 @@ class Snapshot:
 
     @torch.no_grad()
     def put_into(self, model: SplatModel) -> None:
-        """Let `model`, a copy of what the snapshot is of, hold it: in its own leaves where there are as many rows."""
-        held = model.parameters()
-        if len(held["means"]) != len(self.rows["means"]):
+        """Set `model`, a copy of the snapshot's model, to the snapshot: in its own leaves where there are as many rows."""
+        parameters = model.parameters()
+        if len(parameters["means"]) != len(self.rows["means"]):
             model.replace_parameters({name: tensor.clone().requires_grad_() for name, tensor in self.rows.items()})
         else:
-            for name, tensor in held.items():
+            for name, tensor in parameters.items():
                 tensor.copy_(self.rows[name])
         for name, tensor in model.shared_parameters().items():
             tensor.copy_(self.shared[name])
 
     def to(self, device: torch.device) -> Snapshot:
-        rows, shared = ({name: tensor.to(device) for name, tensor in held.items()} for held in (self.rows, self.shared))
+        """The snapshot on another device."""
+        rows, shared = ({name: tensor.to(device) for name, tensor in group.items()} for group in (self.rows, self.shared))
         return Snapshot(rows, shared, self.rows_changed)

@@ -1,4 +1,4 @@
-"""Whose a file of an interrupted run is: runs that write to one output at the same time keep their states in files of their own."""
+"""Ownership of the state files of interrupted runs: concurrent runs with the same output keep their states in separate files."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from mipmap_plugin.formats.staging import SLOTS, claim, release
 
 
 class StateFile:
-    """The path of a state that no other run touches until this one has removed it, or is dead."""
+    """A locked state file: no other run touches it until this run removes or releases it, or its process ends."""
 
     def __init__(self, path: Path, lock: int) -> None:
         self.path = path
         self._lock: int | None = lock
 
     def remove(self) -> None:
-        """The state is of no more use."""
+        """Delete the state, which is no longer needed."""
         self.path.unlink(missing_ok=True)
         self.release()
 
     def release(self) -> None:
-        """Leave the state, if there is one, to whoever comes next."""
+        """Unlock the state, if there is one, for the next run."""
         if self._lock is not None:
             release(_lock_of(self.path), self._lock)
             self._lock = None
@@ -32,29 +32,29 @@ class StateFile:
         self.release()
 
 
-def own_state_file(wanted: Path, fits: Callable[[Path], bool]) -> StateFile:
-    """The state to go on from, at `wanted`, `wanted`.2 and so on, or the first of these that is free; `fits` tells ours from others'.
+def claim_state_file(requested: Path, is_ours: Callable[[Path], bool]) -> StateFile:
+    """Lock and return the state to resume, at `requested`, `requested`.2 and so on, or else the first of these that is free.
 
-    Raises SettingsError where only states of other runs are there, all of them dead.
+    `is_ours` returns whether a state belongs to this run. Raises SettingsError if there are only states of other runs that have ended.
     """
     free: StateFile | None = None
-    others = []
-    for path in (wanted, *(wanted.with_name(f"{wanted.name}.{number}") for number in range(2, SLOTS + 1))):
-        there = os.path.lexists(path)
-        if not there and free is not None and not os.path.lexists(_lock_of(path)):
+    foreign = []
+    for path in (requested, *(requested.with_name(f"{requested.name}.{number}") for number in range(2, SLOTS + 1))):
+        exists = os.path.lexists(path)
+        if not exists and free is not None and not os.path.lexists(_lock_of(path)):
             continue
         if (lock := claim(_lock_of(path))) is None:
-            continue  # a living run keeps its state there
+            continue  # a run that is still going on keeps its state there
         file = StateFile(path, lock)
-        if there and fits(path):
+        if exists and is_ours(path):
             return file
-        if there:
-            others.append(path)
+        if exists:
+            foreign.append(path)
         elif free is None:
             free = file
-    if others or free is None:
-        told = others[0] if others else wanted
-        raise SettingsError(f"{told}: it belongs to another base, other settings or other views; repeat those, or delete the file to start anew")
+    if foreign or free is None:
+        path = foreign[0] if foreign else requested
+        raise SettingsError(f"{path}: this state belongs to another base, settings or views; repeat the run with those, or delete it to start anew")
     return free
 
 

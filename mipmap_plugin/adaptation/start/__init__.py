@@ -1,1 +1,1 @@
-"""What a run begins with: the closed form, merged splats and matched opacities."""
+"""The model that a run begins with: closed form, merged splats and matched opacities."""

@@ -1,4 +1,4 @@
-"""How much of a scene's images each splat makes up: the sum of its blending weights."""
+"""The blend weight of each splat: how much it contributes to the images of a scene."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.small import most_threads
+from mipmap_plugin.adaptation.parallel import max_threads
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -17,22 +17,22 @@ from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.threads import side_by_side
 
 
-def light(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Tensor:
-    """[N] how many pixels of a view each splat fills, on average over `views`; 0 for one that is nowhere seen.
+def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Tensor:
+    """The blend weight of each splat, summed over the pixels of a view and averaged over `views`: [N] in pixels; 0 for an invisible splat.
 
-    An image is linear in the splats' colors, and so its weights are what a gray splat's color has for a gradient. From any backend
-    with gradients.
+    An image is linear in the splats' colors, so that the weights are the gradient of the image's sum with respect to the colors. Works
+    with any backend that has gradients.
     """
     plain = replace(effects, sh_degree=0, settings=effects.settings.of_any_color())
 
     @torch.enable_grad()
-    def of_view(view: Camera) -> Tensor:
+    def color_gradient(view: Camera) -> Tensor:
         color = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_()
-        backend.render(replace(gaussians, sh=color), view, plain).image.sum().backward()
+        backend.render(replace(gaussians, sh=color), view, plain).image.sum().backward()  # type: ignore[no-untyped-call]  # torch's
         assert color.grad is not None
         return color.grad
 
-    first, *others = side_by_side(of_view, views, most_threads(gaussians.means, views[0]))
-    for gradient in others:
-        first += gradient
-    return first[:, 0].mean(dim=1) / (C0 * len(views))
+    total, *gradients = side_by_side(color_gradient, views, max_threads(gaussians.means, views[0]))
+    for gradient in gradients:
+        total += gradient
+    return total[:, 0].mean(dim=1) / (C0 * len(views))

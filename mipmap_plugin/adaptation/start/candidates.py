@@ -1,4 +1,4 @@
-"""What a run begins with: the best, on validation views, of the base as it is, the closed form, and the closed form of merged splats."""
+"""The choice of the model that a run begins with: the base as it is, the closed form, or the closed form of merged splats."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.start.blend_weights import light
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, Form, closed_form, needs_nothing, pixel_size
-from mipmap_plugin.adaptation.start.matching import matched
+from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, filter_suffices, pixel_size
+from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
@@ -21,100 +21,102 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import Rebuilt, SplatModel
 
-# Views that tell how much of the base's images each splat makes up.
-WEIGHED_VIEWS = 12
+# Views from which blend weights are computed.
+WEIGHT_VIEWS = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """What a start is wanted for."""
+class StartProblem:
+    """The request for a start: the base, the target, and what measures the candidates."""
 
-    base: Callable[[], SplatModel]  # a copy of the base, to be rendered as the target is
+    base: Callable[[], SplatModel]  # makes a copy of the base that is rendered with the target's screen filter
     views: Sequence[Camera]  # at the base scale
     scale: float
-    trained: Effects  # how the base is rendered
-    aim: Effects  # how the adapted file is
+    base_effects: Effects  # how the base is rendered
+    target: Effects  # how the adapted file is rendered
     config: AdaptConfig
     backend: Backend
-    weighs: bool  # whether splats are the same for all views, and the backend tells how much of an image each makes up
-    steer: Callable[[SplatModel], float]  # dB of a model on the views that steer the run
-    phase: Callable[[str], AbstractContextManager[None]]  # bills what is done inside to a phase of that name
+    has_blend_weights: bool  # whether splats are the same for all views, and the backend has the gradients that blend weights need
+    steer: Callable[[SplatModel], float]  # PSNR (dB) of a model on the views that steer the run
+    phase: Callable[[str], AbstractContextManager[None]]  # counts the seconds spent inside under a phase of that name
 
 
-class Start:
-    """The candidates, and the choice among them."""
+class StartSearch:
+    """The candidates, and the choice among them by their PSNR on the steering views."""
 
-    def __init__(self, problem: Problem) -> None:
-        self._of, self._views = problem, evenly(problem.views, WEIGHED_VIEWS)
-        filters_do_it = needs_nothing(problem.scale, problem.trained, problem.aim)
-        self._weighs = problem.weighs and problem.scale <= 1 and not filters_do_it
+    def __init__(self, problem: StartProblem) -> None:
+        self._problem, self._weight_views = problem, evenly(problem.views, WEIGHT_VIEWS)
+        unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
+        self._matches_weights = problem.has_blend_weights and problem.scale <= 1 and not unchanged
 
     @torch.no_grad()
     def best(self) -> tuple[SplatModel, str]:
-        """A model to begin with, and what it is."""
-        of, config, base = self._of, self._of.config, self._of.base()
+        """Return the model to begin with, and its name."""
+        problem, config, base = self._problem, self._problem.config, self._problem.base()
         if not (config.closed_form or config.merge_to < 1):
             return base, "the base"
-        with of.phase("blend weights"):
-            weights = self._weights(base) if self._weighs or config.merge_to < 1 else None
-        formed = self._formed(weights, 1.0)
+        with problem.phase("blend weights"):
+            weights = self._base_weights(base) if self._matches_weights or config.merge_to < 1 else None
+        formed = self._candidate(weights, 1.0)
         if config.merge_to == 1 and config.returns == "last":
             return formed, "the closed form"
-        found, least = of.steer(base), of.steer(formed)
-        for share in (config.merge_to ** (1 / part) for part in (1, 2, 4)) if config.merge_to < 1 else ():
-            merged = self._formed(weights, share)
-            if (judged := of.steer(merged)) >= least - config.merging_costs:
-                return (merged, "the closed form of merged splats") if judged >= found else (base, "the base")
-        return (formed, "the closed form") if least >= found else (base, "the base")
+        base_db, formed_db = problem.steer(base), problem.steer(formed)
+        for fraction in (config.merge_to ** (1 / root) for root in (1, 2, 4)) if config.merge_to < 1 else ():
+            merged = self._candidate(weights, fraction)
+            if (merged_db := problem.steer(merged)) >= formed_db - config.merging_costs:
+                return (merged, "the closed form of merged splats") if merged_db >= base_db else (base, "the base")
+        return (formed, "the closed form") if formed_db >= base_db else (base, "the base")
 
-    def _formed(self, weights: Tensor | None, share: float) -> SplatModel:
-        """The base with `share` of its splats left, in closed form."""
-        of, student = self._of, self._of.base()
-        if share < 1 and weights is not None:
-            with of.phase("merging"):
-                weights = self._merge(student, weights, share)
-        if of.config.closed_form:
-            with of.phase("closed form"):
-                student.reshape(lambda gaussians: self._form(gaussians, weights), of.views)
+    def _candidate(self, weights: Tensor | None, fraction: float) -> SplatModel:
+        """The base in closed form, after merging its splats down to a fraction of them."""
+        problem, student = self._problem, self._problem.base()
+        if fraction < 1 and weights is not None:
+            with problem.phase("merging"):
+                weights = self._merge(student, weights, fraction)
+        if problem.config.closed_form:
+            with problem.phase("closed form"):
+                student.reshape(lambda gaussians: self._closed_form(gaussians, weights), problem.views)
         return student
 
-    def _merge(self, student: SplatModel, weights: Tensor, share: float) -> Tensor:
-        """Leave `share` of the splats; what each that is left fills."""
-        filled = []
+    def _merge(self, student: SplatModel, weights: Tensor, fraction: float) -> Tensor:
+        """Merge the student's splats down to a fraction of them; return the blend weights of the merged splats."""
+        merged_weights = []
 
-        def fewer(gaussians: Gaussians) -> Gaussians:
-            merged, light = merge(gaussians, pixel_size(gaussians.means, self._of.views) / self._of.scale, weights, share)
-            filled.append(light)
-            return merged
+        def merged(gaussians: Gaussians) -> Gaussians:
+            pixel = pixel_size(gaussians.means, self._problem.views) / self._problem.scale
+            splats, new_weights = merge(gaussians, pixel, weights, fraction)
+            merged_weights.append(new_weights)
+            return splats
 
-        cast(Rebuilt, student).rebuild(fewer)
-        return filled[0]
+        cast(Rebuilt, student).rebuild(merged)
+        return merged_weights[0]
 
-    def _form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        of = self._of
-        form = Form(1.0 if self._weighs else AREA_POWER, of.config.crispness)
-        scales, opacities = closed_form(gaussians, of.views, of.scale, of.trained, of.aim, form)
-        if not self._weighs or weights is None:
+    def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
+        problem = self._problem
+        settings = FormSettings(1.0 if self._matches_weights else AREA_POWER, problem.config.crispness)
+        scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
+        if not self._matches_weights or weights is None:
             return scales, opacities
-        views = [view.zoomed(of.scale) for view in self._views]
+        views = [view.zoomed(problem.scale) for view in self._weight_views]
 
-        def weigh(tried: Tensor) -> Tensor:
-            return light(replace(gaussians, scales=scales, opacities=tried), views, of.backend, of.aim)
+        def weights_of(opacities: Tensor) -> Tensor:
+            return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, problem.target)
 
-        return scales, matched(opacities, weights, weigh)
+        return scales, matched_opacities(opacities, weights, weights_of)
 
-    def _weights(self, base: SplatModel) -> Tensor:
-        """[N] target pixels that each of the base's splats fills in a view."""
-        gaussians = base.gaussians(self._views[0]).detach()
-        return light(gaussians, self._views, self._of.backend, self._of.trained) * self._of.scale**2
+    def _base_weights(self, base: SplatModel) -> Tensor:
+        """[N]: the blend weights of the base's splats, in target pixels of a view."""
+        gaussians = base.gaussians(self._weight_views[0]).detach()
+        return blend_weights(gaussians, self._weight_views, self._problem.backend, self._problem.base_effects) * self._problem.scale**2
 
 
-def warm(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], *, gradients: bool) -> None:
-    """Have the backend compile what it will be asked for, on one splat, so that no later phase is billed for it."""
+def warm_up_backend(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], *, gradients: bool) -> None:
+    """Let the backend compile for all `effects` by rendering one splat, so that compilation counts in no later phase."""
     camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
-    for each in effects:
+    for setting in effects:
         one = gaussians[torch.arange(min(1, len(gaussians)))].detach()
         one.means.requires_grad_(gradients)
-        image = backend.render(one, camera, each).image
+        image = backend.render(one, camera, setting).image
         if gradients and image.requires_grad:
-            image.sum().backward()
+            image.sum().backward()  # type: ignore[no-untyped-call]  # torch's

@@ -1,9 +1,9 @@
-"""Fewer, larger splats for a coarser image: of neighbors of like color two become one, those first whose loss shows least.
+"""Fewer, larger splats for a coarser image: pairs of neighbors of similar color are merged, the pairs of least cost first.
 
-At x1/8 thousands of splats share a pixel, and a classic renderer dilates every one of them. A pair is replaced by the splat with
-the same weight, mean and covariance (moment matching, as in Runnalls 2007, "Kullback-Leibler approach to Gaussian mixture
-reduction"), weighed by the light that each shows; the pairs are those that Ward's method takes (1963, "Hierarchical grouping to
-optimize an objective function"), many at a time.
+At x1/8 thousands of splats share a pixel, and a classic renderer dilates every one of them. A pair is replaced by one splat with the same
+total weight, mean and covariance (moment matching, as in Runnalls 2007, "Kullback-Leibler approach to Gaussian mixture reduction"), where
+the weights are the splats' blend weights. The cost of a pair is that of Ward's method (1963, "Hierarchical grouping to optimize an
+objective function"); many pairs are merged at a time.
 """
 
 from __future__ import annotations
@@ -19,155 +19,159 @@ from mipmap_plugin.splatting.eigen import eigh3
 from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.splatting.rotations import quaternions, rotations
 
-# Target pixels: a step from black to white in one channel keeps splats apart as this distance does.
+# Target pixels: a difference from black to white in one channel counts as this distance.
 CONTRAST = 20.0
 
-# Target pixels: splats that are this far apart, in place, shape and color together, stay two; and so do those whose merging would cost
-# more than one pixel of light that moves by one. Objects come down to half of their splats at x1/2 and to a tenth at x1/8 within both. A
-# meadow at x1/4 (flowers) stays at 56 %, which is as good as all; with a distance of 5 it comes down to 50 %, and loses 0.3 dB.
-FARTHEST = 4.0
-DEAREST = 1.0
+# Target pixels: splats at this distance, in position, shape and color together, are not merged; nor are pairs whose cost is above that of
+# one pixel of blend weight moved by one pixel. Within both limits objects can be reduced to half of their splats at x1/2 and to a tenth at
+# x1/8. A meadow at x1/4 (flowers) stops at 56 %, which is as good as all splats; with a distance of 5 it stops at 50 %, and loses 0.3 dB.
+MAX_DISTANCE = 4.0
+MAX_COST = 1.0
 
-# What no view saw has this share of the light that it could have: that much it weighs beside what was seen, and by that among its like.
-UNSEEN = 1e-6
+# A splat that no view saw gets this fraction of its largest possible weight: almost nothing beside seen splats, but enough to be merged with
+# other unseen ones.
+UNSEEN_WEIGHT = 1e-6
 
-# How many of those that follow a splat along the curve through all of them are looked at for a partner.
+# A splat's partner is searched among this many next splats along a space-filling curve.
 NEIGHBORS = 8
 
-# Of the pairs that are found at once, the share that is merged: those left over may find a better partner among what the others became.
-AT_ONCE = 0.7
+# The fraction of a round's pairs that is merged: the splats of the other pairs may find better partners among the merged ones.
+MERGED_PER_ROUND = 0.7
 
-# The share of the splats that has to find a partner for another round to pay.
-HARDLY_ANY = 0.002
+# Merging ends when a round finds fewer pairs than this fraction of the splats.
+MIN_PAIRS = 0.002
 
-# Cells of the curve through all splats lie at -2^19..2^19 on each axis, and are shifted by 2^19..2^20: 21 bits hold what comes out.
-HALF_CURVE = 2**19
+# Cells of the space-filling curve lie at -2^19..2^19 on each axis, and are shifted by 2^19..2^20, so that 21 bits suffice.
+CELL_RANGE = 2**19
 
-# Each spreads the bits that the one before left together, until two zeros follow every bit.
+# (shift, mask): each step moves bits apart, until two zeros follow every bit.
 SPREADS = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249))
 
-# No opacity reaches 1, whose logit is infinite.
-MOST_OPAQUE = 0.999
+# Opacities stay below 1, whose logit is infinite.
+MAX_OPACITY = 0.999
 
 
-def merge(gaussians: Gaussians, pixel: Tensor, light: Tensor, share: float) -> tuple[Gaussians, Tensor]:
-    """Splats merged until `share` (0..1) of them is left, or hardly any lie within `FARTHEST` of each other and cost less than `DEAREST`;
-    and how many target pixels each of them fills.
+def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float) -> tuple[Gaussians, Tensor]:
+    """Merge splats down to a `fraction` (0..1) of them; return them and their blend weights.
 
-    `pixel` [N]: the size of a target pixel at each splat, world units. `light` [N]: how many target pixels each fills in a view.
+    Merging ends early when hardly any pairs are within `MAX_DISTANCE` and `MAX_COST`. `pixel` [N]: the size of a target pixel at each splat,
+    in world units. `weights` [N]: the blend weight of each splat, in target pixels of a view.
     """
-    splats, wanted = _Splats.of(gaussians, pixel, light), max(1, math.floor(share * len(gaussians)))
-    rows, before = torch.arange(len(gaussians), device=light.device), splats.light
+    splats, target_count = _Moments.of(gaussians, pixel, weights), max(1, math.floor(fraction * len(gaussians)))
+    rows, old_weights = torch.arange(len(gaussians), device=weights.device), splats.weights
     generator = torch.Generator().manual_seed(0)
-    while (surplus := len(splats.light) - wanted) > 0:
+    while (surplus := len(splats.weights) - target_count) > 0:
         first, second = splats.pairs(torch.rand(3, generator=generator))
-        if len(first) < HARDLY_ANY * len(splats.light):
+        if len(first) < MIN_PAIRS * len(splats.weights):
             break
-        most = min(surplus, math.ceil(AT_ONCE * len(first)))
-        splats, now = splats.merged(first[:most], second[:most])
-        rows = now[rows]
-    return splats.gaussians(gaussians, rows, before), splats.light
+        count = min(surplus, math.ceil(MERGED_PER_ROUND * len(first)))
+        splats, new_rows = splats.merged(first[:count], second[:count])
+        rows = new_rows[rows]
+    return splats.gaussians(gaussians, rows, old_weights), splats.weights
 
 
 @dataclass(frozen=True)
-class _Splats:
-    """Splats as merging sees them, row by row."""
+class _Moments:
+    """The quantities of splats that merging uses, by row."""
 
     means: Tensor  # [N, 3]
-    covariances: Tensor  # [N, 3, 3], double: thin splats cancel
-    depth: Tensor  # [N] optical depth times surface, which is what two splats have as much of as one in their place
+    covariances: Tensor  # [N, 3, 3], double, because differences of thin splats cancel
+    depth: Tensor  # [N] optical depth times surface, which is additive: a merged splat has the sum of its pair's
     color: Tensor  # [N, 3] in target pixels
-    light: Tensor  # [N] target pixels
+    weights: Tensor  # [N] blend weights, in target pixels
     pixel: Tensor  # [N] world units
 
     @classmethod
-    def of(cls, gaussians: Gaussians, pixel: Tensor, light: Tensor) -> _Splats:
+    def of(cls, gaussians: Gaussians, pixel: Tensor, weights: Tensor) -> _Moments:
+        """The moments of `gaussians`, whose blend weights are `weights` [N]."""
         axes = (rotations(gaussians.quats) * gaussians.scales[:, None, :]).double()
         covariances = axes @ axes.mT
-        depth = -torch.log1p(-gaussians.opacities.clamp_max(MOST_OPAQUE)) * _surface(covariances)
+        depth = -torch.log1p(-gaussians.opacities.clamp_max(MAX_OPACITY)) * _surface(covariances)
         color = CONTRAST * (0.5 + C0 * gaussians.sh[:, 0]).clamp(0, 1)
-        unseen = (UNSEEN * depth / pixel**2).to(light).clamp_min(torch.finfo(light.dtype).tiny)
-        return cls(gaussians.means, covariances, depth, color, light + unseen, pixel)
+        unseen = (UNSEEN_WEIGHT * depth / pixel**2).to(weights).clamp_min(torch.finfo(weights.dtype).tiny)
+        return cls(gaussians.means, covariances, depth, color, weights + unseen, pixel)
 
     def pairs(self, shift: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows that are each other's nearest, first those whose merging costs least. `shift` [3], 0..1: where the curve begins."""
+        """Return pairs of rows that are each other's nearest neighbors, by rising cost. `shift` [3], 0..1, moves the space-filling curve."""
         order = _curve(self.means, self.pixel.median(), shift)
-        means, shapes, color, light, pixel = (each[order] for each in (self.means, self.covariances, self.color, self.light, self.pixel))
-        least, nearest = torch.full_like(light, torch.inf), torch.zeros_like(order)
-        place = torch.arange(len(order), device=order.device)
+        means, shapes, color, weights, pixel = (
+            tensor[order] for tensor in (self.means, self.covariances, self.color, self.weights, self.pixel)
+        )
+        least, nearest = torch.full_like(weights, torch.inf), torch.zeros_like(order)
+        position = torch.arange(len(order), device=order.device)
         for step in range(1, min(NEIGHBORS + 1, len(order))):
             one, other = slice(None, -step), slice(step, None)
-            apart = (means[one] - means[other]).square().sum(1)
-            apart = apart + (shapes[one] - shapes[other]).flatten(1).norm(dim=1).to(apart)
-            unlike = apart / (pixel[one] * pixel[other]) + (color[one] - color[other]).square().sum(1)
-            cost = unlike * light[one] * (light[other] / (light[one] + light[other]))
-            cost = torch.where((unlike < FARTHEST**2) & (cost < DEAREST), cost, torch.inf)
+            square = (means[one] - means[other]).square().sum(1)
+            square = square + (shapes[one] - shapes[other]).flatten(1).norm(dim=1).to(square)
+            distance = square / (pixel[one] * pixel[other]) + (color[one] - color[other]).square().sum(1)  # squared
+            cost = distance * weights[one] * (weights[other] / (weights[one] + weights[other]))
+            cost = torch.where((distance < MAX_DISTANCE**2) & (cost < MAX_COST), cost, torch.inf)
             for here, there in ((one, other), (other, one)):
                 nearer = cost < least[here]
-                nearest[here] = torch.where(nearer, place[there], nearest[here])
+                nearest[here] = torch.where(nearer, position[there], nearest[here])
                 least[here] = torch.where(nearer, cost, least[here])
-        first = ((nearest[nearest] == place) & (place < nearest) & least.isfinite()).nonzero()[:, 0]
+        first = ((nearest[nearest] == position) & (position < nearest) & least.isfinite()).nonzero()[:, 0]
         first = first[least[first].argsort(stable=True)]
         return order[first], order[nearest[first]]
 
-    def merged(self, first: Tensor, second: Tensor) -> tuple[_Splats, Tensor]:
-        """One row for each pair, after those that are in none; and the new row [N] of each."""
-        share = self.light[first] / (self.light[first] + self.light[second])
+    def merged(self, first: Tensor, second: Tensor) -> tuple[_Moments, Tensor]:
+        """Merge pairs of rows; return the unpaired rows followed by one row per pair, and the new row [N] of each old one."""
+        fraction = self.weights[first] / (self.weights[first] + self.weights[second])
         between = (self.means[first] - self.means[second]).double()
-        spread = (share * (1 - share))[:, None, None] * between[:, :, None] * between[:, None, :]
+        spread = (fraction * (1 - fraction))[:, None, None] * between[:, :, None] * between[:, None, :]
 
         def mean(values: Tensor) -> Tensor:
-            weight = share.view(-1, *[1] * (values.dim() - 1)).to(values)
+            weight = fraction.view(-1, *[1] * (values.dim() - 1)).to(values)
             return weight * values[first] + (1 - weight) * values[second]
 
-        pairs = _Splats(
+        pairs = _Moments(
             mean(self.means), mean(self.covariances) + spread, self.depth[first] + self.depth[second], mean(self.color),
-            self.light[first] + self.light[second], mean(self.pixel),
+            self.weights[first] + self.weights[second], mean(self.pixel),
         )  # fmt: skip
-        alone = torch.ones_like(self.light, dtype=torch.bool).index_fill_(0, torch.cat([first, second]), False)
-        rows = alone.cumsum(0) - 1
-        rows[first] = rows[second] = torch.arange(len(first), device=rows.device) + int(alone.sum())
-        return _Splats(*(torch.cat([getattr(self, field.name)[alone], getattr(pairs, field.name)]) for field in fields(self))), rows
+        unpaired = torch.ones_like(self.weights, dtype=torch.bool).index_fill_(0, torch.cat([first, second]), False)
+        rows = unpaired.cumsum(0) - 1
+        rows[first] = rows[second] = torch.arange(len(first), device=rows.device) + int(unpaired.sum())
+        return _Moments(*(torch.cat([getattr(self, field.name)[unpaired], getattr(pairs, field.name)]) for field in fields(self))), rows
 
-    def gaussians(self, before: Gaussians, rows: Tensor, light: Tensor) -> Gaussians:
-        """What the splats are now; `rows` [N0] tells which of them each of `before`'s went into. One that is alone stays bit by bit."""
-        count = len(self.light)
-        new = torch.zeros(count, dtype=torch.long, device=rows.device).index_add_(0, rows, torch.ones_like(rows)) > 1
-        if not new.any():
+    def gaussians(self, before: Gaussians, rows: Tensor, old_weights: Tensor) -> Gaussians:
+        """Return the merged splats. `rows` [N0]: the new row of each splat of `before`. Splats that were not merged stay bit-identical."""
+        count = len(self.weights)
+        is_merged = torch.zeros(count, dtype=torch.long, device=rows.device).index_add_(0, rows, torch.ones_like(rows)) > 1
+        if not is_merged.any():
             return before
         origin = torch.zeros_like(rows[:count]).index_copy_(0, rows, torch.arange(len(rows), device=rows.device))
 
-        def put(old: Tensor, values: Tensor) -> Tensor:
-            return old[origin].masked_scatter(new.view(-1, *[1] * (old.dim() - 1)), values.to(old))
+        def replaced(old: Tensor, values: Tensor) -> Tensor:
+            return old[origin].masked_scatter(is_merged.view(-1, *[1] * (old.dim() - 1)), values.to(old))
 
-        variances, directions = eigh3(self.covariances[new])
+        variances, directions = eigh3(self.covariances[is_merged])
         directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
-        opacities = -torch.expm1(-self.depth[new] / _surface(self.covariances[new]))
-        share = (light / self.light[rows])[:, None, None]
-        sh = torch.zeros_like(before.sh[:count]).index_add_(0, rows, share * before.sh)
+        opacities = -torch.expm1(-self.depth[is_merged] / _surface(self.covariances[is_merged]))
+        fraction = (old_weights / self.weights[rows])[:, None, None]
+        sh = torch.zeros_like(before.sh[:count]).index_add_(0, rows, fraction * before.sh)
         return replace(
-            before, means=put(before.means, self.means[new]), quats=put(before.quats, quaternions(directions)),
-            scales=put(before.scales, variances.clamp_min(0).sqrt()), opacities=put(before.opacities, opacities.clamp_max(MOST_OPAQUE)),
-            sh=put(before.sh, sh[new]),
+            before, means=replaced(before.means, self.means[is_merged]), quats=replaced(before.quats, quaternions(directions)),
+            scales=replaced(before.scales, variances.clamp_min(0).sqrt()), sh=replaced(before.sh, sh[is_merged]),
+            opacities=replaced(before.opacities, opacities.clamp_max(MAX_OPACITY)),
         )  # fmt: skip
 
 
 def _surface(covariances: Tensor) -> Tensor:
-    """[N] the surface of ellipsoids, up to a factor: the root of the mean square of the areas that they show from all sides.
+    """Approximate surface of ellipsoids, up to a factor: [N], the root mean square of their projected areas over all directions.
 
-    For half-axes a, b and c that is the root of a²b² + b²c² + c²a², a sum of minors, so that no axes are needed.
+    For half-axes a, b and c that is the root of a²b² + b²c² + c²a², a sum of minors, so that no eigenvalues are needed.
     """
     minors = [covariances[:, i, i] * covariances[:, j, j] - covariances[:, i, j] ** 2 for i, j in ((0, 1), (0, 2), (1, 2))]
     return sum(minors, torch.zeros_like(minors[0])).clamp_min(torch.finfo(covariances.dtype).tiny).sqrt()
 
 
 def _curve(means: Tensor, pixel: Tensor, shift: Tensor) -> Tensor:
-    """[N] the order of `means` [N, 3] along a Z-shaped curve through space (Morton 1966), on which neighbors mostly follow each other.
+    """The order [N] of `means` [N, 3] along a Z-order curve (Morton 1966), on which neighbors in space mostly follow each other.
 
-    Its cells measure a quarter of `pixel`. `shift` [3], 0..1, moves them: neighbors that one curve tears apart follow on another.
+    Its cells measure a quarter of `pixel`. `shift` [3], 0..1, moves them, because neighbors that one curve separates are close on another.
     """
-    cells = (4 * (means - means.median(dim=0).values) / pixel).clamp(-HALF_CURVE, HALF_CURVE - 1)
-    bits = (cells + HALF_CURVE * (1 + shift.to(cells))).long()
+    cells = (4 * (means - means.median(dim=0).values) / pixel).clamp(-CELL_RANGE, CELL_RANGE - 1)
+    bits = (cells + CELL_RANGE * (1 + shift.to(cells))).long()
     for step, mask in SPREADS:
         bits = (bits | bits << step) & mask
     return (bits[:, 0] | bits[:, 1] << 1 | bits[:, 2] << 2).argsort(stable=True)

@@ -1,8 +1,9 @@
-"""The closed form of surfels, whose screen filter does not widen them but puts a least size of its own beside them.
+"""The closed form of surfels, whose screen filter does not widen them but sets a minimum size.
 
-A surfel shows the larger of itself and of a low-pass filter of e px² (`splatting.surfels`). At scale s the file's filter is e px² of the
-target, where the base showed e·s² of them. Zoom-in: the base's filter, which the file no longer has, becomes the surfel's least size.
-Zoom-out: nothing can become smaller than the file's filter, so that opacity falls by the area that this one adds.
+A pixel shows the larger of the surfel and of a low-pass filter of e px² (`splatting.surfels`). At scale s the filter of the adapted file
+is e px² of the target, while that of the base measured e·s² of them. Zoom-in: the base's filter, which the file no longer has, becomes
+the surfel's minimum size. Zoom-out: no surfel can be smaller than the file's filter, so that its opacity is divided by the area that
+the filter adds.
 """
 
 from __future__ import annotations
@@ -14,39 +15,40 @@ from torch import Tensor
 
 from mipmap_plugin.splatting.projection import Projected
 
-# A surfel that views see at a slant shows less than the filter did; with more than so many times its area it stands out where it is met from
-# the front (lego at x2, its splats made flat: 28.4 dB from the base; 28.0 at 1, 28.2 from 4 on).
-MOST_WIDER = 2.0
+# A surfel that views see at a slant covers less than the filter did. It is enlarged for that by at most this factor of its area, because a
+# larger one stands out in views from the front (lego at x2, its splats made flat: 28.4 dB from the base; 28.0 at 1, 28.2 from 4 on).
+MAX_WIDENING = 2.0
 
 
-def least_sizes(scales: Tensor, pixel: Tensor, eps2d: float) -> Tensor:
-    """Scales [N, 3] of which the first two are at least as wide as a filter of `eps2d` px², of pixels of size `pixel` [N] (world units)."""
+def widened_to_filter(scales: Tensor, pixel: Tensor, eps2d: float) -> Tensor:
+    """Scales [N, 3] whose first two are at least as wide as a filter of `eps2d` px², for pixels of size `pixel` [N] (world units)."""
     wide = scales[:, :2].maximum((eps2d**0.5 * pixel)[:, None])
     return torch.cat([wide, scales[:, 2:]], dim=1)
 
 
-def lay_out(scales: Tensor, wide: Tensor, lost: Tensor) -> Tensor:
-    """`wide` [N, 3], larger where it is wider than `scales` already, so that the areas that are `lost` [N] at a slant are shown again."""
+def widened_for_slant(scales: Tensor, wide: Tensor, area_ratio: Tensor) -> Tensor:
+    """Enlarge the axes of `wide` [N, 3] that are wider than in `scales`, so that the area grows by `area_ratio` [N], which slant removes."""
     widened = wide > scales
-    share = lost.clamp(1, MOST_WIDER)[:, None] ** (1 / widened.sum(1, keepdim=True).clamp_min(1))
-    return torch.where(widened, wide * share, wide)
+    factor = area_ratio.clamp(1, MAX_WIDENING)[:, None] ** (1 / widened.sum(1, keepdim=True).clamp_min(1))
+    return torch.where(widened, wide * factor, wide)
 
 
-def shown_area(projected: Projected, eps2d: float) -> Tensor:
-    """[N] px², up to 2π: the integral over the screen of the larger of a splat's Gaussian and of one of variance `eps2d`, both 1 in the middle.
+def visible_area(projected: Projected, eps2d: float) -> Tensor:
+    """Visible area of each splat, [N] in px², without the factor 2π: the integral over the screen of the larger of two Gaussians.
 
-    In polar coordinates both fall off as a Gaussian of r, whose variance along the direction is the larger of the two. With deviations
-    a >= f >= b of the splat's axes and of the filter the splat's is the larger within an angle t of its long axis, where
-    tan² t = (1/f² - 1/a²) / (1/b² - 1/f²), and the integrals of both parts are known:
+    One is the splat's, the other the filter's, of variance `eps2d`; both are 1 at the center. In polar coordinates each is a Gaussian of
+    the radius, and along each direction the one of larger variance is the larger. With standard deviations a >= f >= b of the splat's axes
+    and of the filter, the splat's is the larger within an angle t of its long axis, where tan² t = (1/f² - 1/a²) / (1/b² - 1/f²), and
+    both parts have closed-form integrals:
 
         area = (2/π)·(a·b·atan(tan(t)·a/b) + f²·(π/2 - t)).
     """
     tiny = torch.finfo(projected.det.dtype).tiny
-    middle, apart = (projected.xx + projected.yy) / 2, torch.hypot((projected.xx - projected.yy) / 2, projected.xy)
-    longer = middle + apart
+    mean, half_difference = (projected.xx + projected.yy) / 2, torch.hypot((projected.xx - projected.yy) / 2, projected.xy)
+    longer = mean + half_difference
     shorter = projected.det / longer.clamp_min(tiny)
-    a2, b2 = longer.clamp_min(eps2d), shorter.clamp(tiny, eps2d)  # with which the formula holds for any of them but the widest
+    a2, b2 = longer.clamp_min(eps2d), shorter.clamp(tiny, eps2d)  # the formula then holds for all splats except those wider than the filter
     tangent = ((1 / eps2d - 1 / a2) / (1 / b2 - 1 / eps2d).clamp_min(tiny)).clamp_min(0).sqrt()
-    own = (a2 * b2).sqrt() * torch.atan(tangent * (a2 / b2).sqrt())
-    beside = 2 / math.pi * (own + eps2d * (math.pi / 2 - torch.atan(tangent)))
-    return torch.where(shorter > eps2d, projected.det.sqrt(), beside)
+    splat_part = (a2 * b2).sqrt() * torch.atan(tangent * (a2 / b2).sqrt())
+    area = 2 / math.pi * (splat_part + eps2d * (math.pi / 2 - torch.atan(tangent)))
+    return torch.where(shorter > eps2d, projected.det.sqrt(), area)

@@ -1,1 +1,1 @@
-"""What is optimized towards: pseudo ground truth, resized or enlarged, and photographs."""
+"""The target of the optimization: pseudo ground truth, resized or upsampled, and photographs."""

@@ -1,4 +1,4 @@
-"""Images that took long to make, kept on disk from one run to the next."""
+"""A cache on disk for images that take long to make."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ VARIABLE = "MIPMAP_PLUGIN_CACHE"
 
 
 def cache_folder() -> Path:
-    """Where they lie: what MIPMAP_PLUGIN_CACHE says, else `mipmap_plugin` in the user's cache folder. It may be deleted at any time."""
+    """The folder of the cache: MIPMAP_PLUGIN_CACHE, or else `mipmap_plugin` in the user's cache folder. It may be deleted at any time."""
     if folder := os.environ.get(VARIABLE):
         return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mipmap_plugin"
 
 
 def fingerprint(image: Tensor, *facts: object) -> str:
-    """A name that no other image and facts have."""
+    """A hash of an image and of `facts`, to name a file in the cache."""
     digest = hashlib.sha256(repr((facts, tuple(image.shape), image.dtype)).encode())
     digest.update(image.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
 
 
 def cached(name: str, make: Callable[[], Tensor]) -> Tensor:
-    """The image kept as `name`, or else what `make` returns; in half precision both times, which is a tenth of an 8-bit step.
+    """Return the image cached as `name`, or else make and cache it; in both cases in half precision, accurate to a tenth of an 8-bit step.
 
-    A damaged file is made anew. A folder that cannot be written to costs the image the next time, and a warning now.
+    A damaged file is replaced. If the folder cannot be written to, the image is not cached, with a warning.
     """
     file = cache_folder() / name[:2] / f"{name}.pt"
-    if (kept := _kept(file)) is not None:
-        return kept.float()
+    if (stored := _load(file)) is not None:
+        return stored.float()
     image = make().detach().to("cpu", torch.float16)
     try:
         save_torch(file, image, overwrite=True)
     except (OutputError, OutputExists) as error:
-        warnings.warn(f"the image is made again next time, for {error} (the variable {VARIABLE} names another folder)", stacklevel=2)
+        warnings.warn(f"the image is not cached: {error}; set the variable {VARIABLE} to another folder", stacklevel=2)
     return image.float()
 
 
-def _kept(file: Path) -> Tensor | None:
+def _load(file: Path) -> Tensor | None:
     if not file.is_file():
         return None
     try:
-        kept = load_torch(file)
+        image = load_torch(file)
     except CheckpointError:
         return None
-    return kept if isinstance(kept, Tensor) and kept.dim() == 3 and kept.is_floating_point() else None
+    return image if isinstance(image, Tensor) and image.dim() == 3 and image.is_floating_point() else None

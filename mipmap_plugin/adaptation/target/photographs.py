@@ -1,4 +1,4 @@
-"""Real images as the truth of a zoom-in, where a person has them: they were there before the base, and know more than it shows."""
+"""Photographs as the truth of a zoom-in, where the user has them: they show more detail than the base that was trained on them."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from mipmap_plugin.scenes import Scene
 
 
 class Photographs:
-    """The training images of a scene at the pixel density of the base, and the cameras that they belong to."""
+    """The training images of a scene at the pixel density of the base, and their cameras."""
 
     def __init__(self, scene: Scene, base: Camera | None, background: tuple[float, float, float]) -> None:
-        """`base`: any camera of the base scale. Raises SettingsError where there is none, and for a scene without training images."""
+        """`base`: any camera of the base scale. Raises SettingsError if it is None, and for a scene without training images."""
         if base is None:
             raise SettingsError("the checkpoint has no cameras, so that the scale of the images is not known; give its model folder")
         self._scene, self._background = scene, background
-        self._taken_by = {as_sampled(camera, base): camera for camera in scene.split("train") if camera in scene.images}
-        if not self._taken_by:
+        self._originals = {at_density_of(camera, base): camera for camera in scene.split("train") if camera in scene.images}
+        if not self._originals:
             raise SettingsError(f"{scene.source}: there are no training images to adapt to; leave them out, or give the folder that has them")
-        self.cameras = list(self._taken_by)
+        self.cameras = list(self._originals)
 
     def __call__(self, view: Camera) -> Tensor | None:
-        """The image [H, W, 3] of one of `cameras`, made smaller as Pillow does; None for any other view."""
-        if view not in self._taken_by:
+        """Return the image [H, W, 3] of one of `cameras`, shrunk as Pillow does; None for any other view."""
+        if view not in self._originals:
             return None
-        return resize(self._scene.image(self._taken_by[view], self._background), view.size, "pil-bicubic").clamp(0, 1)
+        return resize(self._scene.image(self._originals[view], self._background), view.size, "pil-bicubic").clamp(0, 1)
 
 
-def as_sampled(camera: Camera, base: Camera) -> Camera:
-    """`camera` at the pixel density of `base`: where zooming starts from, and not itself a zoom."""
+def at_density_of(camera: Camera, base: Camera) -> Camera:
+    """`camera` at the pixel density of `base`, as a view of the base scale (its `zoom` stays)."""
     ratio = base.fx / camera.fx
     return camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))

@@ -1,8 +1,8 @@
-"""One file for several viewers: which of them speak for the rest, and which of them the start aims at.
+"""One file for several viewers: which of them are rendered during the optimization, and which one the start is made for.
 
-A splat that is right in two viewers is right in one between them: between two dilations, between what compensates and what does not, and
-where less is left out. So steps draw the extremes alone, in turn. On lego at x1/4 that makes the worst of all viewers 0.7 dB better than
-turns through all of them, half of which draw much alike.
+A splat that is right in two viewers is right in one between them: between two dilations, with or without compensation, and where fewer
+splats are left out. So steps render the extreme viewers only, in turn. On lego at x1/4 that makes the worst of all viewers 0.7 dB better
+than turns through all of them, half of which render much alike.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from typing import Any
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import COMPENSATED, Effects
 
-# Of a recipe's `merge_to`: fewer, larger splats care less about a filter. At x1/4 half of them makes the worst viewer 0.3 dB better on lego,
-# and a quarter no better than that.
-FEWER = 0.5
+# Factor of a recipe's `merge_to`: fewer, larger splats depend less on the filter. At x1/4, half of them make the worst viewer 0.3 dB better
+# on lego, and a quarter no better than that.
+MERGE_FACTOR = 0.5
 
 
-def for_several(config: AdaptConfig) -> dict[str, Any]:
-    """What a recipe's settings become. The loss is the square itself instead of its logarithm, so that the worst viewer counts most:
-    +0.9 dB there on lego at x1/4, +0.5 on flowers."""
-    return {"merge_to": config.merge_to * FEWER if config.merge_to < 1 else 1.0, "loss": "l2" if config.loss == "psnr" else config.loss}
+def settings_for_several(config: AdaptConfig) -> dict[str, Any]:
+    """The changes of a recipe's settings. The loss is the mean square error instead of its logarithm, so that the worst viewer counts most:
+    +0.9 dB in it on lego at x1/4, +0.5 on flowers."""
+    return {"merge_to": config.merge_to * MERGE_FACTOR if config.merge_to < 1 else 1.0, "loss": "l2" if config.loss == "psnr" else config.loss}
 
 
-def extremes(targets: Mapping[str, Effects]) -> dict[str, Effects]:
-    """Those of `targets` that go farthest in one respect, of equals the first: the widest dilation with and without compensation, the
-    narrowest, and what is left out most or changed most for its size."""
+def extreme_targets(targets: Mapping[str, Effects]) -> dict[str, Effects]:
+    """The viewers among `targets` that are extreme in one respect, of equals the first: the widest dilation with and without compensation,
+    the narrowest dilation, and those that leave out most splats or change them most for their size."""
     respects: tuple[Callable[[Effects], tuple[float, ...]], ...] = (
         lambda effects: (0.0 if _compensates(effects) else effects.eps2d,),
         lambda effects: (effects.eps2d if _compensates(effects) else 0.0,),
@@ -35,12 +35,12 @@ def extremes(targets: Mapping[str, Effects]) -> dict[str, Effects]:
         lambda effects: (effects.settings.min_variance, effects.settings.min_contribution),
         lambda effects: (effects.settings.least_spread,),
     )
-    found = [max(targets, key=lambda name: respect(targets[name])) for respect in respects]
-    return {name: targets[name] for name in targets if name in found}
+    extremes = [max(targets, key=lambda name: respect(targets[name])) for respect in respects]
+    return {name: targets[name] for name in targets if name in extremes}
 
 
-def middle(targets: Mapping[str, Effects]) -> Effects:
-    """What a start aims at, which leads to all of `targets` from the nearest: the median dilation without compensation."""
+def median_target(targets: Mapping[str, Effects]) -> Effects:
+    """The target that a start is made for, as close as possible to all of `targets`: the one of median dilation without compensation."""
     dilating = [effects for effects in targets.values() if not _compensates(effects)] or list(targets.values())
     median = median_low(effects.eps2d for effects in dilating)
     return next(effects for effects in dilating if effects.eps2d == median)

@@ -1,4 +1,4 @@
-"""r(x) for zoom-out: an image made smaller. Which filter is part of every protocol, for two good ones differ by about 40 dB."""
+"""r(x) for zoom-out: an image is made smaller. Every protocol names its filter, because the results of two good ones differ by about 40 dB."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from mipmap_plugin.errors import SettingsError
 
 
 def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
-    """[H, W, 3] -> [size[0], size[1], 3], not clamped, differentiable.
+    """Resize an image [H, W, 3] to [size[0], size[1], 3]; not clamped, differentiable.
 
     `box`: the mean of whole blocks (P1); `area`: the same for any ratio; `bilinear`: two taps and no prefilter, as the
     paper's cv2.resize; `pil-bicubic` and `lanczos`: antialiased, equal to Pillow's on floats.
-    Raises SettingsError when `box` is asked for a ratio that is not whole.
+    Raises SettingsError for `box` with a ratio that is not a whole number.
     """
     if tuple(image.shape[:2]) == tuple(size):
         return image
@@ -23,11 +23,11 @@ def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
 
 
 def _check_box(image: Tensor, size: tuple[int, int]) -> None:
-    whole = list(image.shape[:2])
-    if any(pixels % wanted for pixels, wanted in zip(whole, size, strict=True)):
-        raise SettingsError(f"box: {whole} px is not a whole multiple of {list(size)} px; use area")
+    old = list(image.shape[:2])
+    if any(pixels % new for pixels, new in zip(old, size, strict=True)):
+        raise SettingsError(f"box: {old} px is not a whole multiple of {list(size)} px; use area")
 
 
 def difference_from(target: Tensor, image: Tensor, method: str) -> Tensor:
-    """How far `image` [H, W, 3] is from `target` [h, w, 3], at the target's size: where the truth is the base itself, the base's."""
+    """`image` [H, W, 3], resized to the size of `target` [h, w, 3], minus `target`."""
     return resize(image, (target.shape[0], target.shape[1]), method) - target

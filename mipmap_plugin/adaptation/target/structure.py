@@ -1,4 +1,4 @@
-"""Structural similarity with a gradient, pixel by pixel (Wang et al. 2004, as every splatting paper sets it)."""
+"""Differentiable structural similarity per pixel (Wang et al. 2004, with the parameters of all splatting papers)."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-# An 11 x 11 Gaussian window of sigma 1.5, and what keeps flat and dark places from dividing by nothing: (0.01, 0.03)², of images in 0..1.
+# An 11 x 11 Gaussian window of sigma 1.5, and the constants that keep the ratios finite in flat or dark areas, for images in 0..1.
 RADIUS, SIGMA = 5, 1.5
 LUMINANCE_FLOOR, CONTRAST_FLOOR = 0.01**2, 0.03**2
 
-# Beside a product of two variances: a hundredth of the floor, squared. Two flat images are 2 % more alike than they can be.
+# Added to the product of two variances, to keep its root differentiable; it is so small that flat areas come out only 2 % too similar.
 LEAST_CONTRAST = 1e-10
 
 
 def similarity(image: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """SSIM at each pixel of two images [H, W, C] in 0..1, [H, W, C], and the part of it that compares how strong their contrasts are.
+    """SSIM of two images [H, W, C] in 0..1 at each pixel, and its contrast term, both [H, W, C].
 
-    That part (Wang et al. 2004, equation 9) is 1 where both vary as much, wherever they do. Beyond their borders both are black.
+    The contrast term (Wang et al. 2004, equation 9) is 1 where both have the same local variance, whatever their structure. Images are
+    padded with black.
     """
     a, b = image.permute(2, 0, 1), truth.permute(2, 0, 1)
     mean_a, mean_b, square_a, square_b, product = _blurred(torch.stack([a, b, a * a, b * b, a * b]))
@@ -30,15 +31,15 @@ def similarity(image: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _geometric_mean(a: Tensor, b: Tensor) -> Tensor:
-    """Of variances, which rounding may leave below 0; its slope is finite where one of them is 0."""
+    """Geometric mean of variances, which rounding may leave below 0; its gradient is finite where one of them is 0."""
     return (a.clamp_min(0) * b.clamp_min(0) + LEAST_CONTRAST).sqrt()
 
 
 def _blurred(images: Tensor) -> Tensor:
-    """[..., H, W] under the window."""
+    """Blur images [..., H, W] with the window."""
     offsets = torch.arange(-RADIUS, RADIUS + 1, device=images.device, dtype=images.dtype)
     weights = torch.softmax(-offsets.square() / (2 * SIGMA**2), 0)
     channels = images.reshape(-1, *images.shape[-2:])
-    count = len(channels)  # one group each: fourteen times as fast as a batch of images with one channel
+    count = len(channels)  # a group per channel is fourteen times as fast as a batch of single-channel images
     across = conv2d(channels, weights.expand(count, 1, 1, -1), padding=(0, RADIUS), groups=count)
     return conv2d(across, weights[:, None].expand(count, 1, -1, 1), padding=(RADIUS, 0), groups=count).view(images.shape)

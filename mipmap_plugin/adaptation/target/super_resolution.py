@@ -1,4 +1,4 @@
-"""Super-resolution networks from files, by spandrel: any architecture and weights that it knows, as an upsampler."""
+"""Super-resolution networks from files as upsamplers: any architecture that spandrel supports."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from mipmap_plugin.torchvision_absent import torchvision_optional
 SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
 INSTALL = "install it with `pip install 'mipmap-plugin[sr]'`"
 
-# Larger images go through a network in tiles of this many px with this much of their surroundings, so that memory stays small.
+# Larger images are processed in tiles of this many px, with this many px of margin around each, so that memory stays small.
 TILE = 256
 MARGIN = 32
 
 
 class Network:
-    """A network as an upsampler: `network(image [H, W, 3], size) -> [size[0], size[1], 3]`, kept on disk by what goes in."""
+    """A network as an upsampler: `network(image [H, W, 3], size) -> [size[0], size[1], 3]`. Results are cached on disk."""
 
     def __init__(self, path: str | Path) -> None:
-        """Raises CheckpointError for a file that is no network, SettingsError for one that does not enlarge, PluginError without spandrel."""
+        """Raises CheckpointError if the file is not a network, SettingsError if it does not enlarge, PluginError without spandrel."""
         self.path = Path(path)
         self._network = _load(self.path)
 
@@ -47,7 +47,7 @@ class Network:
 
     @torch.no_grad()
     def _enlarged(self, image: Tensor, size: tuple[int, int]) -> Tensor:
-        """Through the network until it is large enough, then down to the exact size."""
+        """Apply the network until the image is large enough, then shrink it to the exact size."""
         network = self._network.to(image.device)
         while image.shape[0] < size[0] or image.shape[1] < size[1]:
             with _quietly():
@@ -56,36 +56,36 @@ class Network:
 
 
 def _load(path: Path) -> Any:
-    """spandrel's descriptor of the network. spandrel's own file reader is passed by, for it executes TorchScript."""
+    """Return spandrel's descriptor of the network. spandrel's own file reader is not used, because it executes TorchScript."""
     with torchvision_optional():
         try:
             import spandrel
         except ImportError as error:
-            raise PluginError(f"{path}: is a super-resolution network, which spandrel loads; {INSTALL} ({error})") from error
+            raise PluginError(f"{path}: spandrel is needed to load a super-resolution network; {INSTALL} ({error})") from error
     try:
         weights = spandrel.canonicalize_state_dict(_weights(path))
         with _quietly():
             network = spandrel.ModelLoader().load_from_state_dict(weights)
     except (spandrel.UnsupportedModelError, RuntimeError, AttributeError, KeyError, TypeError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
-        raise CheckpointError(f"{path}: is no network that spandrel knows ({reason})") from error
+        raise CheckpointError(f"{path}: not a network that spandrel supports ({reason})") from error
     if not isinstance(network, spandrel.ImageModelDescriptor) or (network.input_channels, network.output_channels) != (3, 3):
         raise SettingsError(f"{path}: {network.architecture.name} does not turn one RGB image into another; give a super-resolution network")
     if network.scale < 2:
-        raise SettingsError(f"{path}: this {network.architecture.name} network does not enlarge; give one that does")
+        raise SettingsError(f"{path}: this {network.architecture.name} network does not enlarge images; give one that does")
     return network.eval()
 
 
 @contextlib.contextmanager
 def _quietly() -> Iterator[None]:
-    """Without what the authors of networks are warned of, such as SwinIR's of torch.meshgrid: it is nothing that a user can act on."""
+    """Suppress warnings about a network's code, such as SwinIR's use of torch.meshgrid, which a user can do nothing about."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
 def _weights(path: Path) -> Any:
-    """The tensors of a file by name; nothing in it is executed."""
+    """The tensors of a file by name; no code in it is executed."""
     if path.suffix == ".safetensors":
         from safetensors import SafetensorError
         from safetensors.torch import load_file
@@ -105,16 +105,17 @@ def _is_torchscript(path: Path) -> bool:
 
 
 def _in_tiles(network: Any, image: Tensor) -> Tensor:
-    """[H, W, 3] -> [scale H, scale W, 3], whole where it is small or the architecture looks at all of it."""
+    """Apply the network to [H, W, 3] in tiles, or at once if the image is small or the architecture needs all of it: [scale H, scale W, 3]."""
     planes = image.movedim(-1, 0)[None]
     if max(planes.shape[2:]) <= TILE or network.tiling.name != "SUPPORTED":
-        return network(planes)[0].movedim(0, -1).clone()  # not an inference tensor, which no loss may use
-    height, width, times = *image.shape[:2], network.scale
-    result = image.new_empty(height * times, width * times, 3)
+        result: Tensor = network(planes)[0].movedim(0, -1).clone()  # a copy, because a loss cannot use inference tensors
+        return result
+    height, width, factor = *image.shape[:2], network.scale
+    result = image.new_empty(height * factor, width * factor, 3)
     for top in range(0, height, TILE):
         for left in range(0, width, TILE):
-            above, before = min(top, MARGIN), min(left, MARGIN)
-            part = network(planes[..., top - above : top + TILE + MARGIN, left - before : left + TILE + MARGIN])[0].movedim(0, -1)
-            spot = result[top * times : (top + TILE) * times, left * times : (left + TILE) * times]
-            spot.copy_(part[above * times :, before * times :][: spot.shape[0], : spot.shape[1]])
+            margin_y, margin_x = min(top, MARGIN), min(left, MARGIN)
+            part = network(planes[..., top - margin_y : top + TILE + MARGIN, left - margin_x : left + TILE + MARGIN])[0].movedim(0, -1)
+            tile = result[top * factor : (top + TILE) * factor, left * factor : (left + TILE) * factor]
+            tile.copy_(part[margin_y * factor :, margin_x * factor :][: tile.shape[0], : tile.shape[1]])
     return result
