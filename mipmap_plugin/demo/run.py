@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.demo.world import render_world
@@ -18,13 +20,15 @@ from mipmap_plugin.evaluation.protocols import Protocol
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 from mipmap_plugin.formats.images import write_image
+from mipmap_plugin.progress import announced
 from mipmap_plugin.scenes import read_cameras
+from mipmap_plugin.threads import side_by_side
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 PROTOCOL = Protocol("demo", "box", truncate=False)
 
-# Views judged on: each costs a ray-traced image of 640 x 640 px at x4.
-JUDGED = 3
+# Views judged on, and the share of one, along each side, that is judged at zoom-in: its true image is ray-traced.
+JUDGED, MIDDLE = 3, 1 / 2
 
 # Samples per pixel of the truth: many where pixels are large and few.
 SAMPLES = {True: 64, False: 4}  # zoomed out, zoomed in
@@ -32,11 +36,10 @@ SAMPLES = {True: 64, False: 4}  # zoomed out, zoomed in
 # Pictures are shown at this many px, so that a small image is enlarged pixel by pixel and the eye sees what a screen shows.
 SHOWN = 480
 
-# Seconds for each scale; the demo should end within three minutes, whichever backend it finds.
-BUDGET_S = 45.0
-
-# Every which training view is adapted to, one a step: where there is only the reference, the truth of a view costs as much as some steps.
-EVERY = 4
+# Seconds to adapt to each scale at most, where there is only the reference: the demo should end within three minutes. It then adapts to
+# every so many-th training view, one a step, for the truth of a view costs as much as some steps.
+REFERENCE_BUDGET_S = 45.0
+REFERENCE_EVERY = 4
 
 
 class WorldView:
@@ -64,26 +67,44 @@ def run_demo(output: Path, scales: Sequence[float], viewer: str | None = None, *
     for scale in scales:
         refuse_output(output / f"x{scale:g}.ply", overwrite, is_file=True)
         refuse_unwritable(output / f"x{scale:g}.ply")
-    views = [WorldView(camera) for camera in base.cameras if camera.split == "test"]
-    views = views[:: len(views) // JUDGED][:JUDGED]
-    train = [camera for camera in base.cameras if camera.split == "train"][::EVERY]
     rows: list[Row] = []
-    judge = Judge(views, PROTOCOL)
     for scale in scales:
+        judge = Judge(judged_views(base, scale), PROTOCOL)
         rows += training_free_rows(base, judge, scale, without=("window",), viewer=viewer)  # most of a minute a view on the reference
-        adapted = base.adapt(scale, viewer=viewer, cameras=train, views="given", views_per_step=1, resize="box", time_budget_s=BUDGET_S)
+        adapted = base.adapt(scale, viewer=viewer, resize="box", **settings_for(base))
         rows.append(adapted_row("adapted", adapted, judge))
         adapted.save(output / f"x{scale:g}.ply", overwrite=overwrite)
-        camera = views[0].camera.zoomed(scale)
-        pictures = [base.render(camera, viewer=viewer).image, adapted.render(camera).image, views[0].truth(scale, PROTOCOL)]
-        write_image(output / f"x{scale:g}_base_adapted_truth.png", side_by_side(pictures), overwrite=overwrite)
+        view = judge.views[0]
+        camera = view.camera.zoomed(scale)
+        pictures = [base.render(camera, viewer=viewer).image, adapted.render(camera).image, view.truth(scale, PROTOCOL)]
+        write_image(output / f"x{scale:g}_base_adapted_truth.png", beside_each_other(pictures), overwrite=overwrite)
     return (
         f"{table(rows)}\n\nReal dB, against the ray-traced world, over {JUDGED} views that nothing was trained or adapted on.\n"
         f"Pictures (base | adapted | truth) and checkpoints for {viewer or 'what draws as 3DGS does'}: {output.resolve()}"
     )
 
 
-def side_by_side(pictures: Sequence[Tensor]) -> Tensor:
+def judged_views(base: Wrapped, scale: float) -> list[WorldView]:
+    """Test views, of a zoom-in their middle, whose true images at `scale` are made."""
+    cameras = [camera for camera in base.cameras if camera.split == "test"]
+    cameras = cameras[:: len(cameras) // JUDGED][:JUDGED]
+    if scale > 1:
+        cameras = [camera.window(round(camera.width * MIDDLE), round(camera.height * MIDDLE)) for camera in cameras]
+    views = [WorldView(camera) for camera in cameras]
+    with announced(f"ray-tracing the truth x{scale:g}"), threads.shared(None):
+        list(side_by_side(lambda view: view.truth(scale, PROTOCOL), views, threads.count()))
+    return views
+
+
+def settings_for(base: Wrapped) -> dict[str, Any]:
+    """The recipe's own; less work where only the reference can do it."""
+    if base.backend(gradients=True)[0].name != "reference":
+        return {}
+    train = [camera for camera in base.cameras if camera.split == "train"][::REFERENCE_EVERY]
+    return dict(cameras=train, views="given", views_per_step=1, time_budget_s=REFERENCE_BUDGET_S)
+
+
+def beside_each_other(pictures: Sequence[Tensor]) -> Tensor:
     """Pictures [h, w, 3] of one size beside each other, each about SHOWN px high: small ones enlarged by whole pixels."""
     height, width = pictures[0].shape[:2]
     times = max(1, SHOWN // height)
