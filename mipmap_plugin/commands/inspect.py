@@ -21,9 +21,9 @@ def inspect(
     from mipmap_plugin.effects import explain
     from mipmap_plugin.evaluation.looks import looks
     from mipmap_plugin.models import load_model
-    from mipmap_plugin.models.anchors.model import AnchorModel
     from mipmap_plugin.models.base import effects_of
-    from mipmap_plugin.models.health import examine
+    from mipmap_plugin.models.health import examine, holds_splats
+    from mipmap_plugin.models.vanilla import VanillaModel
     from mipmap_plugin.wrap import wrap_model
 
     model = load_model(checkpoint, iteration=iteration)
@@ -38,7 +38,7 @@ def inspect(
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
         "cameras": summary(wrapped.cameras),
         "effects": [str(effect) for effect in explain(wrapped.effects(), gaussians, effects_of(model))],
-        "health": examine(model.bake(view) if isinstance(model, AnchorModel) else model).sentences() or ["nothing found"],
+        "health": examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained)).sentences() or ["nothing found"],
         "viewers": looks(wrapped) if viewers else "not asked for",
         "notes": model.notes,
     }

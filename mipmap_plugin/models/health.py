@@ -75,6 +75,11 @@ class Health:
         return [f"{count:,} of {self.splats:,} splats hold {kind} in {name}" for kind, name, count in counts if count]
 
 
+def holds_splats(model: SplatModel) -> bool:
+    """Whether the rows of a model's parameters are splats, which `examine` counts; those of anchors, for one, are not."""
+    return {"means", "scales", "quats", "opacities", "sh0", "shN"} <= model.parameters().keys()
+
+
 def examine(model: SplatModel) -> Health:
     """Examine a model whose parameters have gsplat's names (means, scales, quats, opacities, sh0, shN)."""
     raw = {name: tensor.detach() for name, tensor in model.parameters().items()}
