@@ -1,0 +1,98 @@
+"""How long a person waits: whole commands, by phase, from a cold and a warm start, on one thread and on two, beside another version of the project.
+
+    python benchmarks/wait.py DATA
+    python benchmarks/wait.py DATA --before ../checkout-of-the-version-before --scale 1/4
+
+DATA holds `checkpoints/bases/lego_200`. Each command is a process of its own, the versions take turns, and of several runs the quickest counts.
+*cold* is the first run after installation, with an empty cache of compiled kernels. Writes wait.json and wait.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from mipmap_plugin.formats.atomic import write_json
+
+HERE = Path(__file__).parents[1]
+COMMAND = "import sys; from mipmap_plugin.cli import main; sys.exit(main())"
+PHASES = ("compilation", "blend weights", "merging", "closed form", "optimization", "validation")
+INTRO = """# How long a person waits
+
+Made by `python benchmarks/wait.py DATA`: seconds of whole processes, the quickest of {runs}; the phases of the report of the same run. Two cores.
+"""
+
+
+def main(
+    data: tyro.conf.Positional[Path],
+    before: Path | None = None,
+    scale: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    runs: int = 2,
+    output: Path = HERE / "benchmarks" / "results",
+) -> None:
+    """Measure, and write the tables.
+
+    Args:
+        data: The folder with checkpoints/.
+        before: A checkout of another version, to be measured beside this one.
+        scale: Scales to adapt lego_200 to; 1/2, 1/4 and 1/8 by default.
+        runs: Runs of each, of which the quickest counts.
+        output: Where the results go.
+    """
+    versions = {"now": HERE} | ({"before": before.resolve()} if before else {})
+    base = data.resolve() / "checkpoints" / "bases" / "lego_200"
+    rows: list[dict[str, Any]] = []
+    for what, options in commands(base, scale or ("1/2", "1/4", "1/8")):
+        for threads in (1, 2) if "adapt" in what else (1,):
+            quickest: dict[str, dict[str, Any]] = {}
+            for _ in range(1 if "cold" in what else runs):
+                for version, checkout in versions.items():
+                    row = {"command": what, "version": version, "threads": threads, **timed(checkout, options, threads, cold="cold" in what)}
+                    quickest[version] = min(quickest.get(version, row), row, key=lambda measured: measured["seconds"])
+            rows += quickest.values()
+            print("\n".join(map(line, quickest.values())), flush=True)
+    write_json(output / "wait.json", rows, overwrite=True)
+    head = f"| command | version | threads | seconds | {' | '.join(PHASES)} |\n|{'---|' * (4 + len(PHASES))}"
+    (output / "wait.md").write_text("\n".join([INTRO.format(runs=runs), head, *map(line, rows), ""]))
+
+
+def commands(base: Path, scales: tuple[str, ...]) -> list[tuple[str, list[str]]]:
+    """What is run, and its options."""
+    adapted = [(f"adapt lego_200 x{scale}", ["adapt", str(base), "--scale", scale, "--json"]) for scale in scales]
+    return [
+        ("--help", ["--help"]),
+        ("inspect lego_200", ["inspect", str(base)]),
+        *adapted,
+        ("adapt lego_200 x1/8, cold", ["adapt", str(base), "--scale", "1/8", "--json"]),
+    ]
+
+
+def timed(checkout: Path, options: list[str], threads: int, *, cold: bool) -> dict[str, Any]:
+    """Seconds of one process, and of its phases where it reports any."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(threads)}
+        environment |= {"NUMBA_CACHE_DIR": folder} if cold else {}
+        output = ["--output", str(Path(folder, "adapted"))] if options[0] == "adapt" else []
+        command = [sys.executable, "-c", COMMAND, *options, *output]
+        began = time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder, check=True)
+        seconds = time.perf_counter() - began
+    report = json.loads(done.stdout)[0] if options[0] == "adapt" else {}
+    return {"seconds": seconds, "phases": report.get("seconds", {}), "validation": report.get("validation", {})}
+
+
+def line(row: dict[str, Any]) -> str:
+    phases = (f"{row['phases'][name]:.1f}" if name in row["phases"] else "" for name in PHASES)
+    return f"| {row['command']} | {row['version']} | {row['threads']} | {row['seconds']:.1f} | {' | '.join(phases)} |"
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
