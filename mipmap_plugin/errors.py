@@ -1,20 +1,20 @@
-"""One exception tree: every error a user can cause is a `MipmapPluginError` whose text says what, where and what to do."""
+"""The exceptions. Every error that a user can cause is a `MipmapPluginError`, whose message says what is wrong, where, and what to do."""
 
 
-# Letters of a sentence at most. A damaged file that is quoted may have megabytes in place of a name or a number.
-LONGEST = 1500
+# Maximum characters of a message. A damaged file that it quotes may have megabytes in place of a name or a number.
+MAX_LENGTH = 1500
 
 
 class MipmapPluginError(Exception):
-    """Base of all errors that the command line turns into one sentence and exit code 2. Of a long one, its beginning and its end are told."""
+    """Base of all errors that the command line prints in one sentence, with exit code 2. Long messages are cut in the middle."""
 
     def __str__(self) -> str:
         text = super().__str__()
-        return text if len(text) <= LONGEST else f"{text[: 2 * LONGEST // 3]} ... {text[-LONGEST // 4 :]}"
+        return text if len(text) <= MAX_LENGTH else f"{text[: 2 * MAX_LENGTH // 3]} ... {text[-MAX_LENGTH // 4 :]}"
 
 
 class CheckpointError(MipmapPluginError, ValueError):
-    """A checkpoint that cannot be read, or not in the way that was asked."""
+    """A checkpoint that cannot be read, or not in the requested way."""
 
 
 class SceneError(MipmapPluginError, ValueError):
@@ -22,24 +22,24 @@ class SceneError(MipmapPluginError, ValueError):
 
 
 class ShapeError(MipmapPluginError, ValueError):
-    """Tensors that do not fit together."""
+    """Tensors whose shapes do not match."""
 
 
 class SettingsError(MipmapPluginError, ValueError):
-    """A request that cannot be served as it was put."""
+    """A request with invalid or conflicting settings."""
 
 
 class BackendUnavailable(MipmapPluginError, ImportError):
-    """No backend can serve a request; the text holds each backend's reasons."""
+    """No backend can serve a request; the message holds each backend's reasons."""
 
 
 class PluginError(MipmapPluginError, ImportError):
-    """A registered name whose target does not import or does not fit."""
+    """A registered plug-in that cannot be imported or does not follow its contract."""
 
 
 class OutputError(MipmapPluginError, OSError):
-    """An output that the system refuses to write: a full disk, a missing permission."""
+    """An output that cannot be written: a full disk, a missing permission."""
 
 
 class OutputExists(MipmapPluginError, FileExistsError):
-    """An output that is already there and was not to be overwritten."""
+    """An output that exists already and must not be overwritten."""

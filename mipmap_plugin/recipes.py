@@ -12,20 +12,20 @@ from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.limits import check_scale
 from mipmap_plugin.registry import Registry
 
-# The settings, by the names of AdaptConfig, at a scale; and whether a network enlarges the base's images.
+# (scale, whether the upsampler is a network) -> settings, by the names of AdaptConfig.
 Recipe = Callable[[float, bool], Mapping[str, Any]]
 
-# Upsamplers that know nothing that the base does not.
-KERNELS = frozenset({"bicubic", "lanczos"})
+# Upsamplers that interpolate, and add no detail to the base's images.
+INTERPOLATIONS = frozenset({"bicubic", "lanczos"})
 
-# Of a zoom-out's splats, times the scale, is left; nearer to the base, where fewer share a pixel, twice the scale's square.
+# A zoom-out keeps this fraction of the splats, times the scale; at scales near 1, where fewer share a pixel, twice the square of the scale.
 MERGE_TO = 0.8
 
-# Share of the base scale below which rates are whole. Nearer to the base there is less to learn, and steps are shorter by as much.
-WHOLE_RATES = 0.25
+# The scale up to which a zoom-out uses its full learning rates. Above it there is less to learn, and rates fall as 1 / scale.
+FULL_RATES_SCALE = 0.25
 
-# The published code of Mipmap-GS (renaissanceee/Mipmap-GS): every quirk a named setting. Its centers never move, because its loader leaves
-# the rate's factor at 0.
+# The published code of Mipmap-GS (renaissanceee/Mipmap-GS), with a named setting for each of its quirks. Its means never move, because its
+# loader leaves the factor of their learning rate at 0.
 PAPER = dict(
     returns="last", views="given", steps=1000, resize="bilinear", upsampler="bicubic", quantize_truth=True, closed_form=False, rates=LearningRates(),
     densify_gradient=2e-4, reset_opacity_at=2,
@@ -54,22 +54,22 @@ THOROUGH_UPSAMPLED = dict(
 
 
 def default(scale: float, network: bool) -> dict[str, Any]:
-    """What suits most: minutes at most, and the closed form first."""
-    return DEFAULT_OUT | _fitted(scale) if scale < 1 else DEFAULT_UPSAMPLED if network else DEFAULT_IN
+    """For most uses: closed form, merging and a short optimization, minutes at most."""
+    return DEFAULT_OUT | _zoom_out_settings(scale) if scale < 1 else DEFAULT_UPSAMPLED if network else DEFAULT_IN
 
 
 def thorough(scale: float, network: bool) -> dict[str, Any]:
-    """What more time buys; at zoom-in there is nothing to buy without a network."""
-    return THOROUGH_OUT | _fitted(scale) if scale < 1 else THOROUGH_UPSAMPLED if network else DEFAULT_IN
+    """Better quality in several times the time; at zoom-in without a network the same as `default`."""
+    return THOROUGH_OUT | _zoom_out_settings(scale) if scale < 1 else THOROUGH_UPSAMPLED if network else DEFAULT_IN
 
 
 def paper(scale: float, network: bool) -> dict[str, Any]:
-    """What the published code of Mipmap-GS does, at every scale."""
+    """The published method of Mipmap-GS with its settings, at every scale, for comparison."""
     return PAPER
 
 
 def instant(scale: float, network: bool) -> dict[str, Any]:
-    """The closed form alone."""
+    """The closed form alone, without optimization: seconds."""
     return dict(steps=0)
 
 
@@ -77,34 +77,34 @@ RECIPES = Registry("mipmap_plugin.recipes", {name: f"mipmap_plugin.recipes:{name
 
 
 def register_recipe(name: str, target: Recipe | str, *, replace: bool = False) -> None:
-    """Add a function `(scale, network) -> settings` under `name`, or `"package.module:function"`. Raises SettingsError."""
+    """Register a function `(scale, network) -> settings`, or `"package.module:function"`, under `name`. Raises SettingsError."""
     RECIPES.add(name, target, replace=replace)
 
 
 def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
-    """The settings of a recipe at `scale`, with `overrides`.
+    """Return the settings of a recipe at `scale`, with `overrides`.
 
-    Raises SettingsError for an unknown name or a value out of range, PluginError for a stranger's recipe that fails.
+    Raises SettingsError for an unknown name or a value out of range, PluginError for a third-party recipe that fails.
     """
     check_scale(scale)
     if name not in RECIPES.names():
-        raise SettingsError(f"there is no recipe {name!r}; known are {', '.join(RECIPES.names())}")
-    found = RECIPES.get(name)
-    if not callable(found):
-        raise PluginError(f"recipe {name!r} is of type {type(found).__name__}; make it a function (scale, network) -> settings")
+        raise SettingsError(f"there is no recipe {name!r}; choose from {', '.join(RECIPES.names())}")
+    function = RECIPES.get(name)
+    if not callable(function):
+        raise PluginError(f"recipe {name!r} is of type {type(function).__name__}; make it a function (scale, network) -> settings")
     try:
-        settings = {**found(scale, str(overrides.get("upsampler", "bicubic")) not in KERNELS)}
-    except Exception as error:  # a stranger's code may fail in any way
-        raise PluginError(f"recipe {name!r} gives no settings at x{scale:g}: {type(error).__name__}: {error}") from error
+        settings = {**function(scale, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)}
+    except Exception as error:  # third-party code may fail in any way
+        raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
     try:
         return AdaptConfig(**{"recipe": name, **settings, **overrides})
     except ValidationError as error:
         raise SettingsError("; ".join(f"setting {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())) from None
 
 
-def _fitted(scale: float) -> dict[str, Any]:
-    """The settings of a zoom-out that follow from its scale."""
-    share = min(1.0, WHOLE_RATES / scale)
-    of_splats = ("means", "scales", "quats", "opacities", "sh0", "shN")  # what anchors and networks learn is not known to want it
-    rates = RATES_OUT.model_copy(update={name: share * getattr(RATES_OUT, name) for name in of_splats})
+def _zoom_out_settings(scale: float) -> dict[str, Any]:
+    """The settings of a zoom-out that depend on the scale."""
+    factor = min(1.0, FULL_RATES_SCALE / scale)
+    splat_rates = ("means", "scales", "quats", "opacities", "sh0", "shN")  # not those of anchors and networks, which were not tested with it
+    rates = RATES_OUT.model_copy(update={name: factor * getattr(RATES_OUT, name) for name in splat_rates})
     return {"merge_to": min(1.0, scale * max(MERGE_TO, 2 * scale)), "rates": rates}

@@ -1,4 +1,4 @@
-"""Names in, objects out at first use: built-ins as strings, strangers through `add` or an entry point."""
+"""Plug-ins by name, imported at first use: built-in ones, and third-party ones through `add` or an entry point."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mipmap_plugin.errors import PluginError, SettingsError
 
 
 class Registry:
-    """Objects by name, imported only when asked for.
+    """Objects by name, imported only when they are used.
 
-    A target is `"package.module:Name"` or the object itself. Names from the entry-point group are seen too; a name
-    registered here wins over an installed one, so that no package can shadow a built-in.
+    A target is `"package.module:Name"` or the object itself. Names of the entry-point group are included; a name
+    registered here takes precedence over an installed one, so that no package can shadow a built-in.
     """
 
     def __init__(self, group: str, builtins: Mapping[str, Any]) -> None:
@@ -23,14 +23,14 @@ class Registry:
         self._targets: dict[str, Any] = dict(builtins)
 
     def add(self, name: str, target: Any, *, replace: bool = False) -> None:
-        """Register `target` under `name`. Raises SettingsError when another target has the name already."""
+        """Register `target` under `name`. Raises SettingsError if another target has the name already."""
         if not replace and self._targets.get(name, target) != target:
             raise SettingsError(f"{self.group}: the name {name!r} is taken; pass replace=True to override it")
         self._targets[name] = target
 
     @contextmanager
     def temporarily(self, **targets: Any) -> Iterator[None]:
-        """Register `targets` by name until the block ends, whatever had these names; then everything is as it was before."""
+        """Register `targets` by name until the block ends, replacing others of these names; then restore the registry."""
         before, self._targets = self._targets, {**self._targets, **targets}
         try:
             yield
@@ -42,9 +42,9 @@ class Registry:
         return sorted({*self._targets, *self._installed()})
 
     def get(self, name: str) -> Any:
-        """The object behind `name`. Raises SettingsError for an unknown name, PluginError for a broken target."""
+        """Return the object of that name. Raises SettingsError for an unknown name, PluginError for a broken target."""
         if name not in self._targets and name not in self._installed():
-            raise SettingsError(f"{self.group}: there is no {name!r}; known are {', '.join(self.names())}")
+            raise SettingsError(f"{self.group}: there is no {name!r}; choose from {', '.join(self.names())}")
         target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target
 
@@ -53,8 +53,9 @@ class Registry:
 
 
 def load_target(name: str, target: str) -> Any:
+    """Import `"package.module:Name"`. Raises PluginError."""
     module, _, attribute = target.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # a stranger's module may fail in any way; one broken plugin must not break the others
+    except Exception as error:  # a third-party module may fail in any way; one broken plug-in must not break the others
         raise PluginError(f"{name!r} ({target}) cannot be loaded: {type(error).__name__}: {error}") from error

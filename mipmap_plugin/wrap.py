@@ -1,4 +1,4 @@
-"""wrap_model(model).adapt(scale): test-time adaptation as a wrapper. What is wrapped never changes."""
+"""wrap_model(model).adapt(scale): test-time adaptation as a wrapper. The wrapped model never changes."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 
-class Drawn(TypedDict, total=False):
-    """What a view is drawn with besides."""
+class RenderOptions(TypedDict, total=False):
+    """Further options of `Wrapped.render`."""
 
-    viewer: str | None  # as that viewer draws it, instead of a screen filter: without a filter_3D that it does not read
-    filter_3d: bool  # every splat is smoothed first by what the cameras could see of it at best (Mip-Splatting's 3D filter)
-    outputs: Sequence[str]  # "depth" and "normals", beside the image (`Rendered`)
-    exposure: bool  # the colors become those of the photograph that the camera is named after, where exposure.json has them
+    viewer: str | None  # render as this viewer does, instead of with a screen filter; without a filter_3D if it does not read it
+    filter_3d: bool  # first smooth every splat to the finest detail that the cameras could resolve (Mip-Splatting's 3D filter)
+    outputs: Sequence[str]  # "depth" and "normals", besides the image (`Rendered`)
+    exposure: bool  # apply the exposure of the photograph that the camera is named after, if exposure.json has it
 
 
 class Wrapped:
@@ -61,19 +61,19 @@ class Wrapped:
         self.background = trained.background or (0.0, 0.0, 0.0)
 
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
-        """How this model is rendered at `scale`, or by the viewer of that name (`viewers`).
+        """How this model is rendered at `scale`, or by the viewer of that name (`splatting.viewers`).
 
-        `screen_filter`: None for what it was trained with, a filter's name, or "scaled" for the training-free filter
-        whose dilation keeps its size in the world. The filters that integrate over the pixel see splats so dilated too: a
-        classic model was trained to look right with it. Raises SettingsError for an unknown viewer, and for one and a filter.
+        `screen_filter`: None for the filter of its training, a filter's name, or "scaled" for the training-free filter whose dilation
+        keeps its size in the world. Filters that integrate over the pixel dilate splats in this way too, because a classic model was
+        trained to look right with dilation. Raises SettingsError for an unknown viewer, and for a viewer together with a filter.
         """
         trained = self.trained
         degree = self._needs.sh_degree
         if viewer is not None:
             if screen_filter is not None:
                 raise SettingsError(f"viewer {viewer} has a screen filter of its own; leave the screen filter {screen_filter} out")
-            render_model = Effects(degree, background=self.background, supersampling=supersampling, near_plane=trained.near_plane)
-            return find_viewer(viewer).effects(render_model)
+            plain = Effects(degree, background=self.background, supersampling=supersampling, near_plane=trained.near_plane)
+            return find_viewer(viewer).effects(plain)
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
@@ -83,13 +83,13 @@ class Wrapped:
         return Effects(degree, screen_filter, eps2d, self.background, supersampling, trained.near_plane)
 
     def backend(self, *, gradients: bool = False, screen_filter: str | None = None, viewer: str | None = None) -> tuple[Backend, str]:
-        """The backend that serves this model, and why it was taken."""
+        """Return the backend that renders this model, and why it was chosen."""
         effects = self.effects(screen_filter=screen_filter, viewer=viewer)
         needs = replace(self._needs, gradients=gradients, screen_filter=effects.screen_filter, settings=effects.settings)
         return choose_backend(self._backend, needs)
 
     def lacks(self, screen_filter: str) -> str:
-        """Why what renders this model does not have a screen filter, in a sentence; empty where it does."""
+        """Why this model's backend does not have a screen filter, in a sentence; "" if it does."""
         try:
             self.backend(screen_filter=screen_filter)
         except BackendUnavailable as error:
@@ -102,26 +102,27 @@ class Wrapped:
         scale: float = 1.0,
         screen_filter: str | None = None,
         supersampling: int = 1,
-        **drawn: Unpack[Drawn],
+        **options: Unpack[RenderOptions],
     ) -> Rendered:
-        """The base model's view of `camera`, which is taken to sample `scale` times as finely as training did.
+        """Render the base model's view of `camera`, which samples `scale` times as finely as the training did.
 
-        `screen_filter`: as of `effects`. `supersampling`: samples a pixel along each side. `drawn`: see `Drawn`. Raises SettingsError.
+        `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: see `RenderOptions`. Raises
+        SettingsError.
         """
-        viewer, exposure = drawn.get("viewer"), drawn.get("exposure", False)
+        viewer, exposure = options.get("viewer"), options.get("exposure", False)
         check_scale(scale)
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
-        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(drawn.get("outputs", ())), exposure=exposure)
+        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(options.get("outputs", ())), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
-        form = self._smoothed if drawn.get("filter_3d") else None
+        form = self._smoothed if options.get("filter_3d") else None
         return render_model(self._read_by(viewer), backend, camera, effects, form)
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
-        """Raises SettingsError where no splat can be smoothed, or nothing says by how much."""
+        """Apply Mip-Splatting's 3D filter. Raises SettingsError without cameras, and for splats that it cannot be applied to."""
         if not self.cameras:
-            raise SettingsError("the 3D filter follows from the cameras, and this checkpoint has none; give --cameras")
+            raise SettingsError("the 3D filter is computed from the cameras, and this checkpoint has none; give --cameras")
         if gaussians.covariances is not None or self.model.traits.filtered:
-            raise SettingsError(f"{self.model.family}: its splats have no scales of their own, or a 3D filter already; leave filter_3d out")
+            raise SettingsError(f"{self.model.family}: its splats have covariances instead of scales, or a 3D filter already; leave filter_3d out")
         scales, opacities = smooth_3d(gaussians.scales, gaussians.opacities, filter_3d_of(gaussians.means, self.cameras))
         return replace(gaussians, scales=scales, opacities=opacities)
 
@@ -137,92 +138,94 @@ class Wrapped:
         images: Scene | None = None,
         **settings: Any,
     ) -> Adapted:
-        """A new model for `scale` (target focal length in px over base focal length in px); the base stays as it is.
+        """Return a new model for `scale` (target focal length in px over base focal length in px); the base does not change.
 
-        `viewer`: what the file is to be opened in (`viewers`), or "portable" for all that are built in at once; by default what draws it as its
-        training did, but without compensation.
-        `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override the recipe's, by the names
-        of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to go on from if it exists; Ctrl-C writes it
-        and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` sees the model before
-        the first step and after each.
-        `images`: a scene whose training images are the truth of a zoom-in, instead of what the base shows of them.
+        `viewer`: the viewer that the file will be opened in (`splatting.viewers`), or "portable" for all built-in ones at once; by
+        default any viewer that renders as the training did, but without compensation.
+        `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override those of the recipe, by the names
+        of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to continue from if it exists; Ctrl-C writes it
+        and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` is called with the model
+        before the first step and after each step.
+        `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
         Raises SettingsError and BackendUnavailable.
         """
         check_scale(scale)
         model = cast(Filtered, self.model).fused() if viewer is not None and self.model.traits.filtered else self.model
         if not model.traits.same_for_all_views and settings.setdefault("merge_to", 1.0) < 1:
-            raise SettingsError(f"{model.family}: its splats belong to a view, a moment or a filter, so none are merged; leave merge_to out")
+            raise SettingsError(f"{model.family}: its splats differ by view or time, or have a 3D filter, so none are merged; leave merge_to out")
         if images is not None and self.model.traits.exposures.changed:
-            raise SettingsError("the images were exposed differently, which adapting to them does not know (exposure.json); leave them out")
+            raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
         if len(targets) > 1:
             config = make_config(recipe, scale, **(settings_for_several(config) | settings))
-        real = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
+        photographs = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
-            cameras = real.cameras if real else self.cameras
-        needs = [replace(self._needs, gradients=True, screen_filter=each.screen_filter, settings=each.settings) for each in targets.values()]
-        differentiates = config.steps > 0 or config.merge_to < 1
-        backend, why = choose_backend(self._backend, *(replace(each, gradients=differentiates) for each in needs), self._needs)
+            cameras = photographs.cameras if photographs else self.cameras
+        needs = [replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
+        needs_gradients = config.steps > 0 or config.merge_to < 1
+        backend, note = choose_backend(self._backend, *(replace(need, gradients=needs_gradients) for need in needs), self._needs)
+        has_gradients = not any(backend.lacking(need) for need in needs)
         if config.steps:
             largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
-        read = self._read_by(viewer)
-        given = model if read is self.model else read
-        request = AdaptationRequest(model, self.effects(), targets, viewer, backend, why, not any(backend.lacking(each) for each in needs), given)
+        in_viewer = self._read_by(viewer)
+        base_in_viewer = model if in_viewer is self.model else in_viewer
+        request = AdaptationRequest(model, self.effects(), targets, viewer, backend, note, has_gradients, base_in_viewer)
         with threads.shared(self.threads):
-            return Session(request, scale, config, list(cameras), real).run(None if resume is None else Path(resume), observe)
+            return Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
-        """Raise what saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be known, before any work."""
+        """Raise now the error that saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be predicted."""
         report, source = named(path).with_name(named(path).name + REPORT), self.model.source
         parts = parts_of(source, self.model.folder)
         model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
         model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
-        for beside in (report, state_path(path)):
-            refuse_output(beside, True, parts, is_file=True)
+        for file in (report, state_path(path)):
+            refuse_output(file, True, parts, is_file=True)
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 
     def targets(self, viewer: str | None) -> dict[str, Effects]:
-        """How each viewer that an adapted file for `viewer` is for renders it; several where that is `portable`, one named "" where it is None.
+        """How an adapted file for `viewer` is rendered, by viewer: several for "portable", and one named "" for None.
 
-        Raises SettingsError for a viewer of splats that no viewer draws.
+        Raises SettingsError for a model whose splats no viewer renders.
         """
         if viewer is None:
             return {"": self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)}
-        if why := why_no_viewer(self.model):
-            raise SettingsError(f"{self.model.family}: {why}; leave the viewer {viewer} out")
-        return {each: self.effects(viewer=each) for each in viewers_for(viewer)}
+        if reason := why_no_viewer(self.model):
+            raise SettingsError(f"{self.model.family}: {reason}; leave the viewer {viewer} out")
+        return {name: self.effects(viewer=name) for name in viewers_for(viewer)}
 
     def target(self, viewer: str | None) -> Effects:
-        """How the adapted file is rendered. Raises SettingsError as `targets` does, and for a name that stands for several viewers."""
+        """How the adapted file is rendered. Raises SettingsError as `targets` does, and for the name of a group of viewers."""
         if viewer is not None:
             find_viewer(viewer)
         return self.targets(viewer)[viewer or ""]
 
     def _read_by(self, viewer: str | None) -> SplatModel:
-        """The base as a viewer reads its file."""
-        reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(each).filter_3d for each in viewers_for(viewer))
+        """The base as a viewer reads its file: without its 3D filter if the viewer does not read it."""
+        reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(name).filter_3d for name in viewers_for(viewer))
         return self.model if reads_all else cast(Filtered, self.model).bare()
 
     def views(self) -> list[Camera]:
-        """The checkpoint's cameras, or a generated orbit where it came without any."""
+        """The checkpoint's cameras, or a generated orbit if it came without any."""
         return self.cameras or choose_views([], self.model.parameters()["means"], AdaptConfig())[0]
 
     def place(self, scene: Scene) -> Scene:
-        """The scene as the model was trained on it (`placed`); its cameras become those of a checkpoint that came without any."""
-        here = placed(self.model, scene)
-        if here is not scene and not self.cameras:
-            self.cameras = list(here.cameras)
-        return here
+        """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""
+        in_frame = placed(self.model, scene)
+        if in_frame is not scene and not self.cameras:
+            self.cameras = list(in_frame.cameras)
+        return in_frame
 
     @cached_property
     def _needs(self) -> Needs:
-        """What the base asks of a backend; asked once, for the base never changes."""
+        """What the base needs of a backend; computed once, because the base never changes."""
         with torch.no_grad():
             gaussians = self.model.gaussians(self.any_camera())
         return Needs.of(gaussians, Effects(gaussians.used_sh_degree(), self.trained.screen_filter), gradients=False)
 
     def any_camera(self) -> Camera:
+        """One of the cameras, or a camera of one pixel if there are none."""
         return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 
@@ -237,20 +240,20 @@ def wrap_model(
 ) -> Wrapped:
     """Wrap a loaded model, the checkpoint at a path, or another project's live model, which is copied (`models.live.adopt`).
 
-    A checkpoint is taken to the GPU where a backend serves it there (`backends.device_for`); a model stays where it is.
+    A checkpoint is loaded to the GPU if a backend serves it there (`backends.device_for`); a model stays on its device.
 
-    `cameras`: views of the scale it was trained at, or the scene that it was trained on; by default those beside the
-    checkpoint. `background`: linear RGB; by default what the checkpoint says, else black. `screen_filter`: what it was trained
-    with, where its files do not say ("classic", "antialiased", "mip", "analytic"). `threads`: to adapt with; by default as many as torch has.
-    The result does not depend on it. Raises CheckpointError, SceneError, and
-    SettingsError for an unknown filter or an object that is no model.
+    `cameras`: views of the scale of its training, or the scene that it was trained on; by default those beside the checkpoint.
+    `background`: linear RGB; by default that of the checkpoint, or else black. `screen_filter`: the filter that it was trained with, if
+    its files do not say ("classic", "antialiased", "mip", "analytic"). `threads`: to adapt with; by default as many as torch has. The
+    result does not depend on it. Raises CheckpointError, SceneError, and SettingsError for an unknown filter or an object that is not a
+    model.
     """
     color = None if background is None else check_background(background)
     model = _loaded(model, backend) if isinstance(model, (str, Path)) else adopt(model)
     trained = replace(model.trained, background=color or model.trained.background)
     if screen_filter is not None:
         if screen_filter not in USUAL_EPS2D:
-            raise SettingsError(f"there is no screen filter {screen_filter!r}; known are {', '.join(USUAL_EPS2D)}")
+            raise SettingsError(f"there is no screen filter {screen_filter!r}; choose from {', '.join(USUAL_EPS2D)}")
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
     if isinstance(cameras, Scene):
         cameras = placed(model, cameras).cameras
@@ -263,7 +266,7 @@ def _loaded(path: str | Path, backend: str) -> SplatModel:
 
 
 def placed(model: SplatModel, scene: Scene) -> Scene:
-    """The scene as the model was trained on it: gsplat and splatfacto have a frame and a size of their own. Raises SceneError."""
+    """The scene in the frame that the model was trained in: gsplat and splatfacto transform it. Raises SceneError."""
     if not model.traits.placed:
         return scene
     scene = scene.original()
@@ -272,11 +275,11 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
 
 
 def state_path(output: Path) -> Path:
-    """Where the state of a run is kept whose model is to be saved to `output`."""
+    """The path of the state of a run whose model is to be saved to `output`."""
     output = named(output)
     return output.with_name(output.name + ".resume")
 
 
 def own_cameras(model: SplatModel) -> list[Camera]:
-    """The cameras beside the model's file, at the size that it was trained at; empty where there are none."""
+    """The cameras beside the model's file, at the image size of its training; empty if there are none."""
     return model_cameras(model.folder, read_options(model.folder)[0])

@@ -385,14 +385,14 @@ def test_splats_with_ends_of_every_range_stay_finite():
 
 @pytest.mark.parametrize("scale", [0, -1, float("inf"), float("nan")])
 def test_a_scale_that_is_no_zoom_is_refused(scale):
-    with pytest.raises(SettingsError, match=f"scale {scale} is no zoom; give a number from 1e-09 to 10000, such as 0.25 or 4"):
+    with pytest.raises(SettingsError, match=f"scale must be from 1e-09 to 10000, such as 0.25 or 4, got {scale}"):
         wrapped().adapt(scale)
 
 
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        (dict(recipe="best"), "there is no recipe 'best'; known are default, instant, paper, thorough"),
+        (dict(recipe="best"), "there is no recipe 'best'; choose from default, instant, paper, thorough"),
         (dict(stepz=3), "setting stepz: Extra inputs are not permitted"),
         (dict(steps=-1), "setting steps: Input should be greater than or equal to 0"),
         (dict(resize="nearest"), "setting resize: Input should be 'box'"),
@@ -410,7 +410,7 @@ def test_settings_that_cannot_be_served_are_refused_in_a_sentence(settings, sent
 
 
 def test_an_unknown_backend_and_one_that_cannot(monkeypatch):
-    with pytest.raises(SettingsError, match="there is no 'gpu'; known are"):
+    with pytest.raises(SettingsError, match="there is no 'gpu'; choose from"):
         wrap_model(tiny.model(5), cameras=tiny.cameras(), backend="gpu").adapt(4)
     monkeypatch.setattr(ReferenceBackend, "lacking", lambda self, needs: ["it has no gradients"] if needs.gradients else [])
     assert wrapped().adapt(4, recipe="instant").report.ended_by == "0 steps"  # which needs none

@@ -138,7 +138,7 @@ def test_the_report_says_what_was_enlarged(upsampler):
     report = adapted("mine", steps=2, upsampled_views=4).report
     assert report.views == "the 6 train views, 4 of them upsampled"
     assert "and mine fused with it" in report.filters
-    assert any("mine adds detail that the base's image has not" in str(effect) for effect in report.effects)
+    assert any("mine adds detail that the base's image does not have" in str(effect) for effect in report.effects)
     assert report.seconds["upsampling"] > 0
 
 

@@ -103,7 +103,7 @@ def test_asking_by_name():
     assert (type(backend), why) == (ReferenceBackend, "reference: requested")
     with pytest.raises(BackendUnavailable, match="backend 'fussy' cannot do this: it is not in the mood; nor will it be"):
         choose_backend("fussy", NEEDS)
-    with pytest.raises(SettingsError, match=r"mipmap_plugin\.backends: there is no 'gpu'; known are fussy, reference"):
+    with pytest.raises(SettingsError, match=r"mipmap_plugin\.backends: there is no 'gpu'; choose from fussy, reference"):
         choose_backend("gpu", NEEDS)
 
 

@@ -127,7 +127,7 @@ def test_a_name_that_is_taken_is_refused_unless_replaced(image):
 
 
 def test_an_unknown_upsampler_is_refused_with_the_known_ones():
-    with pytest.raises(SettingsError, match=r"there is no 'swin'; known are bicubic, lanczos"):
+    with pytest.raises(SettingsError, match=r"there is no 'swin'; choose from bicubic, lanczos"):
         UPSAMPLERS.get("swin")
 
 

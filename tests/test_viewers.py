@@ -486,7 +486,7 @@ def test_supersplat_is_playcanvas_and_every_record_is_under_its_name():
 
 
 def test_an_unknown_viewer_is_told_the_known_ones():
-    with pytest.raises(SettingsError, match=r"there is no 'sparks'; known are antialiased, .*, spark, supersplat"):
+    with pytest.raises(SettingsError, match=r"there is no 'sparks'; choose from antialiased, .*, spark, supersplat"):
         find_viewer("sparks")
 
 
@@ -572,4 +572,4 @@ def test_the_command_draws_as_a_viewer(tmp_path, capsys):
     assert list((tmp_path / "out").glob("*.png"))
     words[-1] = "superspalt"
     assert cli.main([*words, "--overwrite"]) == 2
-    assert "there is no 'superspalt'; known are" in capsys.readouterr().err
+    assert "there is no 'superspalt'; choose from" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.limits import mixed
+from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.scenes.trajectories import ORBIT_FOV, jittered, orbit
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
@@ -40,7 +40,7 @@ class ViewSchedule:
             return [self._rounds(first + number) for number in range(count)]
         before, after = self._introduced(pace - 1), self._introduced(pace)
         new = range(before, min(after, before + count))
-        generator = torch.Generator().manual_seed(mixed(self._seed, step))
+        generator = torch.Generator().manual_seed(derived_seed(self._seed, step))
         repeated = torch.randperm(before, generator=generator)[: count - len(new)].tolist()
         return [self._rounds(draw) for draw in (*new, *repeated)]
 
@@ -73,7 +73,7 @@ class ShuffledRounds:
         """The `draw`-th view since the beginning of the run."""
         round_number, position = divmod(draw, len(self.views))
         if round_number != self._round:
-            generator = torch.Generator().manual_seed(mixed(self._seed, round_number))
+            generator = torch.Generator().manual_seed(derived_seed(self._seed, round_number))
             self._round, self._order = round_number, torch.randperm(len(self.views), generator=generator).tolist()
         return self.views[self._order[position]]
 

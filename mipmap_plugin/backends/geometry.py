@@ -57,5 +57,5 @@ def facing(gaussians: Gaussians, camera: Camera) -> Tensor:
 def _blended(backend: Backend, gaussians: Gaussians, colors: Tensor, camera: Camera, effects: Effects) -> Rendered:
     """Render with `colors` [N, 3], which are not negative, over black."""
     colored = replace(gaussians, sh=(colors - 0.5)[:, None] / C0)
-    plain = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=effects.settings.of_any_color())
+    plain = replace(effects, sh_degree=0, background=(0.0, 0.0, 0.0), settings=effects.settings.without_color_rounding())
     return supersample.render(backend, colored, camera, plain)

@@ -17,7 +17,7 @@ from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 if TYPE_CHECKING:
     from mipmap_plugin.backends.base import Rendered
     from mipmap_plugin.camera import Camera
-    from mipmap_plugin.wrap import Drawn, Wrapped
+    from mipmap_plugin.wrap import RenderOptions, Wrapped
 
 
 def render(
@@ -68,7 +68,7 @@ def render(
     if exposure:
         for camera in views:
             wrapped.model.traits.exposures.of(camera)  # before anything is written
-    drawn: Drawn = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
+    drawn: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
     for camera, picture in zip(views, pictures, strict=True):
         _write(picture, wrapped.render(camera.zoomed(scale), scale, asked, supersampling, **drawn), outputs, overwrite)
     print(f"{len(views)} pictures in {output}")

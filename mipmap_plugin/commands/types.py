@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.limits import LEAST_SCALE, MOST_SCALE
+from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 
 
 def read_scale(text: str) -> float:
@@ -19,8 +19,8 @@ def read_scale(text: str) -> float:
         scale = float(Fraction(text))
     except (ValueError, ZeroDivisionError, OverflowError):
         scale = 0.0
-    if not LEAST_SCALE <= scale <= MOST_SCALE:
-        raise ValueError(f"{text} is no zoom; give a number from {LEAST_SCALE:g} to {MOST_SCALE:g}, such as 1/4 or 4")
+    if not MIN_SCALE <= scale <= MAX_SCALE:
+        raise ValueError(f"scale must be from {MIN_SCALE:g} to {MAX_SCALE:g}, such as 1/4 or 4, got {text}")
     return scale
 
 

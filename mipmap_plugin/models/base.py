@@ -42,7 +42,7 @@ class Traits:
     placed: bool = False  # trained in a coordinate frame or at an image size of its own: the model has `as_trained`
     no_viewer: str = ""  # why no viewer (`viewers`) can draw the splats, a sentence without a full stop; empty if one can
     exposures: Exposures = NO_EXPOSURES  # the trained color transformation of each photograph
-    effects: tuple[Effect, ...] = ()  # those of `effects.OF_OTHER_MODELS` that the model simulates
+    effects: tuple[Effect, ...] = ()  # those of `effects.MODEL_EFFECTS` that the model simulates
 
 
 # Allowed names of parameters, each with a learning rate of its own (`config.LearningRates`). The first is required.

@@ -15,7 +15,7 @@ from tiny import with_bands
 
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation.report import Report
-from mipmap_plugin.effects import OF_OTHER_MODELS, Effect, Effects, Packing, RenderSettings, explain
+from mipmap_plugin.effects import MODEL_EFFECTS, Effect, Effects, Packing, RenderSettings, explain
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel, load_mip
@@ -35,29 +35,29 @@ def told(effects: Effects, splats: Gaussians) -> dict:
 def test_a_plain_scene_calls_for_the_screen_filter_only():
     assert told(Effects(sh_degree=0), with_bands(0, 3)) == {
         "view-dependent geometry": (False, "the splats are the same for every camera"),
-        "levels of detail": (False, "every splat is there at every distance"),
-        "time": (False, "nothing moves"),
+        "levels of detail": (False, "all splats are used at every distance"),
+        "time": (False, "the scene does not move"),
         "appearance embedding": (False, "all views share one appearance"),
         "exposure": (False, "the checkpoint has none"),
-        "3D filter": (False, "no splat has one"),
+        "3D filter": (False, "splats have no 3D filter"),
         "view-dependent color": (False, "SH up to degree 0 of 3: above it every coefficient is 0"),
         "screen filter": (True, "classic, 0.3 px²"),
         "compensation": (False, "the screen filter is classic"),
-        "supersampling": (False, "1 sample a pixel"),
-        "edge": (False, "a splat ends where it is below 0.0039"),
-        "size cull": (False, "no splat is too small to be drawn"),
-        "contribution cull": (False, "no splat gives too little"),
+        "supersampling": (False, "1 sample per pixel"),
+        "edge": (False, "a splat ends where its alpha is below 0.0039"),
+        "size cull": (False, "small splats are rendered too"),
+        "contribution cull": (False, "no splat contributes too little"),
         "stretching": (False, "round splats stay round"),
-        "size limit": (False, "no splat is too large"),
-        "frame": (False, "a splat is drawn wherever its center lies"),
+        "size limit": (False, "splats may be of any size"),
+        "frame": (False, "a splat is rendered wherever its center lies"),
         "color limit": (False, "colors have no upper bound"),
-        "order by distance": (False, "the least deep is in front"),
+        "order by distance": (False, "splats are sorted by depth"),
         "coarse order": (False, "the order is exact"),
-        "rounded picture": (False, "rounded once it is shown"),
-        "packing": (False, "splats are kept exactly"),
+        "rounded picture": (False, "rounded only for display"),
+        "packing": (False, "splats are not rounded"),
         "covariances": (False, "quaternions and scales suffice"),
-        "depth": (False, "not asked for"),
-        "normals": (False, "not asked for"),
+        "depth": (False, "not requested"),
+        "normals": (False, "not requested"),
         "upsampler": (False, "nothing is optimized"),
         "densification statistics": (False, "nothing is optimized"),
     }
@@ -66,7 +66,7 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
 def test_everything_on():
     splats = tiny.gaussians(4)
     given = Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, torch.eye(3).expand(4, 3, 3))
-    of_model = [replace(effect, on=True) for effect in OF_OTHER_MODELS]
+    of_model = [replace(effect, on=True) for effect in MODEL_EFFECTS]
     everything = RenderSettings(
         radius=3.0, min_variance=1.0, min_contribution=1.0, least_spread=1.0, max_color=1.0, radial=True, packing=Packing(), picture_step=0.1,
         frame=1.0, max_half_axis=1.0,
@@ -76,9 +76,9 @@ def test_everything_on():
     assert [effect.name for effect in effects if not effect.on] == ["coarse order"]  # there is another already
     assert told(Effects(settings=RenderSettings(bucketed=True)), splats)["coarse order"][0]
     reasons = {effect.name: effect.reason for effect in effects}
-    assert [reasons[name] for name in ("supersampling", "covariances")] == ["16 samples a pixel", "the model gives them"]
-    assert reasons["upsampler"] == "bicubic makes the truth from the base's image"
-    assert reasons["densification statistics"] == "splats above 0.0002 are cloned or split"
+    assert [reasons[name] for name in ("supersampling", "covariances")] == ["16 samples per pixel", "the model provides them"]
+    assert reasons["upsampler"] == "bicubic enlarges the base's image to the truth"
+    assert reasons["densification statistics"] == "splats with gradients above 0.0002 are cloned or split"
     assert not told(Effects(eps2d=0.0), splats)["screen filter"][0]
 
 
@@ -86,16 +86,16 @@ def test_each_effect_tells_its_cost():
     on = explain(Effects(2, supersampling=3), with_bands(2, 3))
     off = explain(Effects(0), with_bands(0, 3))
     said = {effect.name: str(effect) for effect in on}
-    assert said["supersampling"] == "supersampling: on, 9 samples a pixel (costs 9 times the pixels)"
-    assert said["view-dependent color"].endswith("(costs a direction and 9 of 16 coefficients a splat)")
-    assert str(off[6]).endswith("(saves a direction and 15 of 16 coefficients a splat)")
+    assert said["supersampling"] == "supersampling: on, 9 samples per pixel (costs 9 times the pixels)"
+    assert said["view-dependent color"].endswith("(costs a direction and 9 of 16 coefficients per splat)")
+    assert str(off[6]).endswith("(saves a direction and 15 of 16 coefficients per splat)")
     assert all(effect.reason and effect.cost for effect in (*on, *off))
 
 
 @pytest.mark.parametrize(
     ("scale", "settings", "reason"),
     [
-        (1 / 4, {}, "no image has to become larger"),
+        (1 / 4, {}, "no image is enlarged"),
         (4, {}, "images are shrunk and compared with the base's own"),
         (4, dict(steps=0), "nothing is optimized"),
     ],
@@ -110,7 +110,7 @@ def test_why_no_upsampler_is_called_for(scale, settings, reason):
 
 def on(path) -> dict[str, Effect]:
     """The effects of a family that are on, beside what rendering calls for."""
-    known = {effect.name for effect in OF_OTHER_MODELS}
+    known = {effect.name for effect in MODEL_EFFECTS}
     model = wrap_model(path, cameras=tiny.cameras(1))
     return {effect.name: effect for effect in model.render(tiny.cameras(1)[0]).effects if effect.on and effect.name in known}
 
@@ -173,7 +173,7 @@ def test_inspect_prints_them(tmp_path, capsys):
     assert cli.main(["inspect", str(tiny.folder(tmp_path / "plain"))]) == 0
     out = capsys.readouterr().out
     assert all(f"{effect.name}: " in out for effect in explain(Effects(), tiny.gaussians(1)))
-    assert "time: off, nothing moves (saves a pass through a field for each image)" in out
+    assert "time: off, the scene does not move (saves a pass through a deformation field per image)" in out
 
 
 # From a request to effects

@@ -92,7 +92,7 @@ def test_the_line_says_on_or_off_and_why(tmp_path, exposures, reason):
     assert line(model.render(model.cameras[0])) == (False, reason)
     assert line(model.adapt(1 / 4, recipe="instant").report) == (False, reason)
     if isinstance(exposures, dict) and "view_1" in exposures:
-        assert line(model.render(model.cameras[1], exposure=True)) == (True, "asked for: exposure.json has this view's")
+        assert line(model.render(model.cameras[1], exposure=True)) == (True, "requested; exposure.json has an entry for this view")
 
 
 def test_without_one_it_cannot_be_asked_for(tmp_path):

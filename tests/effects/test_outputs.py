@@ -222,7 +222,7 @@ def test_any_backend_serves_them(monkeypatch):
 
 
 def test_an_unknown_output_is_refused():
-    with pytest.raises(SettingsError, match="there is no output 'albedo'; what can be drawn beside the image is depth, normals"):
+    with pytest.raises(SettingsError, match="there is no output 'albedo'; choose from depth, normals"):
         wrapped(tiny.gaussians(3)).render(view(), outputs=["albedo"])
 
 

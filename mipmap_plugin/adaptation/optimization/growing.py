@@ -18,7 +18,7 @@ from mipmap_plugin.adaptation.optimization.optimizer import restore_parameters
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.views import extent
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.limits import mixed
+from mipmap_plugin.limits import derived_seed
 
 
 @torch.no_grad()
@@ -72,5 +72,5 @@ def _grow(run: Run, task: Task, config: AdaptConfig, gradients: Tensor) -> None:
     if config.densify_keeps_image:
         density.halve(run.student, run.optimizer, selected, splats)
     else:
-        generator = torch.Generator().manual_seed(mixed(config.seed, run.step))
+        generator = torch.Generator().manual_seed(derived_seed(config.seed, run.step))
         density.clone_and_split(run.student, run.optimizer, selected, extent(task.views), splats, generator)

@@ -23,7 +23,7 @@ def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backen
     An image is linear in the splats' colors, so that the weights are the gradient of the image's sum with respect to the colors. Works
     with any backend that has gradients.
     """
-    plain = replace(effects, sh_degree=0, settings=effects.settings.of_any_color())
+    plain = replace(effects, sh_degree=0, settings=effects.settings.without_color_rounding())
 
     @torch.enable_grad()
     def color_gradient(view: Camera) -> Tensor:
