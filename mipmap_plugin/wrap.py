@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, TypedDict, cast
 import torch
 
 from mipmap_plugin import threads
-from mipmap_plugin.adaptation.adapted import Adapted, render_model
+from mipmap_plugin.adaptation.adapted import Adapted as Adapted
+from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
 from mipmap_plugin.adaptation.target.photographs import Photographs

@@ -80,7 +80,7 @@ class _Draw(torch.autograd.Function):
         return image, 1 - transmittance
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]  # torch's decorator has no types
+    @once_differentiable
     def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Tensor | None, ...]:
         from mipmap_plugin.backends.triton_kernels import drawing
 

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.models import detect, load_model
-from mipmap_plugin.models.base import PARAMETERS, SplatModel, lacking
+from mipmap_plugin.models.base import PARAMETERS, Filtered, Rebuilt, SplatModel, lacking
 from mipmap_plugin.scenes.trajectories import orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
@@ -47,21 +47,21 @@ class ModelSuite:
         views = self.cameras or orbit(model.parameters()["means"], (24, 32), 4, torch.Generator().manual_seed(0))
         return wrap_model(model, cameras=views, backend="reference")
 
-    def test_is_recognized(self, checkpoint):
+    def test_is_recognized(self, checkpoint: Path) -> None:
         assert detect(checkpoint).family == self.family
 
-    def test_offers_what_a_model_offers(self, base):
+    def test_offers_what_a_model_offers(self, base: Wrapped) -> None:
         assert lacking(base.model) == []
         named = base.model.parameters()
         assert "means" in named and set(named) <= set(PARAMETERS)
         assert {len(tensor) for tensor in named.values()} == {len(named["means"])}
 
-    def test_shows_something_finite(self, base):
+    def test_shows_something_finite(self, base: Wrapped) -> None:
         with torch.no_grad():
             rendered = base.render(base.cameras[0])
         assert rendered.image.isfinite().all() and rendered.alpha.max() > 0
 
-    def test_a_copy_learns_and_the_base_does_not(self, base):
+    def test_a_copy_learns_and_the_base_does_not(self, base: Wrapped) -> None:
         before, copied, view = _tensors(base.model), base.model.copy(), base.cameras[0]
         base.backend(gradients=True)[0].render(copied.gaussians(view), view, base.effects()).image.sum().backward()
         gradients = {name: tensor.grad for name, tensor in copied.parameters().items() if tensor.grad is not None}
@@ -72,7 +72,7 @@ class ModelSuite:
                 tensor.add_(1)
         _assert_same(before, base.model)
 
-    def test_rows_can_be_taken_away(self, base):
+    def test_rows_can_be_taken_away(self, base: Wrapped) -> None:
         copied = base.model.copy()
         half = {name: tensor.detach()[: max(1, len(tensor) // 2)].clone().requires_grad_() for name, tensor in copied.parameters().items()}
         copied.replace_parameters(half)
@@ -80,24 +80,24 @@ class ModelSuite:
         assert copied.row_opacities(base.cameras).shape == (len(half["means"]),)
         assert copied.gaussians(base.cameras[0]).means.isfinite().all()
 
-    def test_keeps_what_its_traits_promise(self, base):
+    def test_keeps_what_its_traits_promise(self, base: Wrapped) -> None:
         view, traits = base.cameras[0], base.model.traits
         image = base.render(view).image
-        models = [base.model.fused()] if traits.filtered else []  # type: ignore[attr-defined]
+        models = [cast(Filtered, base.model).fused()] if traits.filtered else []
         if traits.same_for_all_views:
-            copied = base.model.copy()
-            copied.rebuild(lambda gaussians: gaussians[torch.arange(len(gaussians))])  # type: ignore[attr-defined]
+            copied = cast(Rebuilt, base.model.copy())
+            copied.rebuild(lambda gaussians: gaussians[torch.arange(len(gaussians))])
             models.append(copied)
         for model in models:
             same = Wrapped(model, base.cameras, "reference", base.trained).render(view).image
             assert (image - same).abs().max() <= SAME
 
-    def test_the_base_is_never_an_output(self, base):
-        for path in {base.model.source, base.model.folder} - {None}:
+    def test_the_base_is_never_an_output(self, base: Wrapped) -> None:
+        for path in filter(None, {base.model.source, base.model.folder}):
             with pytest.raises((OutputError, OutputExists, SettingsError)):
                 base.model.refuse_output(path, overwrite=True, networks_move=False)
 
-    def test_adapts_and_is_saved_and_loaded_again(self, base, checkpoint, tmp_path):
+    def test_adapts_and_is_saved_and_loaded_again(self, base: Wrapped, checkpoint: Path, tmp_path: Path) -> None:
         with _untouched(base.model, checkpoint):
             adapted = base.adapt(self.scale, **self.settings)
             saved = adapted.save(tmp_path / self.saved_as)
@@ -107,7 +107,7 @@ class ModelSuite:
         images = [adapted.render(view).image, wrap_model(again, cameras=base.cameras, backend="reference").render(view).image]
         assert (images[0] - images[1]).abs().max() <= SAME
 
-    def test_goes_to_another_device(self, base):
+    def test_goes_to_another_device(self, base: Wrapped) -> None:
         moved = base.model.to(self.device)
         assert {tensor.device.type for tensor in moved.parameters().values()} == {torch.device(self.device).type}
         with torch.no_grad():

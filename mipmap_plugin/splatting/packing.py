@@ -48,7 +48,7 @@ def round_to(values: Tensor, steps: Tensor) -> Tensor:
 def _straight_through(values: Tensor, rounded: Tensor) -> Tensor:
     """`rounded` with the gradient of `values`; values that are not finite are not rounded."""
     rounded = torch.where(values.isfinite(), rounded.to(values), values).detach()
-    return rounded if not values.requires_grad else _StraightThrough.apply(values, rounded)  # type: ignore[no-any-return]
+    return rounded if not values.requires_grad else _StraightThrough.apply(values, rounded)
 
 
 class _StraightThrough(torch.autograd.Function):

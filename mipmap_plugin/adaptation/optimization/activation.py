@@ -62,7 +62,7 @@ class Activation:
         products = [(splats[name] * gradient).sum() for name, gradient in self._gradients.items()]
         self._splats, self._gradients = None, {}  # free the memory for the optimizer and density control
         if products:
-            torch.stack(products).sum().backward()  # type: ignore[no-untyped-call]  # torch's
+            torch.stack(products).sum().backward()
 
 
 def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:

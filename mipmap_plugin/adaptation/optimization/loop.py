@@ -84,7 +84,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         image = task.renderer(draw)(gaussians, camera)  # x: the student at the new scale
         difference = difference_from(target, image, config.resize)
         loss = _loss(difference, config.loss)
-        (loss if task.detail is None else loss + task.detail(view, image)).backward()  # type: ignore[no-untyped-call]  # torch's
+        (loss if task.detail is None else loss + task.detail(view, image)).backward()
         return gaussians, camera, difference.detach().square().mean()
 
     draws = list(enumerate(views, run.step * config.views_per_step))

@@ -28,7 +28,7 @@ def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backen
     @torch.enable_grad()
     def color_gradient(view: Camera) -> Tensor:
         color = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_()
-        backend.render(replace(gaussians, sh=color), view, plain).image.sum().backward()  # type: ignore[no-untyped-call]  # torch's
+        backend.render(replace(gaussians, sh=color), view, plain).image.sum().backward()
         assert color.grad is not None
         return color.grad
 

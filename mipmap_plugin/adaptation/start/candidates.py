@@ -119,4 +119,4 @@ def warm_up_backend(backend: Backend, gaussians: Gaussians, effects: Sequence[Ef
         one.means.requires_grad_(gradients)
         image = backend.render(one, camera, setting).image
         if gradients and image.requires_grad:
-            image.sum().backward()  # type: ignore[no-untyped-call]  # torch's
+            image.sum().backward()
