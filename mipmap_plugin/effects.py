@@ -10,9 +10,9 @@ from typing import Literal
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
-
-# px²: the variance that every 3DGS rasterizer adds to a projected splat (diff-gaussian-rasterization, forward.cu).
-DILATION = 0.3
+from mipmap_plugin.screen_filters import COMPENSATED as COMPENSATED
+from mipmap_plugin.screen_filters import DILATION as DILATION
+from mipmap_plugin.screen_filters import INTEGRATED as INTEGRATED
 
 # The screen filter of 2D Gaussian Splatting (`splatting.surfels`), and the variance of its low-pass, px²: a deviation of half the root of
 # two (diff-surfel-rasterization, auxiliary.h).
@@ -34,12 +34,6 @@ MAX_ALPHA = 0.99
 FRUSTUM_MARGIN = 0.3
 
 TILE = 16  # px
-
-# Screen filters that integrate over the pixel, or over the part of it that is not hidden.
-INTEGRATED = frozenset({"analytic", "window"})
-
-# Screen filters that lower the opacity of the splats that they widen.
-COMPENSATED = frozenset({"antialiased", "mip"})
 
 # What can be rendered beside the image (`backends.geometry`), and the cost of each.
 OUTPUTS = {

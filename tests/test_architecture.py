@@ -14,7 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 STOREYS = [
     {"errors"},
     {"limits"},
-    {"registry", "config", "torchvision_absent", "threads", "progress"},
+    {"registry", "config", "torchvision_absent", "threads", "progress", "screen_filters"},
     {"gaussians", "camera"},
     {"formats"},
     {"effects"},

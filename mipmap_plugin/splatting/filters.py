@@ -8,26 +8,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mipmap_plugin.effects import DILATION, USUAL, RenderSettings
+from mipmap_plugin.effects import USUAL, RenderSettings
+from mipmap_plugin.screen_filters import SCREEN_FILTERS as RECORDS
+from mipmap_plugin.screen_filters import USUAL_EPS2D as USUAL_EPS2D
 from mipmap_plugin.splatting import culls
 from mipmap_plugin.splatting.pixel_integral import PixelIntegral, integral_of
 from mipmap_plugin.splatting.projection import Projected
 from mipmap_plugin.splatting.window import WindowIntegral
 
-# The least factor by which a compensating filter multiplies an opacity. Where it is reached, the splat is too bright and has no gradient.
-# "antialiased" (dr_aa, gsplat 1.6): keeps flat and needle-shaped splats, whose projected area is almost zero, visible.
-# "mip" (Mip-Splatting): the root of its 1e-6, too small for any splat to be visible. Mip-Splatting also adds 1e-6 to det_blur, and drops
-# splats whose det is below 1e-6 px⁴; here they fade.
-LEAST_COMPENSATION = {"classic": 1.0, "antialiased": 0.005, "mip": 0.001}
-
-# px²: each filter's default dilation. Filters that integrate over the pixel need none.
-USUAL_EPS2D = {"classic": DILATION, "antialiased": DILATION, "mip": 0.1, "analytic": 0.0, "window": 0.0}
+LEAST_COMPENSATION = {name: screen_filter.min_compensation for name, screen_filter in RECORDS.items()}
 
 # Filters that integrate over the pixel instead of sampling its center.
 INTEGRALS = {"analytic": PixelIntegral, "window": WindowIntegral}
 
-SCREEN_FILTERS = frozenset(USUAL_EPS2D)
-
+SCREEN_FILTERS = frozenset(RECORDS)
 
 # px², the variance of a square of one pixel.
 SQUARE_VARIANCE = 1 / 12

@@ -239,7 +239,7 @@ CAMERAS = {
 }
 BAD = (math.nan, math.inf)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
-FILTERS = ("classic", "antialiased", "mip", "analytic", "window")
+FILTERS = tuple(USUAL_EPS2D)
 
 # Viewers with render settings of their own.
 WITH_SETTINGS = tuple(viewer for viewer in BUILT_IN if viewer.settings != USUAL)
