@@ -15,7 +15,7 @@ import tyro
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.commands.types import Scale
-from mipmap_plugin.evaluation.evaluate import Judge, adapted_row
+from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row
 from mipmap_plugin.evaluation.measure import warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import table
@@ -66,7 +66,7 @@ def main(
     """
     wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
     scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
-    judge = Judge(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
+    judge = Evaluator(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
     scored = dict(views="given", cameras=[view.camera for view in judge.views])
     warm_up(wrapped, scale, wrapped.cameras)
     for name in only or ABLATIONS:

@@ -10,7 +10,7 @@ from pathlib import Path
 from real_bases import SCALES
 
 from mipmap_plugin import load_model, load_scene, wrap_model
-from mipmap_plugin.evaluation.evaluate import Judge, adapted_row
+from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.wrap import own_cameras
 
@@ -42,7 +42,7 @@ def _of_base(data: Path, base: str, backend: str, device: str, settings: dict) -
     here = load_model(data / "checkpoints" / "bases" / base)
     wrapped = wrap_model(here.to(device), cameras=own_cameras(here), backend=backend)
     scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
-    judge = Judge(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"])
+    judge = Evaluator(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"])
     wrapped.adapt(1 / 2, **{**settings, "steps": 10})  # compiles what is to be compiled
     rows = []
     for scale in SCALES[base]:

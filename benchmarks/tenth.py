@@ -16,7 +16,7 @@ from pages import write_page
 from real_bases import SCALES
 
 from mipmap_plugin import load_scene, wrap_model
-from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
+from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import records, table
 from mipmap_plugin.formats.atomic import write_json
@@ -29,7 +29,7 @@ the test views, all held out; one thread of a shared machine, one after the othe
 """
 
 
-def rows_of(model: Wrapped, judge: Judge, scale: float) -> list[Row]:
+def rows_of(model: Wrapped, judge: Evaluator, scale: float) -> list[Row]:
     model.adapt(scale, steps=1)  # what is compiled and cached at first use is billed to neither
     paper = model.adapt(scale, recipe="paper", views="train")
     # The budget counts optimizing only; the closed form and merging come before it.
@@ -57,7 +57,7 @@ def main(
     for base in only or SCALES:
         model = wrap_model(data / "checkpoints" / "bases" / base)
         judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras[0], model.background)[:views]
-        judge = Judge(judged, PROTOCOLS["P3"], None, base)
+        judge = Evaluator(judged, PROTOCOLS["P3"], None, base)
         rows = [row for scale in SCALES[base] if scale != 1 for row in rows_of(model, judge, scale)]
         write_json(output / "tenth" / f"{base}.json", records(rows), overwrite=True)
         print(f"{base}\n{table(rows)}\n", flush=True)

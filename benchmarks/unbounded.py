@@ -28,11 +28,11 @@ from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
-from mipmap_plugin.evaluation.measure import RESIZED, Show, resized_base, rivals, seen_before, warm_up
+from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
+from mipmap_plugin.evaluation.measure import RESIZED, RenderView, baselines, resized_base, views_seen, warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView
 from mipmap_plugin.evaluation.report import records, table
-from mipmap_plugin.evaluation.tradeoff.truth import JUDGES_SEED
+from mipmap_plugin.evaluation.tradeoff.truth import EVALUATION_SEED
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.images import read_image
 from mipmap_plugin.wrap import Wrapped
@@ -92,10 +92,10 @@ class BaseView:
         return resized_base(self.image, self.camera.zoomed(min(scale, 1.0)).size, shrink_by=protocol.shrink_by)
 
 
-class BaseJudge(Judge):
+class BaseEvaluator(Evaluator):
     """Judges by the base's own images: a zoom-in is shrunk to their size."""
 
-    def row(self, name: str, scale: float, show: Show, **facts: Any) -> Row:
+    def row(self, name: str, scale: float, show: RenderView, **facts: Any) -> Row:
         def no_larger(camera: Camera) -> Tensor:
             return resize(show(camera).clamp(0, 1), camera.zoomed(min(scale, 1.0)).size, self.protocol.shrink_by)
 
@@ -105,28 +105,28 @@ class BaseJudge(Judge):
 def split(base: Wrapped, capture: Capture) -> tuple[list[Camera], list[Camera]]:
     """The views to judge, and the cameras that are left to adapt to; none: an orbit is generated."""
     if capture.every is None:
-        return choose_views([], base.model.parameters()["means"], AdaptConfig(seed=JUDGES_SEED, extra_views=ORBIT_VIEWS))[0], []
+        return choose_views([], base.model.parameters()["means"], AdaptConfig(seed=EVALUATION_SEED, extra_views=ORBIT_VIEWS))[0], []
     cameras = sorted((replace(camera.zoomed(capture.share), split="train") for camera in base.cameras), key=lambda camera: camera.name)
     return cameras[:: capture.every], [camera for number, camera in enumerate(cameras) if number % capture.every]
 
 
-def judges(base: Wrapped, capture: Capture, name: str, scale: float, cameras: Sequence[Camera], data: Path) -> list[Judge]:
+def judges(base: Wrapped, capture: Capture, name: str, scale: float, cameras: Sequence[Camera], data: Path) -> list[Evaluator]:
     with torch.no_grad():
         views = [BaseView(camera, base.render(camera).image.clamp(0, 1)) for camera in cameras]
-    found: list[Judge] = [BaseJudge(views, protocol, scene=name) for protocol in ((AVERAGED, BICUBIC) if scale < 1 else (BICUBIC,))]
+    found: list[Evaluator] = [BaseEvaluator(views, protocol, scene=name) for protocol in ((AVERAGED, BICUBIC) if scale < 1 else (BICUBIC,))]
     if capture.photographs:
         files = [data / "images" / capture.photographs / f"{camera.name}.jpg" for camera in cameras]
         photographs = [TestView(camera, read_image(file, base.background), file) for camera, file in zip(cameras, files, strict=True)]
-        found.insert(0, Judge(photographs, PROTOCOLS["P3"], scene=name))
+        found.insert(0, Evaluator(photographs, PROTOCOLS["P3"], scene=name))
     return found
 
 
-def free_rows(base: Wrapped, judge: Judge, scale: float) -> list[Row]:
+def free_rows(base: Wrapped, judge: Evaluator, scale: float) -> list[Row]:
     """Everything that needs no adapting, but what is the truth itself."""
     finest, count = math.ceil(1 / scale), len(base.model.gaussians(base.any_camera()))
-    found = rivals(base, scale, judge.protocol.shrink_by, filters=("scaled", "window"), samples=sorted({2, finest}) if scale < 1 else ())
+    found = baselines(base, scale, judge.protocol.shrink_by, filters=("scaled", "window"), samples=sorted({2, finest}) if scale < 1 else ())
     truth = {AVERAGED: (RESIZED, f"supersampling, {finest} x {finest}"), BICUBIC: (RESIZED,)}.get(judge.protocol, ())
-    return [judge.row(rival.name, scale, rival.show, gaussians=count) for rival in found if rival.name not in truth]
+    return [judge.row(baseline.name, scale, baseline.render, gaussians=count) for baseline in found if baseline.name not in truth]
 
 
 def recipes(capture: Capture, scale: float) -> dict[str, dict[str, Any]]:
@@ -150,7 +150,7 @@ def rows_of(name: str, scale: float, data: Path, most: int | None) -> list[Row]:
     warm_up(base, scale, others)
     for recipe, settings in recipes(capture, scale).items():
         adapted = base.adapt(scale, cameras=others, **settings)
-        assert not seen_before(judged, adapted.views), f"{name}: views that are judged were adapted to"
+        assert not views_seen(judged, adapted.views), f"{name}: views that are judged were adapted to"
         for judge, beside in zip(judged_by, rows, strict=True):
             beside.append(adapted_row(recipe, adapted, judge))
             print(table(beside[-1:]), flush=True)

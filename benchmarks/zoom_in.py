@@ -20,7 +20,7 @@ from pages import write_page
 from zoom_in_plot import draw
 
 from mipmap_plugin import load_scene, wrap_model
-from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row
+from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
 from mipmap_plugin.evaluation.measure import BASE, resized_base, warm_up
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
@@ -52,7 +52,7 @@ CRISPNESS = (0.0, 0.25, 0.5, 0.75, 1.0)
 NETWORKS = {2: ("X2.pt", "realesr-animevideov3.pth"), 4: ("X4.pt", "realesr-animevideov3.pth")}
 
 
-def rows_of(model: Wrapped, judge: Judge, scale: float) -> list[Row]:
+def rows_of(model: Wrapped, judge: Evaluator, scale: float) -> list[Row]:
     """The base as it is, its own image enlarged, and with each crispness the closed form and the recipe without a network."""
     warm_up(model, scale, model.cameras)
     base = lambda camera: model.render(camera.zoomed(scale), scale).image  # noqa: E731
@@ -63,7 +63,7 @@ def rows_of(model: Wrapped, judge: Judge, scale: float) -> list[Row]:
     return rows
 
 
-def network_rows(model: Wrapped, judge: Judge, scale: float, networks: list[Path], steps: int | None) -> list[Row]:
+def network_rows(model: Wrapped, judge: Evaluator, scale: float, networks: list[Path], steps: int | None) -> list[Row]:
     """For each network its own image, and the recipes with it."""
     rows, limit = [], {} if steps is None else {"steps": steps}
     for network in networks:
@@ -74,7 +74,7 @@ def network_rows(model: Wrapped, judge: Judge, scale: float, networks: list[Path
     return rows
 
 
-def enlarged(model: Wrapped, judge: Judge, scale: float, by: str) -> Row:
+def enlarged(model: Wrapped, judge: Evaluator, scale: float, by: str) -> Row:
     """The base's own image, made larger."""
     show = lambda camera: resized_base(model.render(camera).image, camera.zoomed(scale).size, shrink_by=judge.protocol.shrink_by, upsampler=by)  # noqa: E731
     return judge.row(f"enlarged by {Path(by).name}", scale, show, gaussians=_count(model))
@@ -115,7 +115,7 @@ def main(
     for base in only or ("lego_100", "chair_100"):
         model = wrap_model(data / "checkpoints" / "bases" / base)
         judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras[0], model.background)[:views]
-        judge = Judge(judged, PROTOCOLS["P3"], perceptual, base)
+        judge = Evaluator(judged, PROTOCOLS["P3"], perceptual, base)
         file, rows = output / "zoom_in" / f"{base}.json", []
         for each in scale or (2, 4):
             rows += rows_of(model, judge, each)

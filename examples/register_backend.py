@@ -1,6 +1,6 @@
-"""Bring your own rasterizer: register it, and let the conformance suite say whether it is right.
+"""Register your own rasterizer, and check it with the conformance suite.
 
-A package makes its backend known without any call, by an entry point in its pyproject.toml:
+A package registers its backend without any call, by an entry point in its pyproject.toml:
 
     [project.entry-points."mipmap_plugin.backends"]
     careful = "my_package.careful:CarefulBackend"
@@ -27,11 +27,11 @@ from mipmap_plugin.gaussians import Gaussians
 
 
 class CarefulBackend:
-    """Takes float32, computes in float64."""
+    """Renders float32 splats in float64."""
 
     name = "careful"
     api_version = API_VERSION
-    speed = -1  # never what `auto` takes
+    speed = -1  # never chosen by `auto`
     capabilities = Capabilities(devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic"}))
 
     def lacking(self, needs: Needs) -> list[str]:
@@ -46,7 +46,7 @@ if __name__ == "__main__":
     register_backend("careful", CarefulBackend)
     outcomes = check_backend(get_backend("careful"))
     for outcome in outcomes:
-        verdict = "skipped" if outcome.skipped else "passed" if outcome.passed else "FAILED"
-        print(f"{outcome.case:45} {verdict:8} {outcome.max_error:8.1e}  {outcome.message}")
+        result = "skipped" if outcome.skipped else "passed" if outcome.passed else "FAILED"
+        print(f"{outcome.case:45} {result:8} {outcome.max_error:8.1e}  {outcome.message}")
     failed = sum(not outcome.passed for outcome in outcomes)
     print(f"{len(outcomes)} cases, {failed} failed")

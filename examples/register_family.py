@@ -1,8 +1,8 @@
-"""Bring your own family of checkpoints: splats in a NumPy archive, here.
+"""Register your own family of checkpoints; here: splats in a NumPy archive.
 
     python examples/register_family.py scene.npz 1/4
 
-A package makes it known without any call, by an entry point in its pyproject.toml:
+A package registers it without any call, by an entry point in its pyproject.toml:
 
     [project.entry-points."mipmap_plugin.models"]
     npz = "my_package.npz:FAMILY"

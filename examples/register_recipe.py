@@ -1,13 +1,13 @@
-"""Name a set of settings of your own: half of the steps of `default`, and slower changes of colors that depend on the view, here.
+"""Register a recipe of your own; here: half of the steps of `default`, and slower changes of view-dependent colors.
 
     python examples/register_recipe.py output/bicycle 1/4
 
-A package makes it known without any call, by an entry point in its pyproject.toml:
+A package registers it without any call, by an entry point in its pyproject.toml:
 
     [project.entry-points."mipmap_plugin.recipes"]
     brief = "my_package.brief:brief"
 
-and `mipmap-plugin adapt output/bicycle --scale 1/4 --recipe brief` follows it.
+and `mipmap-plugin adapt output/bicycle --scale 1/4 --recipe brief` uses it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from mipmap_plugin.recipes import default
 
 
 def brief(scale: float, network: bool) -> dict[str, Any]:
-    """The settings at a scale, by the names of mipmap_plugin.config.AdaptConfig; `network`: whether one enlarges the base's images."""
-    usual = default(scale, network)
-    return {**usual, "steps": usual["steps"] // 2, "rates": usual["rates"].model_copy(update={"shN": usual["rates"].shN / 4})}
+    """The settings at a scale, by the names of mipmap_plugin.config.AdaptConfig; `network`: whether the upsampler is a network."""
+    settings = default(scale, network)
+    return {**settings, "steps": settings["steps"] // 2, "rates": settings["rates"].model_copy(update={"shN": settings["rates"].shN / 4})}
 
 
 if __name__ == "__main__":

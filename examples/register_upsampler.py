@@ -1,13 +1,13 @@
-"""Bring your own upsampler, towards which a zoom-in is adapted: unsharp masking of Lanczos, here.
+"""Register your own upsampler, to adapt a zoom-in to its images; here: Lanczos with unsharp masking.
 
     python examples/register_upsampler.py output/bicycle 2
 
-A package makes it known without any call, by an entry point in its pyproject.toml:
+A package registers it without any call, by an entry point in its pyproject.toml:
 
     [project.entry-points."mipmap_plugin.upsamplers"]
     sharp = "my_package.sharp:sharp"
 
-and `mipmap-plugin adapt output/bicycle --scale 2 --upsampler sharp` takes it.
+and `mipmap-plugin adapt output/bicycle --scale 2 --upsampler sharp` uses it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mipmap_plugin.adaptation.target.resize import resize
 
 
 def sharp(image: Tensor, size: tuple[int, int]) -> Tensor:
-    """An `image` [H, W, 3] of 0..1 at `size` (height, width): [*size, 3]."""
+    """Resize an image [H, W, 3] in 0..1 to `size` (height, width): [*size, 3]."""
     height, width, _ = image.shape
     blurred = resize(resize(image, ((height + 1) // 2, (width + 1) // 2), "area"), (height, width), "lanczos")
     return resize(image + 0.5 * (image - blurred), size, "lanczos").clamp(0, 1)

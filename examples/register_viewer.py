@@ -1,8 +1,8 @@
-"""Tell of the viewer that you use, so that files are adapted for it: one record.
+"""Register the viewer that you use, to adapt files for it: one record.
 
     python examples/register_viewer.py output/bicycle 1/4
 
-A package makes it known without any call, by an entry point in its pyproject.toml:
+A package registers it without any call, by an entry point in its pyproject.toml:
 
     [project.entry-points."mipmap_plugin.viewers"]
     kiosk = "my_package.kiosk:KIOSK"

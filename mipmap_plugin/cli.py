@@ -1,4 +1,4 @@
-"""The command line: thin commands over the library. Exit codes: 0 done, 2 one sentence says what is wrong, 130 interrupted."""
+"""The command line: thin commands over the library. Exit codes: 0 success, 2 an error, printed in one sentence, 130 interrupted."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        print("mipmap-plugin: the memory does not suffice; ask for a smaller scale, fewer views or smaller cameras", file=sys.stderr)
+        print("mipmap-plugin: out of memory; use a smaller scale, fewer views or smaller cameras", file=sys.stderr)
         return 2
     except KeyboardInterrupt as interrupt:
         print(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}", file=sys.stderr)
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _our_warnings_only() -> Iterator[None]:
-    """Other libraries warn the programmers who call them, and not the person at the terminal; `python -W` still shows all."""
+    """Hide other libraries' warnings, which are meant for programmers; `python -W` still shows all."""
     with warnings.catch_warnings():
         if not sys.warnoptions:
             warnings.simplefilter("ignore")

@@ -29,7 +29,7 @@ from zoom_in_plot import draw  # noqa: E402
 
 from mipmap_plugin.backends import get_backend  # noqa: E402
 from mipmap_plugin.evaluation.evaluate import Row as Judged  # noqa: E402
-from mipmap_plugin.evaluation.measure import seen_before  # noqa: E402
+from mipmap_plugin.evaluation.measure import views_seen  # noqa: E402
 from mipmap_plugin.evaluation.report import records  # noqa: E402
 from mipmap_plugin.formats.atomic import write_json  # noqa: E402
 from mipmap_plugin.recipes import recipe as make_config  # noqa: E402
@@ -172,7 +172,7 @@ def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_d
     base = wrap_model(tiny.model(), cameras=[], backend="reference")
     judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,)))
     adapted = base.adapt(0.25, recipe="instant", cameras=others)
-    assert len(judged) == unbounded.ORBIT_VIEWS and others == [] and seen_before(judged, adapted.views) == []
+    assert len(judged) == unbounded.ORBIT_VIEWS and others == [] and views_seen(judged, adapted.views) == []
 
 
 def zoomed_in(name, psnr_db=27.0, lpips=0.08, scale=2.0):

@@ -84,8 +84,8 @@ def test_inspect_as_json(run, tmp_path):
 def test_inspect_says_how_far_viewers_are_from_training(run, model_folder):
     pytest.importorskip("numba")
     [line] = [line for line in run("inspect", model_folder)[1].splitlines() if line.startswith("viewers:")]
-    assert re.fullmatch(r"viewers: +spark .* dB, classic the same, antialiased .* dB, beside how it was trained, at x1 in 3 views", line)
-    assert "viewers:      not asked for" in run("inspect", model_folder, "--no-viewers")[1]
+    assert re.fullmatch(r"viewers: +spark .* dB, classic the same, antialiased .* dB, compared with its training, at x1 in 3 views", line)
+    assert "viewers:      not requested" in run("inspect", model_folder, "--no-viewers")[1]
 
 
 def test_inspect_of_an_iteration(run, model_folder):
@@ -362,8 +362,8 @@ def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
     refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no 'gpu'; choose from", "reference")
     refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no upsampler 'swin'; choose from bicubic, lanczos")
     refused(run("adapt", model_folder, "--scale", "4", "--steps", "-1"), "setting steps: Input should be greater than or equal to 0")
-    refused(run("adapt", model_folder), "no scale is given; pass --scale 1/4")
-    refused(run("evaluate", model_folder, "--images", model_folder), "no scale is given; pass --scale 1/4")
+    refused(run("adapt", model_folder), "--scale is required; give --scale 1/4")
+    refused(run("evaluate", model_folder, "--images", model_folder), "--scale is required; give --scale 1/4")
     refused(run("adapt", model_folder, "--scale", "4", "--cameras", "nowhere.json"), "nowhere.json: there is no such file")
 
 

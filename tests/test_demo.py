@@ -8,7 +8,7 @@ import pytest
 
 from mipmap_plugin.demo.run import PROTOCOL, WorldView, embedded, run_demo
 from mipmap_plugin.errors import OutputExists
-from mipmap_plugin.evaluation.evaluate import Judge
+from mipmap_plugin.evaluation.evaluate import Evaluator
 
 
 def test_the_base_fits_into_two_megabytes_and_knows_its_views():
@@ -21,7 +21,7 @@ def test_the_base_fits_into_two_megabytes_and_knows_its_views():
 def test_the_base_shows_the_world():
     base = embedded()
     views = [WorldView(camera) for camera in base.cameras if camera.split == "test"][:1]
-    row = Judge(views, PROTOCOL).row("base", 0.5, lambda camera: base.render(camera.zoomed(0.5), 0.5, "scaled").image, gaussians=0)
+    row = Evaluator(views, PROTOCOL).row("base", 0.5, lambda camera: base.render(camera.zoomed(0.5), 0.5, "scaled").image, gaussians=0)
     assert row.psnr_db > 22
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation import measure, protocols
-from mipmap_plugin.evaluation.evaluate import Judge, evaluate, means, training_free_rows
+from mipmap_plugin.evaluation.evaluate import Evaluator, evaluate, means, training_free_rows
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr, ssim
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.evaluation.published import PUBLISHED, published
@@ -97,16 +97,16 @@ def test_p3_is_pillows_bicubic_on_bytes_and_not_on_floats():
 
 def test_images_are_judged_as_the_8_bit_files_that_they_would_be_saved_as():
     image = torch.tensor([-0.1, 0.49 / 255, 0.51 / 255, 1.2])
-    assert all(torch.equal(each.judged(image), torch.tensor([0, 0, 1 / 255, 1])) for each in PROTOCOLS.values())
-    assert torch.equal(protocols.Protocol("floats", "area", eight_bit=False).judged(image), image)
+    assert all(torch.equal(each.as_saved(image), torch.tensor([0, 0, 1 / 255, 1])) for each in PROTOCOLS.values())
+    assert torch.equal(protocols.Protocol("floats", "area", eight_bit=False).as_saved(image), image)
     views = [protocols.TestView(tiny.cameras(1)[0], torch.full((24, 32, 3), 100 / 255), Path("photograph.png"))]
-    row = Judge(views, PROTOCOLS["P3"]).row("gray", 1, lambda camera: torch.full((*camera.size, 3), 100.4 / 255), gaussians=0)
+    row = Evaluator(views, PROTOCOLS["P3"]).row("gray", 1, lambda camera: torch.full((*camera.size, 3), 100.4 / 255), gaussians=0)
     assert row.psnr_db == SAME_DB
 
 
 def test_a_truth_finer_than_the_photograph_is_refused():
     view = protocols.TestView(tiny.cameras(1)[0], noise(24, 32, 3), Path("photograph.png"))
-    with pytest.raises(SettingsError, match="x2 asks for 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"):
+    with pytest.raises(SettingsError, match="x2 needs 64 x 48 px, but the photographs have only 32 x 24; evaluate a smaller scale"):
         view.truth(2, PROTOCOLS["P3"])
 
 
@@ -128,7 +128,7 @@ def test_p4_reads_the_copy_that_has_the_size(folders, scale, value):
 
 def test_p4_refuses_a_size_that_no_folder_has(folders, tmp_path):
     view = protocols.TestView(tiny.cameras(1)[0], noise(97, 130, 3), folders / "images" / "left" / "a.png")
-    with pytest.raises(SettingsError, match=r"P4 wants a\.png at 16 x 12 px .* but there is 130 x 97, 65 x 49, 33 x 24; evaluate a"):
+    with pytest.raises(SettingsError, match=r"P4 needs a\.png at 16 x 12 px .* but there is 130 x 97, 65 x 49, 33 x 24; evaluate a"):
         view.truth(1 / 2, PROTOCOLS["P4"])
     with pytest.raises(SettingsError, match="but there is none"):
         protocols.ready_made(tmp_path / "a.png", (12, 16))
@@ -149,7 +149,7 @@ def test_all_photographs_are_judged_by_where_none_is_a_test_view(scene):
 
 
 def test_a_scene_without_photographs_is_refused(scene):
-    with pytest.raises(SettingsError, match="there are no photographs to judge by"):
+    with pytest.raises(SettingsError, match="there are no photographs to compare with"):
         protocols.test_views(replace(scene, images={}), tiny.cameras()[0], (0.0, 0.0, 0.0))
 
 
@@ -158,7 +158,7 @@ def test_a_scene_without_photographs_is_refused(scene):
 
 def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
     views = protocols.test_views(scene, tiny.cameras()[0], (0.0, 0.0, 0.0))
-    row = Judge(views, PROTOCOLS["P3"]).row("black", 1, lambda camera: torch.zeros(*camera.size, 3), gaussians=7)
+    row = Evaluator(views, PROTOCOLS["P3"]).row("black", 1, lambda camera: torch.zeros(*camera.size, 3), gaussians=7)
     assert row.psnr_db == pytest.approx(sum(psnr(torch.zeros(24, 32, 3), view.photograph) for view in views) / 2)
     assert (row.name, row.scale, row.gaussians, row.adapt_seconds, row.adapted_on) == ("black", 1, 7, 0.0, "-")
     assert row.ms_per_view > 0 and row.protocol == "P3" and row.lpips is None
@@ -166,7 +166,7 @@ def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
 
 def test_the_base_against_photographs_of_itself_is_perfect(model, scene):
     views = protocols.test_views(scene, tiny.cameras()[0], (0.0, 0.0, 0.0))
-    [row] = training_free_rows(model, Judge(views, PROTOCOLS["P3"]), 1)
+    [row] = training_free_rows(model, Evaluator(views, PROTOCOLS["P3"]), 1)
     assert row.name == "base" and row.psnr_db > 50 and row.ssim == pytest.approx(1.0, abs=1e-3)
 
 
@@ -200,7 +200,7 @@ def test_an_upsampler_has_a_row_of_its_own(model, scene, monkeypatch):
     gray = {"bicubic": 0.0, "mine": 0.999}
     monkeypatch.setattr(measure, "find_upsampler", lambda name: lambda image, size: image.new_full((*size, 3), gray[name]))
     views = [protocols.TestView(tiny.cameras(1)[0], torch.ones(96, 128, 3), Path("photograph.png"))]
-    rows = {row.name: row.psnr_db for row in training_free_rows(model, Judge(views, PROTOCOLS["P3"]), 2, "mine")}
+    rows = {row.name: row.psnr_db for row in training_free_rows(model, Evaluator(views, PROTOCOLS["P3"]), 2, "mine")}
     assert rows["base, resized"] < 1 and rows["base upsampled by mine"] > 50
 
 

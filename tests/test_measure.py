@@ -1,4 +1,4 @@
-"""What every table measures by: one clock, one list of rivals under one set of names, and poses compared."""
+"""What every table measures by: one clock, one list of baselines under one set of names, and poses compared."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.evaluation import protocols
-from mipmap_plugin.evaluation.evaluate import Judge, training_free_rows
-from mipmap_plugin.evaluation.measure import resized_base, rivals, seen_before, warm_up, warm_watch
+from mipmap_plugin.evaluation.evaluate import Evaluator, training_free_rows
+from mipmap_plugin.evaluation.measure import baselines, resized_base, views_seen, warm_stopwatch, warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol
 from mipmap_plugin.evaluation.tradeoff.points import Plan, measure
 from mipmap_plugin.evaluation.tradeoff.truth import photographs
@@ -42,24 +42,24 @@ def wrapped(**options):
     ],
 )
 def test_everything_that_needs_no_adapting_has_its_name(scale, names):
-    assert [rival.name for rival in rivals(wrapped(), scale, "area")] == names
+    assert [baseline.name for baseline in baselines(wrapped(), scale, "area")] == names
 
 
 def test_the_filter_of_training_is_the_base_and_no_row_of_its_own():
     model = wrapped(trained=TrainedScale("antialiased", 0.3))
-    assert [rival.name for rival in rivals(model, 2, "area")] == ["base", "scaled", "window", "base, resized"]
+    assert [baseline.name for baseline in baselines(model, 2, "area")] == ["base", "scaled", "window", "base, resized"]
 
 
 def test_an_upsampler_stands_beside_the_bicubic_one_at_zoom_in_only():
     register_upsampler("tests/mine", lambda image, size: image.new_zeros(*size, 3))
-    shown = {rival.name: rival.show for rival in rivals(wrapped(), 2, "area", upsampler="tests/mine")}
+    shown = {baseline.name: baseline.render for baseline in baselines(wrapped(), 2, "area", upsampler="tests/mine")}
     assert shown["base upsampled by mine"](tiny.cameras(1)[0]).max() == 0 < shown["base, resized"](tiny.cameras(1)[0]).max()
-    assert "base upsampled by mine" not in [rival.name for rival in rivals(wrapped(), 1 / 2, "area", upsampler="tests/mine")]
+    assert "base upsampled by mine" not in [baseline.name for baseline in baselines(wrapped(), 1 / 2, "area", upsampler="tests/mine")]
 
 
 def test_a_table_and_a_tradeoff_have_the_same_rivals_under_the_same_names_with_the_same_decibels(tmp_path):
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", count=30))
-    judge = Judge(protocols.test_views(scene, model.cameras[0], model.background), PROTOCOLS["P3"])
+    judge = Evaluator(protocols.test_views(scene, model.cameras[0], model.background), PROTOCOLS["P3"])
     rows = {row.name: row.psnr_db for row in training_free_rows(model, judge, 1 / 4)}
     plan = Plan(recipes=(), backends=("reference",), supersampling=(4,), renderers=False, repeats=1)
     points = {point.name: point.psnr_db.median for point in measure(model, photographs(model, scene, 1 / 4, None), 1 / 4, plan)}
@@ -79,7 +79,7 @@ def test_samples_are_clamped_before_they_are_averaged():
     splats = tiny.gaussians(30)
     splats.sh.mul_(4)  # highlights beyond 1, which no display shows
     model = wrap_model(VanillaModel.from_gaussians(splats), cameras=tiny.cameras(1), backend="reference")
-    show = {rival.name: rival.show for rival in rivals(model, 1 / 4, "area")}
+    show = {baseline.name: baseline.render for baseline in baselines(model, 1 / 4, "area")}
     view = model.cameras[0]
     assert model.render(view).image.max() > 1.2
     torch.testing.assert_close(show["supersampling, 4 x 4"](view), show["base, resized"](view), atol=1e-5, rtol=0)
@@ -92,7 +92,7 @@ def test_every_protocol_names_the_filter_that_makes_its_truth():
 def test_the_base_resized_is_the_ceiling_of_what_is_judged_by_the_same_filter(tmp_path):
     """The photographs are the base's own images: only the filter is between them and the truth."""
     model, scene = wrapped(), load_scene(tiny.scene(tmp_path / "scene", count=30))
-    judge = Judge(protocols.test_views(scene, model.cameras[0], model.background), Protocol("floats", "pil-bicubic", eight_bit=False))
+    judge = Evaluator(protocols.test_views(scene, model.cameras[0], model.background), Protocol("floats", "pil-bicubic", eight_bit=False))
     rows = {row.name: row.psnr_db for row in training_free_rows(model, judge, 1 / 4)}
     assert rows["base, resized"] > max(rows[name] for name in rows if name != "base, resized") + 10
 
@@ -116,7 +116,7 @@ def test_the_first_image_of_a_row_is_not_billed(monkeypatch):
             return torch.ones(*self.camera.size, 3)
 
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    row = Judge([Black(), Black()], PROTOCOLS["P3"]).row("black", 1, show, gaussians=0)
+    row = Evaluator([Black(), Black()], PROTOCOLS["P3"]).row("black", 1, show, gaussians=0)
     assert row.ms_per_view == 1000 and len(calls) == 3
 
 
@@ -127,7 +127,7 @@ def test_the_watch_waits_for_the_device_that_draws(monkeypatch):
     class OnGpu:
         device = torch.device("cuda")
 
-    with warm_watch(lambda view: OnGpu(), tiny.cameras(1)[0]):
+    with warm_stopwatch(lambda view: OnGpu(), tiny.cameras(1)[0]):
         pass
     assert waited == [torch.device("cuda")] * 2
 
@@ -164,31 +164,31 @@ def shifted(camera, by):
 def test_a_view_is_known_again_by_its_pose_whatever_its_name_lens_and_digits():
     views = tiny.cameras(5)
     as_written = [replace(view.zoomed(3), viewmat=(view.viewmat * 1e4).round() / 1e4, name="other") for view in views]
-    assert seen_before(views, as_written[1:3]) == views[1:3]
+    assert views_seen(views, as_written[1:3]) == views[1:3]
 
 
 def test_a_single_view_far_from_the_origin_is_known_again_but_for_its_digits():
     view = tiny.cameras(1)[0]
     far = replace(view, viewmat=view.viewmat + torch.tensor([0, 0, 0, 1e4]) * torch.tensor([1, 1, 1, 0])[:, None])
-    assert seen_before([far], [replace(far, viewmat=far.viewmat.float().double())]) == [far]
+    assert views_seen([far], [replace(far, viewmat=far.viewmat.float().double())]) == [far]
 
 
 @pytest.mark.parametrize("change", [lambda view: turned(view, 1.0), lambda view: shifted(view, 0.02)], ids=["turned", "shifted"])
 def test_a_view_beside_another_is_another(change):
     views = tiny.cameras(5)
-    assert seen_before(views, [change(view) for view in views]) == []
-    assert seen_before(views, []) == seen_before([], views) == []
+    assert views_seen(views, [change(view) for view in views]) == []
+    assert views_seen(views, []) == views_seen([], views) == []
 
 
 def test_the_same_pose_at_another_time_is_another_view():
     still = tiny.cameras(1)[0]
     at = [replace(still, time=time) for time in (0.0, 0.5)]
-    assert seen_before(at, [at[1]]) == [at[1]]
-    assert seen_before(at, [still]) == at  # at which time it was adapted to is not known
+    assert views_seen(at, [at[1]]) == [at[1]]
+    assert views_seen(at, [still]) == at  # at which time it was adapted to is not known
 
 
 @pytest.mark.parametrize("recipe", ["instant", "default", "paper"])
 def test_an_adapted_model_knows_the_views_that_it_was_adapted_to(recipe):
     model = wrapped()
     adapted = model.adapt(1 / 4, recipe=recipe, steps=0 if recipe == "instant" else 1, extra_views=3, views="jittered")
-    assert len(adapted.views) == 5 + 4 and seen_before(model.cameras, adapted.views) == model.cameras
+    assert len(adapted.views) == 5 + 4 and views_seen(model.cameras, adapted.views) == model.cameras

@@ -11,8 +11,8 @@ from mip_checkpoints import folder, splats
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
-from mipmap_plugin.evaluation import looks
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.evaluation.viewer_differences import viewer_differences
 from mipmap_plugin.formats import splat_transform as exchange
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.cfg_args import read_cfg_args
@@ -153,7 +153,7 @@ def test_who_draws_the_base_has_its_filter_too(tmp_path, monkeypatch):
 
 def test_inspect_says_how_viewers_show_it(tmp_path):
     pytest.importorskip("numba")
-    told = looks.looks(wrap_model(folder(tmp_path / "model"), cameras=tiny.cameras()))
+    told = viewer_differences(wrap_model(folder(tmp_path / "model"), cameras=tiny.cameras()))
     assert told.startswith("spark ") and "playcanvas" in told
 
 

@@ -19,7 +19,7 @@ from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
-from mipmap_plugin.evaluation.evaluate import Judge, adapted_row, training_free_rows
+from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row, training_free_rows
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.ply import read_ply
@@ -200,7 +200,7 @@ def test_the_command_writes_a_portable_file_beside_another(tmp_path, capsys):
 def test_what_is_evaluated_is_the_viewer_that_shows_it_worst(pair):
     model, camera = wrapped(), tiny.cameras(1, seed=9)[0]
     view = SimpleNamespace(camera=camera, truth=lambda scale, protocol: model.render(camera.zoomed(scale), viewer="classic").image)
-    judge = Judge([view], PROTOCOLS["P3"])
+    judge = Evaluator([view], PROTOCOLS["P3"])
     *_, row = training_free_rows(model, judge, 1 / 4, viewer=pair)
     assert row.name == "base in spark, worst of 2"
     adapted = model.adapt(1 / 4, viewer=pair, recipe="instant")

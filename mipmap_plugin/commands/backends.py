@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from mipmap_plugin.commands.common import tell
+from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.errors import SettingsError
 
 
 def backends(check: str | None = None, full: bool = False, json: bool = False) -> None:
-    """List the backends and what each lacks for this machine's usual work, or check one against the reference.
+    """List the backends and why each can or cannot adapt on this machine, or check one against the reference.
 
     Args:
-        check: Run the conformance suite on this backend and print a table; a minute on a usual processor.
-        full: Check it on hundreds of random scenes too; several minutes.
+        check: Run the conformance suite on the backend of this name and print a table; a minute on a usual processor.
+        full: With --check: also run hundreds of random scenes; several minutes.
         json: Print JSON.
     """
-    from mipmap_plugin.evaluation import backends as shown
+    from mipmap_plugin.evaluation import backends as tables
 
     if full and check is None:
-        raise SettingsError("--full says how much to check; say what, with --check NAME")
+        raise SettingsError("--full needs a backend to check; give --check NAME")
     if check is None:
-        listed = shown.listing()
-        print(shown.listing_table(listed)) if not json else tell([asdict(row) for row in listed], json)
+        rows = tables.listing()
+        print(tables.listing_table(rows)) if not json else print_facts([asdict(row) for row in rows], json)
         return
-    outcomes = shown.check(check, full=full)
-    print(shown.check_table(outcomes)) if not json else tell([asdict(row) for row in outcomes], json)
+    outcomes = tables.check(check, full=full)
+    print(tables.check_table(outcomes)) if not json else print_facts([asdict(row) for row in outcomes], json)
     failed = [row.case for row in outcomes if not row.passed]
     if failed:
         raise SettingsError(f"backend {check!r} fails {len(failed)} of {len(outcomes)} cases: {', '.join(failed[:5])}")

@@ -1,4 +1,4 @@
-"""What several commands do."""
+"""Functions that several commands use."""
 
 from __future__ import annotations
 
@@ -40,18 +40,20 @@ def scene(path: Path) -> Scene:
     return load_scene(path)
 
 
-def given(**chosen: Any) -> dict[str, Any]:
-    """The options that were given."""
-    return {name: value for name, value in chosen.items() if value is not None}
+def without_none(**options: Any) -> dict[str, Any]:
+    """The options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def summary(cameras: Sequence[Camera]) -> str:
+    """Describe cameras in a sentence."""
     if not cameras:
         return "none beside the checkpoint"
     return f"{len(cameras)}, {cameras[0].width} x {cameras[0].height} px, {sum(c.split == 'test' for c in cameras)} of them test views"
 
 
-def tell(facts: Any, as_json: bool) -> None:
+def print_facts(facts: Any, as_json: bool) -> None:
+    """Print facts by name, or as JSON."""
     if as_json:
         print(json_text(facts))
         return

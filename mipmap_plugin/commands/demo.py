@@ -18,8 +18,8 @@ def demo(
     """Adapt the embedded scene at x1/4 and x4, write before/after pictures and print a table.
 
     Args:
-        scale: Other scales, instead of 1/4 and 4; may be given several times.
-        viewer: What the files are for: spark, playcanvas (or supersplat), ...
+        scale: Scales, instead of 1/4 and 4; may be given several times.
+        viewer: The viewer that the files are made for: spark, playcanvas (or supersplat), ...
         output: The folder for the pictures.
         overwrite: Replace files that exist there.
     """

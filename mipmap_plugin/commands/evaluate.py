@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from mipmap_plugin.commands.common import given, tell, wrap
-from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, each_once
+from mipmap_plugin.commands.common import print_facts, without_none, wrap
+from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, unique_scales
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
 
@@ -40,44 +40,44 @@ def evaluate(
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
-    """Judge checkpoints against real images: as they are, with training-free filters, resized, and adapted.
+    """Evaluate checkpoints against real images: as they are, with training-free filters, resized, and adapted.
 
     Args:
-        checkpoint: A PLY or a model folder, whose cameras tell the base scale; or several, which are also averaged.
+        checkpoint: A PLY or a model folder with its cameras, which define the base scale. Required; the results of several are also averaged.
         images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images), one for each checkpoint.
-        scale: Target over base, such as 1/4 or 4; 1 is the base itself. May be given several times.
-        recipe: Adapt with it (default, thorough, instant, paper), on the checkpoint's training views and on those that are judged. Several: each.
-        viewer: What files are adapted for, and draws them and the base: spark, supersplat, ...; portable: the viewer that shows each worst.
-        protocol: The truth at another scale: P1 box, cut off; P3 Pillow's bicubic on 8 bits; P4 the folders images_2, images_4, ... of COLMAP.
-        lpips: Also measure LPIPS, with AlexNet or VGG; vgg-01 feeds images in 0..1, which is not LPIPS' definition but what the papers do.
-        lpips_weights: The backbone's weights, as torchvision saves them; by default they are downloaded, once.
-        published: Also print what papers published for this data set.
-        steps: Optimizer steps at most, instead of the recipe's.
-        upsampler: What makes the base image larger, by name or the file of a network.
-        appearance: Of test views, where each training view has one: their mean, or upstream's, which is that of the view with the same number.
-        background: Of the scene; by default what the checkpoint says, else black.
-        screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
-        backend: A backend's name; auto takes the fastest that can do it.
-        threads: Processor threads at most; by default as many as torch finds. The result does not depend on it.
-        seed: Everything random follows from it.
-        output: Also write the rows, and notes on what they lack, as JSON to this file.
+        scale: Target focal length over base focal length, such as 1/4 or 4; 1 is the base itself. Required; may be given several times.
+        recipe: Also adapt: default, thorough (more steps and views), instant (closed form only), paper (published method), or a registered one.
+        viewer: Viewer to adapt files for, and to render them and the base as: spark, supersplat, ...; portable: the worst of all viewers.
+        protocol: How photographs are resized: P1 box filter, truncated to 8 bits; P3 Pillow's bicubic on 8 bits; P4 COLMAP's folders images_2, ...
+        lpips: Also measure LPIPS, with AlexNet or VGG; vgg-01 takes images in 0..1, as papers of this field do, though LPIPS is defined on -1..1.
+        lpips_weights: File of the backbone's weights, as torchvision saves them; by default they are downloaded once.
+        published: Also print the results that papers published for this data set.
+        steps: Maximum number of optimizer steps, instead of the recipe's.
+        upsampler: What makes base images larger: a registered name, or the file of a network.
+        appearance: Appearance of test views, if training views have their own: mean of these, or upstream (of the view with the same number).
+        background: Of the scene; by default that of the checkpoint, or else black.
+        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
+        backend: Name of a backend; auto chooses the fastest one that can serve the request.
+        threads: Maximum number of processor threads; by default as many as torch finds. The result does not depend on it.
+        seed: Seed of everything random.
+        output: Also write the rows, and notes on missing ones, as JSON to this file.
         overwrite: Replace that file if it exists.
         json: Print JSON instead of a table.
     """
     from mipmap_plugin.evaluation import evaluate as evaluation
 
     _refuse(checkpoint, images, output, overwrite)
-    perceptual = _perceptual(lpips, lpips_weights)
-    settings = given(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
+    perceptual, settings = _perceptual(lpips, lpips_weights), without_none(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
     rows, notes = list[Any](), dict[str, None]()  # notes each once, in their order
-    for each, folder in zip(checkpoint, images, strict=True):
-        wrapped, scene = wrap(each, None, background, backend, screen_filter, threads), _scene(folder, appearance)
-        rows += evaluation.evaluate(wrapped, scene, each_once(scale), recipe, protocol, perceptual, **settings)
+    for path, folder in zip(checkpoint, images, strict=True):
+        wrapped, scene = wrap(path, None, background, backend, screen_filter, threads), _scene(folder, appearance)
+        rows += evaluation.evaluate(wrapped, scene, unique_scales(scale), recipe, protocol, perceptual, **settings)
         notes |= dict.fromkeys(evaluation.notes(wrapped, scale, appearance))
     rows += evaluation.means(rows) if len(checkpoint) > 1 else []
+    facts, title = _facts(rows, [*notes]), _title(checkpoint, images, protocol)
     if output:
-        write_json(output, _facts(rows, [*notes]), overwrite)
-    tell(_facts(rows, [*notes]), json) if json else _print_tables(_title(checkpoint, images, protocol), rows, [*notes], published, each_once(scale))
+        write_json(output, facts, overwrite)
+    print_facts(facts, json) if json else _print_tables(title, rows, [*notes], published, unique_scales(scale))
 
 
 def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path | None) -> Perceptual | None:
@@ -101,7 +101,7 @@ def _scene(folder: Path, appearance: str) -> Scene:
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], output: Path | None, overwrite: bool) -> None:
     if output:
-        refuse_output(output, overwrite, [part for each in checkpoint for part in _parts(each)], is_file=True)
+        refuse_output(output, overwrite, [part for path in checkpoint for part in _parts(path)], is_file=True)
         refuse_unwritable(output)
     if len(checkpoint) != len(images):
         raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")

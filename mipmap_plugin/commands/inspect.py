@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from mipmap_plugin.commands.common import summary, tell
+from mipmap_plugin.commands.common import print_facts, summary
 from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
 
 
 def inspect(
     checkpoint: Checkpoint, iteration: int | None = None, screen_filter: ScreenFilter | None = None, viewers: bool = True, json: bool = False
 ) -> None:
-    """Say what a checkpoint is, what it calls for, and what is wrong with it.
+    """Report what a checkpoint is, which effects it needs, and what is wrong with it.
 
     Args:
         checkpoint: A PLY or a model folder.
-        iteration: Which iteration of a model folder; the newest by default.
-        screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
-        viewers: Draw a few views as viewers on the web do, and say how far they are from those of training.
+        iteration: Which iteration of a model folder; by default the newest.
+        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
+        viewers: Render a few views as web viewers do, and report their PSNR against the renders of the training.
         json: Print JSON instead of sentences.
     """
     from mipmap_plugin.effects import explain
-    from mipmap_plugin.evaluation.looks import looks
+    from mipmap_plugin.evaluation.viewer_differences import viewer_differences
     from mipmap_plugin.models import load_model
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
@@ -39,7 +39,7 @@ def inspect(
         "cameras": summary(wrapped.cameras),
         "effects": [str(effect) for effect in explain(wrapped.effects(), gaussians, effects_of(model))],
         "health": examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained)).sentences() or ["nothing found"],
-        "viewers": looks(wrapped) if viewers else "not asked for",
+        "viewers": viewer_differences(wrapped) if viewers else "not requested",
         "notes": model.notes,
     }
-    tell(facts, json)
+    print_facts(facts, json)

@@ -1,4 +1,4 @@
-"""What the command line calls the files that it writes."""
+"""The names of the files that the command line writes."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:
-    """Beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark, or `output`, which is a folder for all where there are several.
+    """The path of an adapted model: beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark, or `output`; a folder for all if `several`.
 
-    What came in an exchange format that is read only goes out as a PLY.
+    Exchange formats that can only be read are written as a PLY.
     """
     checkpoint_name = checkpoint.resolve().name
     known = (*WRITTEN, ".ply", *READ_ONLY) if checkpoint.is_file() or checkpoint.suffix == ".ply" else ()
@@ -28,7 +28,7 @@ def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: st
 
 
 def picture_names(views: Sequence[Camera]) -> list[str]:
-    """A PNG's name for each view, none twice and none with a folder in it; views of the same name are numbered."""
+    """The name of a PNG file for each view, unique and without a folder; views of the same name are numbered."""
     names = [f"{view.split}_{view.name}".replace("/", "_").replace("\\", "_") for view in views]
     numbers = [f"_{names[:i].count(name) + 1}" if names.count(name) > 1 else "" for i, name in enumerate(names)]
     return [f"{name}{number}.png" for name, number in zip(names, numbers, strict=True)]

@@ -37,45 +37,44 @@ def render(
     backend: str = "auto",
     overwrite: bool = False,
 ) -> None:
-    """Render views of a checkpoint as PNG files, and depth and normals beside them.
+    """Render views of a checkpoint as PNG files, optionally with depth and normals.
 
     Args:
         checkpoint: A PLY or a model folder.
         output: The folder for the pictures.
         scale: Zoom, relative to the cameras.
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
-        screen_filter: trained: what the checkpoint was trained with; scaled: the training-free filter for this scale.
-        viewer: Draw the checkpoint as this viewer does: classic, spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown
-            name lists them all.
-        supersampling: N: N x N samples a pixel.
-        filter_3d: Smooth every splat by what the cameras could see of it at best, as Mip-Splatting's 3D filter does.
-        depth: Also write NAME_depth.npy, [height, width] float32: world units along the optical axis, 0 where nothing is.
-        normals: Also write NAME_normals.npy, [height, width, 3] float32: unit vectors in world axes, 0 where nothing is.
-        exposure: Show each view by the exposure of its photograph, where training made one (exposure.json of 3DGS).
-        cameras: A cameras.json, a transforms file or a COLMAP scene, where the checkpoint has none beside it.
-        background: Of the scene; by default what the checkpoint says, else black.
-        backend: A backend's name; auto takes the fastest that can do it.
+        screen_filter: trained: the filter of the checkpoint's training; scaled: the training-free filter for this scale.
+        viewer: Render as this viewer does: classic, spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown name lists all viewers.
+        supersampling: N for N x N samples per pixel.
+        filter_3d: Smooth every splat to the finest detail that the cameras could resolve, as Mip-Splatting's 3D filter does.
+        depth: Also write NAME_depth.npy, [height, width] float32: world units along the optical axis, 0 where there is nothing.
+        normals: Also write NAME_normals.npy, [height, width, 3] float32: unit vectors in world axes, 0 where there is nothing.
+        exposure: Apply the exposure of each view's photograph, if the training learned one (exposure.json of 3DGS).
+        cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
+        background: Of the scene; by default that of the checkpoint, or else black.
+        backend: Name of a backend; auto chooses the fastest one that can serve the request.
         overwrite: Replace pictures that exist.
     """
     wrapped = wrap(checkpoint, cameras, background, backend)
     views = _named(wrapped, view)
-    asked = None if screen_filter == "trained" else screen_filter
+    filter_name = None if screen_filter == "trained" else screen_filter
     if viewer is not None:
-        wrapped.effects(scale, asked, supersampling, viewer)  # before anything is looked for or written
-    outputs = [name for name, wanted in {"depth": depth, "normals": normals}.items() if wanted]
+        wrapped.effects(scale, filter_name, supersampling, viewer)  # check the options before any work
+    outputs = [name for name, requested in {"depth": depth, "normals": normals}.items() if requested]
     pictures = [output / name for name in picture_names(views)]
     _refuse(wrapped, pictures, outputs, overwrite)
     if exposure:
         for camera in views:
-            wrapped.model.traits.exposures.of(camera)  # before anything is written
-    drawn: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
+            wrapped.model.traits.exposures.of(camera)  # raises before anything is written
+    options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
     for camera, picture in zip(views, pictures, strict=True):
-        _write(picture, wrapped.render(camera.zoomed(scale), scale, asked, supersampling, **drawn), outputs, overwrite)
+        _write(picture, wrapped.render(camera.zoomed(scale), scale, filter_name, supersampling, **options), outputs, overwrite)
     print(f"{len(views)} pictures in {output}")
 
 
 def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], overwrite: bool) -> None:
-    """Raise what writing the pictures, and what goes beside them, would raise."""
+    """Raise the errors that writing the pictures and the other outputs would raise."""
     from mipmap_plugin.models.outputs import parts_of
 
     parts = parts_of(wrapped.model.source, wrapped.model.folder)
@@ -101,8 +100,8 @@ def _named(wrapped: Wrapped, names: Sequence[str]) -> list[Camera]:
     cameras = wrapped.views()
     if not names:
         return [c for c in cameras if c.split == "test"] or cameras
-    found = [c for c in cameras if c.name in names]
-    if missing := set(names) - {c.name for c in found}:
+    chosen = [c for c in cameras if c.name in names]
+    if missing := set(names) - {c.name for c in chosen}:
         some = ", ".join(c.name for c in cameras[:5])
         raise SettingsError(f"there is no view {', '.join(sorted(missing))}; the first of {len(cameras)} are {some}")
-    return found
+    return chosen

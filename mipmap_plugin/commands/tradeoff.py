@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from mipmap_plugin.commands.common import tell, wrap
-from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, each_once
+from mipmap_plugin.commands.common import print_facts, wrap
+from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
 from mipmap_plugin.recipes import recipe as make_config
 
 
@@ -33,27 +33,28 @@ def tradeoff(
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
-    """Measure what accuracy costs: dB against seconds to adapt, and against milliseconds a frame.
+    """Measure accuracy against time: dB against seconds to adapt, and against milliseconds per frame.
 
-    Writes tradeoff.json, tradeoff.csv and tradeoff.png. No view that is judged on is adapted to, and clocks stand while it is judged.
+    Writes tradeoff.json, tradeoff.csv and tradeoff.png. Models are evaluated only on views that they were not adapted to, and the time of the
+    evaluation is not counted.
 
     Args:
         checkpoint: A PLY or a model folder.
-        scale: Target over base, such as 1/8 or 4. May be given several times.
+        scale: Target focal length over base focal length, such as 1/8 or 4. Required; may be given several times.
         output: The folder for the results.
         images: Folder of the scene with real images (protocol P3). Without it the base itself is the truth; every axis and table says which.
-        recipe: default, thorough, instant, paper, or one that is registered; default and paper, if none is given.
-        viewer: What files are adapted for, and draws them and the base: spark, playcanvas (or supersplat), ...
-        steps: Optimizer steps at most, one run for each; what each recipe says, if none is given.
-        backend: What to adapt and render with; auto, if none is given.
-        supersampling: N for N x N samples a pixel, finer than the base's pixels left out; 2, 4 and 8, if none is given.
-        renderers: Also draw the first adapted model with other cut-offs, tiles and float types, by the reference backend.
-        repeats: Runs of each, with a seed of their own; the median and the whole range are shown.
-        views: Views to judge on, at most.
-        background: Of the scene; by default what the checkpoint says, else black.
-        screen_filter: What it was trained with, where its files do not say: mip for a fused file of Mip-Splatting, for example.
-        threads: Processor threads at most; by default as many as torch finds. The result does not depend on it.
-        seed: Of the first repeat.
+        recipe: default, thorough (more steps and views), instant (closed form only), paper (published method), or others; default: default, paper.
+        viewer: The viewer that files are adapted for, and that they and the base are rendered as: spark, playcanvas (or supersplat), ...
+        steps: Maximum number of optimizer steps. May be given several times, for a run each; by default that of the recipe.
+        backend: Backend to adapt and render with. May be given several times; by default auto.
+        supersampling: N for N x N samples per pixel; more than the base's own pixels are skipped. May be given several times; by default 2, 4, 8.
+        renderers: Also render the first adapted model with other thresholds, tiles and float types, by the reference backend.
+        repeats: Number of runs, each with its own seed; the median and the whole range are reported.
+        views: Maximum number of views to evaluate on.
+        background: Of the scene; by default that of the checkpoint, or else black.
+        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
+        threads: Maximum number of processor threads; by default as many as torch finds. The result does not depend on it.
+        seed: Seed of the first repeat.
         picture: Draw tradeoff.png, which needs the extra `plot`.
         overwrite: Replace results that exist.
         json: Print JSON instead of tables.
@@ -67,7 +68,7 @@ def tradeoff(
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     model, scene = wrap(checkpoint, None, background, "auto", screen_filter, threads), None if images is None else load_scene(images)
     model.target(viewer)
-    for name, each in product(plan.recipes, scale):
-        make_config(name, each)
-    found = run(model, scene, each_once(scale), plan, views, Folder(output, picture, overwrite))
-    tell(facts(found, complete=True), json) if json else print("\n\n".join(table(each) for each in found))
+    for name, factor in product(plan.recipes, scale):
+        make_config(name, factor)
+    tradeoffs = run(model, scene, unique_scales(scale), plan, views, Folder(output, picture, overwrite))
+    print_facts(facts(tradeoffs, complete=True), json) if json else print("\n\n".join(table(tradeoff) for tradeoff in tradeoffs))

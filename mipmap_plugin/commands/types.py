@@ -1,4 +1,4 @@
-"""What the words of the command line are read as."""
+"""The types of the command line's options."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 
 
 def read_scale(text: str) -> float:
-    """A zoom: 0.25, 1/4, 4. Raises ValueError."""
+    """Parse a scale, such as 0.25, 1/4 or 4. Raises ValueError."""
     try:
         scale = float(Fraction(text))
     except (ValueError, ZeroDivisionError, OverflowError):
@@ -24,10 +24,10 @@ def read_scale(text: str) -> float:
     return scale
 
 
-def each_once(scales: Sequence[float]) -> list[float]:
-    """The scales in their order, without repetitions. Raises SettingsError for none."""
+def unique_scales(scales: Sequence[float]) -> list[float]:
+    """The scales in their order, without repetitions. Raises SettingsError if there are none."""
     if not scales:
-        raise SettingsError("no scale is given; pass --scale 1/4 or --scale 4, for example")
+        raise SettingsError("--scale is required; give --scale 1/4 or --scale 4, for example")
     return list(dict.fromkeys(scales))
 
 

@@ -1,4 +1,4 @@
-"""Rays against the demo world's two kinds of solid: capsules (a sphere is a capsule of length 0) and one round slab."""
+"""Intersection of rays with the demo world's two kinds of solids: capsules (a sphere is a capsule of length 0) and a round slab."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from torch import Tensor
 # Ray-capsule pairs tested at once: small enough for the temporaries to stay in the processor's cache.
 PAIRS_PER_CHUNK = 1 << 18
 
-# Below it a ray counts as parallel to an axis; the quotient then points safely past the capsule's end.
+# Below this a ray counts as parallel to an axis; the quotient then lies far beyond the capsule's end.
 PARALLEL = 1e-7
 
 
 class Hit(NamedTuple):
-    """What N rays met first. `distance` is infinite where a ray met nothing; the other rows are then zero."""
+    """The nearest intersections of N rays. `distance` is infinite for a ray that hits nothing; its other values are then zero."""
 
     distance: Tensor  # [N] world units
     normal: Tensor  # [N, 3] unit length, outward
     albedo: Tensor  # [N, 3] linear RGB
-    mirror: Tensor  # [N] share of light reflected head-on, 0..1
+    mirror: Tensor  # [N] reflectance at normal incidence, 0..1
 
 
 def nothing(directions: Tensor) -> Hit:
-    """The hit of N rays before any solid was tried."""
+    """The `Hit` of N rays that hit nothing."""
     n = len(directions)
     return Hit(directions.new_full((n,), math.inf), torch.zeros_like(directions), torch.zeros_like(directions), directions.new_zeros(n))
 
@@ -51,7 +51,7 @@ class Capsules(NamedTuple):
         return center, ((ends - center).norm(dim=1) + self.radius.repeat(2)).max()
 
     def hit(self, origins: Tensor, directions: Tensor, best: Hit) -> None:
-        """Put into `best` the capsules that N rays [N, 3] meet before what `best` holds."""
+        """Update `best` where N rays [N, 3] hit a capsule nearer than `best`."""
         center, radius = self.bounds
         nearest = ((center - origins) * directions).sum(1)  # along the ray, to its point nearest the center
         base = origins + directions * nearest[:, None] - center  # rays start near the capsules: thin ones then survive float32
@@ -117,7 +117,7 @@ class Slab:
     colors: Tensor  # [3, 3] linear RGB: light tile, dark tile, border
 
     def hit(self, origins: Tensor, directions: Tensor, best: Hit) -> None:
-        """Put the slab into `best` where N rays [N, 3] meet it before what `best` holds: the caps' span of the ray, cut with the side's."""
+        """Update `best` where N rays [N, 3] hit the slab nearer than `best`: the intersection of the rays' spans between caps and in the side."""
         safe = torch.where(directions.abs() < PARALLEL, PARALLEL, directions)
         caps = torch.stack([-origins[:, 2], -self.thickness - origins[:, 2]]) / safe[:, 2]
         a = safe[:, :2].square().sum(1)

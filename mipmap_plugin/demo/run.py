@@ -1,4 +1,4 @@
-"""`mipmap-plugin demo`: the main job on the embedded scene, judged against its ray-traced truth."""
+"""`mipmap-plugin demo`: adapts the embedded scene, and evaluates the result against its ray-traced truth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mipmap_plugin import threads
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.demo.world import render_world
-from mipmap_plugin.evaluation.evaluate import Judge, Row, adapted_row, training_free_rows
+from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row, training_free_rows
 from mipmap_plugin.evaluation.protocols import Protocol
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
@@ -27,10 +27,10 @@ from mipmap_plugin.wrap import Wrapped, wrap_model
 
 PROTOCOL = Protocol("demo", "box", truncate=False)
 
-# Views judged on, and the share of one, along each side, that is judged at zoom-in: its true image is ray-traced.
+# Number of views to evaluate on, and the fraction of each side that is evaluated at zoom-in, since the truth has to be ray-traced.
 JUDGED, MIDDLE = 3, 1 / 2
 
-# Samples per pixel of the truth: many where pixels are large and few.
+# Samples per pixel of the truth: more where pixels are larger and fewer.
 SAMPLES = {True: 64, False: 4}  # zoomed out, zoomed in
 
 # Pictures are shown at this many px, so that a small image is enlarged pixel by pixel and the eye sees what a screen shows.
@@ -43,7 +43,7 @@ REFERENCE_EVERY = 4
 
 
 class WorldView:
-    """A view whose truth can be had at any scale, because the world is ray-traced."""
+    """A view with a truth at any scale, because the world is ray-traced."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -55,7 +55,7 @@ class WorldView:
 
 
 def embedded() -> Wrapped:
-    """The demo's base checkpoint with its cameras."""
+    """Wrap the demo's base checkpoint with its cameras."""
     home = Path(str(files("mipmap_plugin.demo")))
     return wrap_model(home / "base.ply", cameras=read_cameras(home / "cameras.json", {"eval": True}), background=(1.0, 1.0, 1.0))
 
@@ -69,7 +69,7 @@ def run_demo(output: Path, scales: Sequence[float], viewer: str | None = None, *
         refuse_unwritable(output / f"x{scale:g}.ply")
     rows: list[Row] = []
     for scale in scales:
-        judge = Judge(judged_views(base, scale), PROTOCOL)
+        judge = Evaluator(judged_views(base, scale), PROTOCOL)
         rows += training_free_rows(base, judge, scale, without=("window",), viewer=viewer)  # most of a minute a view on the reference
         adapted = base.adapt(scale, viewer=viewer, resize="box", **settings_for(base))
         rows.append(adapted_row("adapted", adapted, judge))

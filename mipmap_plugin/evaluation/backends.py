@@ -1,4 +1,4 @@
-"""The backends of this machine as a table: what each lacks, or how it conforms."""
+"""Tables of this machine's backends: which can adapt, and the results of the conformance suite."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from mipmap_plugin.evaluation.report import markdown
 
 
 @dataclass(frozen=True)
-class Listed:
-    """One backend, and why it cannot do the usual work of one device; empty when it can."""
+class BackendStatus:
+    """One backend on one device, and why it cannot adapt a 3DGS checkpoint there; no reasons if it can."""
 
     name: str
     device: str
     reasons: tuple[str, ...]
-    note: str = ""  # what is to be known of it besides
+    note: str = ""  # the backend's own note
 
 
-def listing() -> list[Listed]:
-    """Every known backend, asked for what adapting a 3DGS checkpoint needs on the devices that are here."""
+def listing() -> list[BackendStatus]:
+    """The status of every known backend on every device of this machine."""
     needs = [Needs(device, torch.float32, gradients=True, sh_degree=3, screen_filter="classic") for device in _devices()]
-    return [Listed(name, need.device, tuple(reasons), note_of(name)) for need in needs for name, reasons in survey(need).items()]
+    return [BackendStatus(name, need.device, tuple(reasons), note_of(name)) for need in needs for name, reasons in survey(need).items()]
 
 
 def check(name: str, *, full: bool = False) -> list[Outcome]:
-    """The conformance suite's outcome for each hard case, on the first device that the backend serves; `full`: for random ones too.
+    """Run the conformance suite on the first device that the backend serves; with `full`, including random cases.
 
-    Raises SettingsError for an unknown backend, BackendUnavailable for one that serves none here.
+    Raises SettingsError for an unknown backend, BackendUnavailable for one that serves no device here.
     """
     backend = get_backend(name)
     cases = {**CASES, **MORE} if full else CASES
     with _one_thread():
         for device in _devices():
-            shown = tqdm(cases.items(), disable=None, desc=f"checking {name} on {device}", unit="case")
-            outcomes = [outcome for case, build in shown for outcome in check_backend(backend, {case: build}, device=device)]
+            progress = tqdm(cases.items(), disable=None, desc=f"checking {name} on {device}", unit="case")
+            outcomes = [outcome for case, build in progress for outcome in check_backend(backend, {case: build}, device=device)]
             if not all(outcome.skipped for outcome in outcomes):
                 return outcomes
     raise BackendUnavailable(f"backend {name!r} cannot be checked here: {outcomes[0].message}")
@@ -50,7 +50,7 @@ def check(name: str, *, full: bool = False) -> list[Outcome]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Images this small cost torch four times as much to share out among two threads as to compute in one."""
+    """Let torch use one thread, which is four times as fast as two for images this small."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -59,7 +59,8 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def listing_table(rows: Sequence[Listed]) -> str:
+def listing_table(rows: Sequence[BackendStatus]) -> str:
+    """A Markdown table of backends."""
     body = [[row.name, row.device, f"no: {'; '.join(row.reasons)}" if row.reasons else "yes", row.note] for row in rows]
     return markdown(["backend", "device", "adapts 3DGS?", "note"], body)
 
@@ -69,8 +70,10 @@ def _devices() -> list[str]:
 
 
 def check_table(rows: Sequence[Outcome]) -> str:
-    def verdict(row: Outcome) -> str:
+    """A Markdown table of the outcomes of a conformance suite."""
+
+    def result(row: Outcome) -> str:
         return "skipped: " + row.message if row.skipped else "pass" if row.passed else "FAIL: " + row.message
 
-    body = [[row.case, f"{row.max_error:.1e}", "yes" if row.finite else "NO", verdict(row)] for row in rows]
+    body = [[row.case, f"{row.max_error:.1e}", "yes" if row.finite else "NO", result(row)] for row in rows]
     return markdown(["case", "max error", "finite", "result"], body)

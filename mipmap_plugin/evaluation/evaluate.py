@@ -1,4 +1,4 @@
-"""Rows of a table: base, training-free filters, supersampling and adapted models, against real images at one scale."""
+"""Evaluation against real images: rows for the base, training-free filters, supersampling and adapted models at each scale."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.measure import FILTERS, Show, base_in, rivals, seen_before, warm_up, warm_watch
+from mipmap_plugin.evaluation.measure import FILTERS, RenderView, base_in_viewer, baselines, views_seen, warm_stopwatch, warm_up
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Judged, Protocol, TestView, not_exposed, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView, TruthView, not_exposed, test_views
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.viewers import viewers_for
-from mipmap_plugin.wrap import Adapted, Wrapped
+from mipmap_plugin.wrap import Wrapped
 
 
 @dataclass(frozen=True)
 class Row:
-    """One way to show a scene at one scale, judged on all test views."""
+    """The mean quality over all test views of one way to render a scene at one scale."""
 
     name: str
     scale: float
@@ -36,75 +37,75 @@ class Row:
     adapt_seconds: float
     ms_per_view: float
     gaussians: int
-    adapted_on: str = "-"  # what it was adapted on
-    lpips: float | None = None  # None: not asked for, or the image is too small
-    lpips_label: str = ""  # which LPIPS
+    adapted_on: str = "-"  # the views it was adapted to
+    lpips: float | None = None  # None: not requested, or the image is too small
+    lpips_label: str = ""  # which variant of LPIPS
     scene: str = ""
-    ended_by: str = ""  # of an adaptation
+    ended_by: str = ""  # why an adaptation ended
 
 
 @dataclass(frozen=True)
-class Judge:
-    """The views of a scene, and how an image of them is compared with the truth."""
+class Evaluator:
+    """The views of a scene, and the comparison of images with their truth."""
 
-    views: Sequence[Judged]
+    views: Sequence[TruthView]
     protocol: Protocol
     perceptual: Perceptual | None = None
     scene: str = ""
 
-    def row(self, name: str, scale: float, show: Show, **facts: Any) -> Row:
-        """The mean quality of `show(camera at the base scale)` over the views. PSNR per view, then the mean, as the literature does."""
-        decibels, similarities, distances = [], [], []
-        watch = warm_watch(show, self.views[0].camera)
+    def row(self, name: str, scale: float, show: RenderView, **facts: Any) -> Row:
+        """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
+        psnrs, similarities, distances = [], [], []
+        watch = warm_stopwatch(show, self.views[0].camera)
         for view in tqdm(self.views, disable=None, desc=f"{name} x{scale:g}", leave=False):
             with torch.no_grad(), watch:
                 image = show(view.camera)
-            image, truth = self.protocol.judged(image), view.truth(scale, self.protocol).to(image)
-            decibels.append(psnr(image, truth))
+            image, truth = self.protocol.as_saved(image), view.truth(scale, self.protocol).to(image)
+            psnrs.append(psnr(image, truth))
             similarities.append(ssim(image, truth))
             distances.append(self.perceptual(image, truth) if self.perceptual else None)
         label = self.perceptual.label if self.perceptual else ""
-        quality = dict(psnr_db=fmean(decibels), ssim=_mean(similarities), lpips=_mean(distances), lpips_label=label)
+        quality = dict(psnr_db=fmean(psnrs), ssim=_mean(similarities), lpips=_mean(distances), lpips_label=label)
         facts = {"adapt_seconds": 0.0, "ms_per_view": 1000 * watch.seconds / len(self.views), **facts}
         return Row(name=name, scale=scale, protocol=self.protocol.name, scene=self.scene, **quality, **facts)  # type: ignore[arg-type]
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """None where one of them is not known."""
+    """The mean, or None if any value is None."""
     known = [value for value in values if value is not None]
     return fmean(known) if len(known) == len(values) else None
 
 
 def training_free_rows(
-    model: Wrapped, judge: Judge, scale: float, upsampler: str = "bicubic", without: Sequence[str] = (), viewer: str | None = None
+    model: Wrapped, judge: Evaluator, scale: float, upsampler: str = "bicubic", without: Sequence[str] = (), viewer: str | None = None
 ) -> list[Row]:
-    """The base as it is, and everything that shows it better without adapting (`measure.rivals`).
+    """Rows of the base as it is and of all training-free improvements of it (`measure.baselines`).
 
-    `without`: filters that are left out. `viewer`: whose picture of the base has a row too.
+    `without`: filters to leave out. `viewer`: adds a row of the base as this viewer renders it.
     """
     count = len(model.model.gaussians(model.any_camera()))
     filters = [name for name in FILTERS if name not in without]
-    found = rivals(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
-    rows = [judge.row(rival.name, scale, rival.show, gaussians=count) for rival in found]
-    shown = [base_in(name, model, scale) for name in viewers_for(viewer)] if viewer else []
-    return rows + worst([judge.row(rival.name, scale, rival.show, gaussians=count) for rival in shown])
+    found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
+    rows = [judge.row(baseline.name, scale, baseline.render, gaussians=count) for baseline in found]
+    in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
+    return rows + worst([judge.row(baseline.name, scale, baseline.render, gaussians=count) for baseline in in_viewers])
 
 
 def worst(rows: Sequence[Row]) -> list[Row]:
-    """Of rows of several viewers the one of least PSNR, which says so; no row without rows."""
+    """The row of lowest PSNR, marked as the worst of several viewers; [] without rows."""
     least = sorted(rows, key=lambda row: row.psnr_db)[:1]
     return [replace(row, name=f"{row.name}, worst of {len(rows)}") for row in least] if len(rows) > 1 else least
 
 
 def notes(model: Wrapped, scales: Sequence[float], appearance: str = "mean") -> list[str]:
-    """What the rows of these scales do not have, in sentences; and which `appearance` test views have."""
+    """Notes on missing rows, on exposures, and on the appearance of test views, in sentences."""
     missing = {name: model.lacks(name) for name in FILTERS if any(scale != 1 for scale in scales)}
-    told = [f"there is no row {name!r}, since {why}" for name, why in missing.items() if why]
-    return told + not_exposed(model.model) + _of_appearance(model.model, appearance)
+    messages = [f"there is no row {name!r}, since {reason}" for name, reason in missing.items() if reason]
+    return messages + not_exposed(model.model) + _appearance_note(model.model, appearance)
 
 
-def _of_appearance(model: SplatModel, appearance: str) -> list[str]:
-    """By which appearance test views were drawn, in a sentence, where the model has any; `appearance`: "mean" or "upstream"."""
+def _appearance_note(model: SplatModel, appearance: str) -> list[str]:
+    """The appearance of test views in a sentence, if the model has appearances; `appearance`: "mean" or "upstream"."""
     if not any(effect.name == "appearance embedding" and effect.on for effect in effects_of(model)):
         return []
     if appearance == "upstream":
@@ -112,13 +113,16 @@ def _of_appearance(model: SplatModel, appearance: str) -> list[str]:
     return ["test views have the mean appearance of all training views; the original has that of the same number (--appearance upstream)"]
 
 
-def adapted_row(name: str, adapted: Adapted, judge: Judge) -> Row:
-    """An adapted model, rendered as the viewer that it was made for renders its file; of several as the one that shows it worst."""
+def adapted_row(name: str, adapted: Adapted, judge: Evaluator) -> Row:
+    """The row of an adapted model, rendered as the viewer that it is made for does; of several viewers, the worst."""
     report = adapted.report
     facts = dict(adapt_seconds=report.seconds["total"], gaussians=report.gaussians_after, adapted_on=report.views, ended_by=report.ended_by)
-    names = {each: f"{name} in {each}" if len(adapted.viewers) > 1 else name for each in adapted.viewers}
-    shows = {each: lambda camera, each=each: adapted.render(camera.zoomed(report.scale), viewer=each).image for each in names}
-    return worst([judge.row(names[each], report.scale, show, **facts) for each, show in shows.items()])[0]
+
+    def row(viewer: str) -> Row:
+        title = f"{name} in {viewer}" if len(adapted.viewers) > 1 else name
+        return judge.row(title, report.scale, lambda camera: adapted.render(camera.zoomed(report.scale), viewer=viewer).image, **facts)
+
+    return worst([row(viewer) for viewer in adapted.viewers])[0]
 
 
 def evaluate(
@@ -130,21 +134,21 @@ def evaluate(
     perceptual: Perceptual | None = None,
     **settings: Any,
 ) -> list[Row]:
-    """All rows: for each scale the training-free ones, then each recipe twice. Raises SettingsError.
+    """Return all rows: for each scale the training-free ones, then each recipe twice. Raises SettingsError.
 
-    Once on the checkpoint's training poses, and around them if the recipe says so; the honest row, for a user zooms to views that nobody adapted
-    to. It is called "held out" only if none of the judged poses was among them, else it says how many were. And once "scored": adapted on the very
-    views that are judged, as the paper does. `settings` are those of `Wrapped.adapt`; with a `viewer` its picture of the base has a row too.
+    First adapted to the checkpoint's training poses (and around them, if the recipe says so). This row shows what a user gets, who looks at other
+    views. It is called "held out" only if none of the evaluated poses was adapted to; otherwise it says how many were. Then "scored": adapted
+    to the evaluated views themselves, as the paper does. `settings` are those of `Wrapped.adapt`; a `viewer` adds a row of the base in it.
     """
     scene = model.place(scene)
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
     judged = test_views(scene, model.cameras[0], model.background)
-    judge = Judge(judged, PROTOCOLS[protocol], perceptual, scene.source.name)
+    judge = Evaluator(judged, PROTOCOLS[protocol], perceptual, scene.source.name)
     viewer, rows = settings.get("viewer"), []
-    model.targets(viewer)  # what cannot be adapted for it, or with a recipe, is refused before anything is drawn
-    for name, each in product(recipes, scales):
-        make_config(name, each)
+    model.targets(viewer)  # raise errors of the viewer and the recipes before any work
+    for name, scale in product(recipes, scales):
+        make_config(name, scale)
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
         if recipes and (scale != 1 or viewer):
@@ -156,19 +160,19 @@ def evaluate(
 
 
 def _views(config: AdaptConfig, on: str, judged: Sequence[TestView]) -> dict[str, Any]:
-    if on == "scored":  # as the paper does, to the last step: what other views show of it does not count
+    if on == "scored":  # as the paper does: the last step, without validation
         return {"views": "given", "cameras": [view.camera for view in judged], "returns": "last"}
-    return {} if config.steps and config.views != "given" else {"views": "train"}  # without steps, further views say nothing
+    return {} if config.steps and config.views != "given" else {"views": "train"}  # without steps, further views have no effect
 
 
 def _unseen(judged: Sequence[TestView], adapted: Adapted) -> str:
-    """Whether the judged views are new to an adapted model, as its row says it."""
-    seen = len(seen_before([view.camera for view in judged], adapted.views))
+    """The part of a row's name that says whether the model was adapted to any of the evaluated views."""
+    seen = len(views_seen([view.camera for view in judged], adapted.views))
     return f"{seen} of {len(judged)} judged views adapted to" if seen else "held out"
 
 
 def means(rows: Sequence[Row]) -> list[Row]:
-    """The rows of several scenes, averaged over them as the papers' tables are: one for each scale and way, in their order."""
+    """The rows of several scenes averaged as in the papers' tables: one for each scale and name, in their order."""
     groups: dict[tuple[float, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.scale, row.name), []).append(row)

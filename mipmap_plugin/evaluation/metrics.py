@@ -6,16 +6,16 @@ import numpy as np
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torch import Tensor
 
-# Wang et al. 2004, as every splatting paper sets it: an 11 x 11 Gaussian window of sigma 1.5.
+# Wang et al. 2004, with the window of all splatting papers: an 11 x 11 Gaussian of sigma 1.5.
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 
-# dB of images that are the same, as 8-bit images can be, so that means stay finite: beyond single precision.
+# The PSNR (dB) of identical images, which occur among 8-bit ones, so that means stay finite. It is beyond single precision.
 SAME_DB = 120.0
 
 
 def psnr(image: Tensor, truth: Tensor) -> float:
-    """dB between two images [H, W, 3], both clamped to 0..1; SAME_DB at most."""
+    """PSNR in dB of two images [H, W, 3], both clamped to 0..1; at most SAME_DB."""
     if np.array_equal(a := _array(image), b := _array(truth)):
         return SAME_DB
     return min(SAME_DB, float(peak_signal_noise_ratio(b, a, data_range=1.0)))

@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018) by the lpips package, which brings the linear heads; the backbone's weights are a file or downloaded."""
+"""LPIPS (Zhang et al. 2018) by the lpips package, which includes the linear heads; the backbone's weights come from a file or a download."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.torchvision_absent import torchvision_optional
 
-# A backbone, and what it is fed with: images in -1..1 as LPIPS is defined, or (01) in 0..1, as the papers of this field do with VGG.
+# A backbone and its input: images in -1..1, as LPIPS is defined, or (01) in 0..1, as papers of this field use VGG.
 Kind = Literal["alex", "vgg", "vgg-01"]
 
 INSTALL = "install it with `pip install 'mipmap-plugin[metrics]'`"
 
-# torchvision's weights for ImageNet, at the address that torchvision has for them.
+# torchvision's weights for ImageNet, at torchvision's own addresses.
 DOWNLOADS = {
     "alex": "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     "vgg": "https://download.pytorch.org/models/vgg16-397923af.pth",
@@ -30,12 +30,12 @@ SMALLEST = {"alex": 31, "vgg": 16}
 
 
 class Perceptual:
-    """LPIPS as a metric: `perceptual(image, truth)`, both [H, W, 3]. `label` says which LPIPS it is."""
+    """LPIPS as a metric: `perceptual(image, truth)`, both [H, W, 3]. `label` names the variant."""
 
     def __init__(self, kind: Kind = "alex", weights: str | Path | None = None) -> None:
-        """`weights`: a file of the backbone's weights, as torchvision names them; by default they are downloaded, once.
+        """`weights`: a file of the backbone's weights, as torchvision names them; by default they are downloaded once.
 
-        Raises PluginError without lpips, CheckpointError for another file, SettingsError when they cannot be downloaded.
+        Raises PluginError without lpips, CheckpointError for a wrong file, SettingsError if they cannot be downloaded.
         """
         self._backbone = kind.removesuffix("-01")
         self._normalize = not kind.endswith("-01")
@@ -47,23 +47,24 @@ class Perceptual:
         """The distance of two images [H, W, 3] clamped to 0..1; None for images that are too small for the backbone."""
         if min(image.shape[:2]) < SMALLEST[self._backbone]:
             return None
-        planes = [each.detach().cpu().float().clamp(0, 1).movedim(-1, 0)[None] for each in (image, truth)]
+        planes = [pixels.detach().cpu().float().clamp(0, 1).movedim(-1, 0)[None] for pixels in (image, truth)]
         return float(self._network(*planes, normalize=self._normalize))
 
 
 def _load(backbone: str, file: Path | None) -> nn.Module:
+    """The lpips network with the backbone's weights from a file, or downloaded."""
     with torchvision_optional(models={"alexnet": _alexnet, "vgg16": _vgg16}):
         try:
             import lpips
         except ImportError as error:
-            raise PluginError(f"LPIPS is measured by the package lpips; {INSTALL} ({error})") from error
+            raise PluginError(f"LPIPS needs the package lpips; {INSTALL} ({error})") from error
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torchvision's, on the arguments that lpips calls it with
+        warnings.simplefilter("ignore")  # torchvision's warnings about the arguments that lpips passes to it
         network = lpips.LPIPS(net=backbone, pnet_rand=True, verbose=False)
     weights = _download(backbone) if file is None else load_torch(file)
-    wanted = {name: "features." + name.split(".", 1)[1] for name in network.net.state_dict()}  # lpips: slice1.0.weight
+    torchvision_names = {name: "features." + name.split(".", 1)[1] for name in network.net.state_dict()}  # lpips: slice1.0.weight
     try:
-        network.net.load_state_dict({name: weights[theirs] for name, theirs in wanted.items()})
+        network.net.load_state_dict({name: weights[torchvision_name] for name, torchvision_name in torchvision_names.items()})
     except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{file} holds no {backbone} backbone as torchvision saves it; leave it out to download one") from error
     return network
@@ -78,7 +79,7 @@ def _download(backbone: str) -> dict[str, Tensor]:
 
 
 def _alexnet(pretrained: bool) -> SimpleNamespace:
-    """AlexNet's convolutions in torchvision's order, with random weights; for where torchvision does not work."""
+    """AlexNet's convolutions in torchvision's order, with random weights; used where torchvision does not work."""
     shapes = [(3, 64, 11, 4, 2), (64, 192, 5, 1, 2), (192, 384, 3, 1, 1), (384, 256, 3, 1, 1), (256, 256, 3, 1, 1)]
     layers: list[nn.Module] = []
     for number, shape in enumerate(shapes):
@@ -89,7 +90,7 @@ def _alexnet(pretrained: bool) -> SimpleNamespace:
 
 
 def _vgg16(pretrained: bool) -> SimpleNamespace:
-    """VGG-16's convolutions, likewise."""
+    """VGG-16's convolutions in torchvision's order, with random weights."""
     layers: list[nn.Module] = []
     channels = 3
     for width, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):

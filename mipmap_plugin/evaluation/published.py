@@ -1,4 +1,4 @@
-"""What papers published for the same question, to stand beside a user's rows: means over a data set, each with its protocol and source."""
+"""Published results, to compare with a user's rows: means over a data set, each with its protocol and source."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ DataSet = Literal["nerf-synthetic", "mip-nerf-360"]
 
 TITLE = {"nerf-synthetic": "mean over the 8 scenes of NeRF-Synthetic", "mip-nerf-360": "mean over the 9 scenes of mip-NeRF 360"}
 
-# LPIPS in these papers: VGG, fed with images in 0..1. Where a table copies another's rows, the protocol is the one that they were made by.
+# LPIPS in these papers: VGG with images in 0..1. Where a table copies rows of another, the protocol is that of the original.
 LPIPS_LABEL = "LPIPS (vgg, 0..1)"
 
 MIPMAP = "Mipmap-GS (arXiv 2408.06286)"
@@ -33,7 +33,7 @@ class Published:
     lpips: float | None = None
 
 
-# (method, protocol, source, then a triple PSNR, SSIM, LPIPS for each scale; None: not published)
+# (method, protocol, source, then (PSNR, SSIM, LPIPS) for each scale; None: not published)
 _Line = tuple[str, str, str, tuple[tuple[float | None, ...], ...]]
 
 _SYNTHETIC_OUT: tuple[_Line, ...] = (

@@ -11,7 +11,7 @@ from mipmap_plugin.evaluation.published import LPIPS_LABEL, Published
 
 
 def table(rows: Sequence[Row]) -> str:
-    """A Markdown table, which is legible in a terminal too. Scenes, LPIPS and what ended the runs have columns where there are any."""
+    """A Markdown table, legible in a terminal too. Scenes, LPIPS and reasons for ending have columns only where there are any."""
     several, label = len({row.scene for row in rows}) > 1, next((row.lpips_label for row in rows if row.lpips_label), "")
     head = ["scene"] * several + ["scale", "protocol", "what", "adapted on", "PSNR dB", "SSIM"] + [label] * bool(label)
     ended = any(row.ended_by for row in rows)
@@ -28,6 +28,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def published_table(rows: Sequence[Published]) -> str:
+    """A Markdown table of published results."""
     head = ["scale", "protocol", "published", "PSNR dB", "SSIM", LPIPS_LABEL, "source"]
     body = [
         [f"x{row.scale:g}", row.protocol, row.method, f"{row.psnr_db:.2f}", _digits(row.ssim, 3), _digits(row.lpips, 3), row.source] for row in rows
@@ -40,11 +41,12 @@ def _digits(value: float | None, digits: int) -> str:
 
 
 def markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Columns padded to one width each."""
+    """A Markdown table with columns of constant width."""
     widths = [max(len(line[i]) for line in [head, *body]) for i in range(len(head))]
     lines = [head, ["-" * width for width in widths], *body]
     return "\n".join("| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines)
 
 
 def records(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Rows as dictionaries, for JSON."""
     return [asdict(row) for row in rows]

@@ -13,11 +13,11 @@ import torch
 from mipmap_plugin import cli
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import OutputExists, SettingsError
-from mipmap_plugin.evaluation.measure import rivals
+from mipmap_plugin.evaluation.measure import baselines
 from mipmap_plugin.evaluation.tradeoff import points as measuring
 from mipmap_plugin.evaluation.tradeoff.files import Folder, facts, table
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
-from mipmap_plugin.evaluation.tradeoff.points import LOOKS, RENDERERS, Plan, measure
+from mipmap_plugin.evaluation.tradeoff.points import OBSERVED_STEPS, RENDERERS, Plan, measure
 from mipmap_plugin.evaluation.tradeoff.run import run
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
 from mipmap_plugin.scenes import load_scene
@@ -101,7 +101,7 @@ def test_a_filter_that_the_backend_lacks_is_named(monkeypatch):
     [note] = measuring.left_out(wrapped(), PLAN)
     assert note.startswith("there is no window filter, since backend 'reference' cannot do this: ") and note.endswith("not window")
     model = wrapped()
-    names = [rival.name for rival in measuring._rivals(model, base_itself(model, 1 / 4, 1), 1 / 4, PLAN) if rival.kind == "filter"]
+    names = [baseline.name for baseline in measuring._baselines(model, base_itself(model, 1 / 4, 1), 1 / 4, PLAN) if baseline.kind == "filter"]
     assert names == ["scaled", "antialiased", "analytic", "mip"]
     one = measuring.Point(1 / 4, "base", "base", "reference", 30, ms_per_frame=measuring.NOTHING)
     found = Tradeoff(1 / 4, "dB", [one], [note])
@@ -110,13 +110,13 @@ def test_a_filter_that_the_backend_lacks_is_named(monkeypatch):
 
 @pytest.mark.parametrize(("scale", "samples"), [(1 / 4, [2, 4]), (4, [2])])
 def test_samples_finer_than_the_pixels_of_the_base_are_left_out(scale, samples):
-    names = [rival.name for rival in rivals(wrapped(), scale, "area", samples=(2, 4, 8))]
+    names = [baseline.name for baseline in baselines(wrapped(), scale, "area", samples=(2, 4, 8))]
     assert [name for name in names if name.startswith("supersampling")] == [f"supersampling, {n} x {n}" for n in samples]
 
 
 def test_a_run_is_looked_at_on_its_way_and_at_its_end(points):
     way = [point for point in points if point.kind == "adapted"]
-    assert [point.step for point in way] == [step for step in LOOKS if step <= 6] + [None]
+    assert [point.step for point in way] == [step for step in OBSERVED_STEPS if step <= 6] + [None]
     assert [point.ms_per_frame is None for point in way] == [True] * (len(way) - 1) + [False]
     assert way[-1].ended_by == "6 steps" and way[-1].name == "default, 6 steps at most"
     assert way[0].psnr_db.median < way[-1].psnr_db.median
@@ -196,7 +196,7 @@ def test_the_first_use_of_a_backend_is_not_billed(monkeypatch):
 
 
 def test_scale_one_has_nothing_to_trade(tmp_path, monkeypatch):
-    monkeypatch.setattr(measuring, "_judged", lambda *_: pytest.fail("it is refused before anything is measured"))
+    monkeypatch.setattr(measuring, "_measured", lambda *_: pytest.fail("it is refused before anything is measured"))
     with pytest.raises(SettingsError, match="give another scale"):
         run(wrapped(), None, [1 / 4, 1], PLAN, 1, Folder(tmp_path, picture=False, overwrite=False))
     assert list(tmp_path.iterdir()) == []
@@ -204,7 +204,7 @@ def test_scale_one_has_nothing_to_trade(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("wrong", [dict(repeats=0), dict(supersampling=(1,))])
 def test_a_plan_that_cannot_be_is_refused(wrong):
-    with pytest.raises(SettingsError, match="repeats of at least 1"):
+    with pytest.raises(SettingsError, match="repeats must be at least 1"):
         Plan(**wrong)
 
 
@@ -228,13 +228,13 @@ def test_json_csv_and_table_hold_every_point(tmp_path):
 def test_ctrl_c_keeps_what_was_measured_and_says_where(tmp_path, monkeypatch):
     left = iter(range(4))
 
-    def tired(point, show, yardstick, repeats, judged=measuring._judged):
+    def tired(point, show, yardstick, repeats, judged=measuring._measured):
         if next(left, None) is None:
             raise KeyboardInterrupt
         return judged(point, show, yardstick, repeats)
 
-    monkeypatch.setattr(measuring, "_judged", tired)
-    with pytest.raises(Interrupted, match=f"the 4 points that were measured until then are in {tmp_path}"):
+    monkeypatch.setattr(measuring, "_measured", tired)
+    with pytest.raises(Interrupted, match=f"the 4 points measured so far are in {tmp_path}"):
         run(wrapped(), None, [1 / 4, 4], PLAN, 1, Folder(tmp_path, picture=False, overwrite=False))
     told = json.loads((tmp_path / "tradeoff.json").read_text())
     assert not told["complete"] and [len(each["points"]) for each in told["scales"]] == [4]
@@ -244,7 +244,7 @@ def test_ctrl_c_before_the_first_point_writes_nothing(tmp_path, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(measuring, "_judged", stop)
+    monkeypatch.setattr(measuring, "_measured", stop)
     with pytest.raises(Interrupted, match="nothing was measured yet"):
         run(wrapped(), None, [1 / 4], PLAN, 1, Folder(tmp_path / "new", picture=False, overwrite=False))
     assert not (tmp_path / "new").exists()

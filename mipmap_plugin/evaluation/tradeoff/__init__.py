@@ -1,1 +1,1 @@
-"""What accuracy costs in time, measured, drawn and written."""
+"""Accuracy against time: measured, plotted and written to files."""

@@ -1,4 +1,4 @@
-"""A tradeoff as files, and as a table."""
+"""The files and the table of a tradeoff."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAMES = ("tradeoff.json", "tradeoff.csv", "tradeoff.png")
 
 
 def refuse(folder: Path, picture: bool, overwrite: bool) -> None:
-    """What would be refused at the end is refused at the beginning. Raises OutputExists, and SettingsError without matplotlib."""
+    """Raise now the errors that `write` would raise at the end: OutputExists, and SettingsError without matplotlib."""
     if picture:
         figure_class()
     for name in NAMES:
@@ -33,29 +33,30 @@ def refuse(folder: Path, picture: bool, overwrite: bool) -> None:
 
 
 def facts(tradeoffs: Sequence[Tradeoff], complete: bool) -> dict[str, Any]:
+    """Everything that was measured, as written to JSON."""
     machine = {"threads": torch.get_num_threads(), "cores": os.cpu_count(), "processor": platform.machine(), **versions()}
     return {"complete": complete, "machine": machine, "scales": [_facts_of(each) for each in tradeoffs]}
 
 
 def _facts_of(each: Tradeoff) -> dict[str, Any]:
     fronts = (front(files(each.points), seconds), front(frames(each.points), milliseconds))
-    told = dict(zip(("seconds", "frames"), each.sentences(), strict=True))
+    sentences = dict(zip(("seconds", "frames"), each.sentences(), strict=True))
     marks = [{"on_front_of_seconds": point in fronts[0], "on_front_of_frames": point in fronts[1]} for point in each.points]
     points = [asdict(point) | mark for point, mark in zip(each.points, marks, strict=True)]
-    return {"scale": each.scale, "truth": each.truth, "sentences": told, "notes": each.notes, "points": points}
+    return {"scale": each.scale, "truth": each.truth, "sentences": sentences, "notes": each.notes, "points": points}
 
 
 @dataclass(frozen=True)
 class Folder:
-    """Where a tradeoff is written to."""
+    """The folder that a tradeoff is written to."""
 
     path: Path
-    picture: bool  # whether one is drawn
+    picture: bool  # whether to write the plot
     overwrite: bool
 
 
 def write(folder: Folder, tradeoffs: Sequence[Tradeoff], *, complete: bool) -> None:
-    """The JSON, the CSV and the picture, each whole or not at all. Raises OutputExists, OutputError, and SettingsError without matplotlib."""
+    """Write JSON, CSV and plot, each atomically. Raises OutputExists, OutputError, and SettingsError without matplotlib."""
     write_json(folder.path / NAMES[0], facts(tradeoffs, complete), folder.overwrite)
     text = io.StringIO(newline="")
     rows = [{"truth": each.truth, **_flat(point)} for each in tradeoffs for point in each.points]
@@ -69,7 +70,7 @@ def write(folder: Folder, tradeoffs: Sequence[Tradeoff], *, complete: bool) -> N
 
 
 def _flat(point: Point) -> dict[str, Any]:
-    """Spreads become three columns each; what was not measured is left empty."""
+    """A point as a row: each spread becomes three columns; values that were not measured are empty."""
     row: dict[str, Any] = {}
     for name, value in vars(point).items():
         if isinstance(value, Spread) or name == "ms_per_frame":
@@ -80,7 +81,7 @@ def _flat(point: Point) -> dict[str, Any]:
 
 
 def table(each: Tradeoff) -> str:
-    """The ends of all runs and everything beside them, best first, with what the dB are of, both sentences and what is missing."""
+    """A table of all final points, best first, with the truth, both sentences and the notes."""
     best = front(files(each.points), seconds), front(frames(each.points), milliseconds)
     body = [
         [point.name, point.backend, _text(point.psnr_db, 2), _text(point.adapt_seconds, 2), _text(point.ms_per_frame, 1), f"{point.gaussians:,}",
@@ -92,7 +93,7 @@ def table(each: Tradeoff) -> str:
 
 
 def _text(spread: Spread | None, digits: int) -> str:
-    """The median, and the whole range where there is one."""
+    """The median, and the range if it is not a single value."""
     if spread is None:
         return "-"
     low, middle, high = (f"{value:.{digits}f}" for value in (spread.low, spread.median, spread.high))

@@ -1,4 +1,4 @@
-"""The Pareto front of cost and quality, and its knee, said in a sentence."""
+"""The Pareto front of cost and quality, its knee, and sentences about both."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ Cost = Callable[[Point], float]
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """All points of one scale, and what their dB are of."""
+    """All points of one scale, and the truth that their dB are measured against."""
 
     scale: float
     truth: str
     points: list[Point]
-    notes: Sequence[str] = ()  # what is not among them
+    notes: Sequence[str] = ()  # on points that are missing
 
     def sentences(self) -> tuple[str, str]:
-        """What was found: of adapting, and of frames."""
-        return said_of_seconds(self.points), said_of_frames(self.points)
+        """The result in sentences: for seconds of adapting, and for milliseconds per frame."""
+        return seconds_sentence(self.points), frames_sentence(self.points)
 
 
 def seconds(point: Point) -> float:
-    """Of adapting."""
+    """The seconds of adapting of a point."""
     return point.adapt_seconds.median
 
 
 def milliseconds(point: Point) -> float:
-    """Of one frame."""
+    """The milliseconds per frame of a point; infinite if not measured."""
     return math.inf if point.ms_per_frame is None else point.ms_per_frame.median
 
 
 def files(points: Sequence[Point]) -> list[Point]:
-    """What a renderer without other filters shows: the base as it is, and what adapting made of it."""
+    """The points that any renderer shows, without special filters: the base as it is, and adapted models."""
     return [point for point in points if point.kind in ("base", "adapted")]
 
 
 def frames(points: Sequence[Point]) -> list[Point]:
-    """Everything whose frames were timed."""
+    """The points whose frames were timed."""
     return [point for point in points if point.ms_per_frame is not None]
 
 
 def front(points: Sequence[Point], cost: Cost) -> list[Point]:
-    """The points that nothing cheaper equals, from the cheapest on."""
+    """The Pareto front: points that are better than all cheaper ones, by rising cost."""
     best: list[Point] = []
     for point in sorted(points, key=lambda point: (cost(point), -point.psnr_db.median)):
         if not best or point.psnr_db.median > best[-1].psnr_db.median:
@@ -56,16 +56,16 @@ def front(points: Sequence[Point], cost: Cost) -> list[Point]:
 
 @dataclass(frozen=True)
 class Knee:
-    """Where a front bends: until here dB are cheap, from here on dear."""
+    """The knee of a front: up to it dB are cheap, beyond it expensive."""
 
     point: Point
     cost: float
-    gain_db: float  # over the cheapest
-    per_doubling_db: float | None  # of the cost, from the knee to the end; None: the knee is the end
+    gain_db: float  # over the cheapest point
+    per_doubling_db: float | None  # gain per doubling of the cost, from the knee to the end; None: the knee is the end
 
 
 def knee(best: Sequence[Point], cost: Cost) -> Knee | None:
-    """The point of a front that lies furthest above the line from its first to its last (Satopää et al. 2011); None for a single point."""
+    """The point of a front farthest above the line from its first to its last point (Satopää et al. 2011); None for a single point."""
     if len(best) < 2:
         return None
     start, end = best[0], best[-1]
@@ -80,8 +80,8 @@ def knee(best: Sequence[Point], cost: Cost) -> Knee | None:
     return Knee(at, cost(at), at.psnr_db.median - start.psnr_db.median, rest)
 
 
-def said_of_seconds(points: Sequence[Point]) -> str:
-    """What adapting buys."""
+def seconds_sentence(points: Sequence[Point]) -> str:
+    """The gain of adapting, in a sentence."""
     found = knee(front(files(points), seconds), seconds)
     if found is None:
         return "adapting buys nothing here: no file is better than the base as it is"
@@ -89,8 +89,8 @@ def said_of_seconds(points: Sequence[Point]) -> str:
     return f"the first {found.cost:.2g} s buy {found.gain_db:.1f} dB ({found.point.name}); {rest}"
 
 
-def said_of_frames(points: Sequence[Point]) -> str:
-    """What a slower frame buys."""
+def frames_sentence(points: Sequence[Point]) -> str:
+    """The gain of slower frames, in a sentence."""
     best = front(frames(points), milliseconds)
     found = knee(best, milliseconds)
     quickest = f"the quickest frame, {milliseconds(best[0]):.2g} ms, has {best[0].psnr_db.median:.1f} dB ({best[0].name})"

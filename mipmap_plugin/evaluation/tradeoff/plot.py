@@ -1,4 +1,4 @@
-"""A tradeoff as a picture: dB against seconds to adapt and against milliseconds a frame, with the Pareto front and its knee."""
+"""Plots of a tradeoff: dB against seconds to adapt and against milliseconds per frame, with the Pareto front and its knee."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mipmap_plugin.evaluation.tradeoff.front import Cost, Tradeoff, files, frame
 from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
 from mipmap_plugin.formats.atomic import new_file
 
-# Marks by what a point is; colors by its name, so that a name is the same in both pictures.
+# Markers by the kind of a point; colors are by its name, and the same in both plots.
 MARKS = {"base": "X", "filter": "o", "supersampling": "s", "adapted": "D", "renderer": "."}
 
 # Seconds below which the axis is linear, so that 0 is on it.
@@ -20,11 +20,11 @@ BRIEF = 0.1
 
 TITLE_WIDTH = 95  # letters
 
-NO_MATPLOTLIB = "pictures need matplotlib: pip install 'mipmap-plugin[plot]', or ask for none (--no-picture)"
+NO_MATPLOTLIB = "plots need matplotlib: pip install 'mipmap-plugin[plot]', or leave them out with --no-picture"
 
 
 def figure_class() -> Any:
-    """matplotlib's Figure, which draws without a screen. Raises SettingsError where matplotlib is missing."""
+    """matplotlib's Figure class, which needs no screen. Raises SettingsError without matplotlib."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -48,7 +48,7 @@ def draw(path: Path, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
 
 
 def _seconds(axes: Any, each: Tradeoff, colors: dict[str, Any]) -> None:
-    """What a renderer without other filters shows, against the seconds it took to make; what needs a renderer of its own is a line across."""
+    """Plot dB against seconds to adapt; what needs no adapting but a special renderer is a horizontal line."""
     for point in each.points:
         if point.kind in ("filter", "supersampling"):
             axes.axhline(point.psnr_db.median, color=colors[point.name], linestyle=":", linewidth=1)
@@ -95,7 +95,7 @@ def _front(axes: Any, points: Sequence[Point], cost: Cost) -> None:
 
 
 def _colors(points: Sequence[Point]) -> dict[str, Any]:
-    """One for each name, evenly around a wheel of twenty."""
+    """One of twenty colors for each name."""
     from matplotlib import colormaps
 
     names = list(dict.fromkeys(point.name for point in points))

@@ -1,5 +1,5 @@
-"""What accuracy costs: one scene at one scale through recipes, steps, backends and renderer settings, beside every answer that
-needs no adapting. Measuring quality is not billed as adapting, and no view that is judged on is adapted to."""
+"""Accuracy against time: one scene at one scale with several recipes, steps, backends and renderer settings, and all baselines without
+adaptation. The time to measure quality is not counted, and evaluated views are never adapted to."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.measure import BASE, FILTERS, RESIZED, Kind, Rival, Show, base_in, rivals, warm_up, warm_watch
-from mipmap_plugin.evaluation.tradeoff.truth import Yardstick
+from mipmap_plugin.evaluation.measure import BASE, FILTERS, RESIZED, Baseline, Kind, RenderView, base_in_viewer, baselines, warm_stopwatch, warm_up
+from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.filters import SCREEN_FILTERS
-from mipmap_plugin.wrap import Adapted, Wrapped
+from mipmap_plugin.wrap import Wrapped
 
-# Steps after which a run is looked at: even on the logarithmic axis of time.
-LOOKS = (0, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+# Steps after which the quality of a run is measured: evenly spaced on the logarithmic axis of time.
+OBSERVED_STEPS = (0, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
-# What a renderer may save, each alone: (name, settings, float type).
+# Renderer settings that may save time, each alone: (name, settings, float type).
 RENDERERS: tuple[tuple[str, RenderSettings, torch.dtype], ...] = (
     ("as usual", USUAL, torch.float32),
     ("float64", USUAL, torch.float64),
@@ -47,6 +48,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
+        """The median and the range of several values."""
         return cls(statistics.median(values), min(values), max(values))
 
 
@@ -55,7 +57,7 @@ NOTHING = Spread(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Point:
-    """One way to show a scene at one scale: what it costs, and how good it is."""
+    """One way to render a scene at one scale: its cost and its quality."""
 
     scale: float
     kind: Kind
@@ -64,48 +66,48 @@ class Point:
     gaussians: int
     psnr_db: Spread = NOTHING
     adapt_seconds: Spread = NOTHING
-    ms_per_frame: Spread | None = None  # None on the way, before a run has ended
-    step: int | None = None  # on the way
-    ended_by: str = ""  # at the end of a run; where repeats differ, all reasons
+    ms_per_frame: Spread | None = None  # None: an intermediate point of a run
+    step: int | None = None  # of an intermediate point
+    ended_by: str = ""  # of a final point: why the run ended, with all reasons if repeats differ
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is tried."""
+    """What to measure."""
 
     recipes: Sequence[str] = ("default",)
-    steps: Sequence[int | None] = ()  # none: as many as each recipe says
+    steps: Sequence[int | None] = ()  # none: those of each recipe
     backends: Sequence[str] = ("auto",)
     supersampling: Sequence[int] = (2, 4, 8)
-    renderers: bool = True  # the settings of RENDERERS, on the first run's model
+    renderers: bool = True  # also measure the first run's model with the settings of RENDERERS
     repeats: int = 3
-    seed: int = 0  # of the first repeat; each has the next
-    viewer: str | None = None  # what files are adapted for, and the base is drawn by too
+    seed: int = 0  # of the first repeat; further repeats have the following seeds
+    viewer: str | None = None  # what files are adapted for, and the base is also rendered as
 
     def __post_init__(self) -> None:
         if self.repeats < 1 or any(n < 2 for n in self.supersampling):
-            raise SettingsError("a tradeoff needs repeats of at least 1, and supersampling of at least 2 x 2 samples")
+            raise SettingsError("repeats must be at least 1, and supersampling at least 2")
 
 
-def measure(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> Iterator[Point]:
-    """Each point as soon as it is measured. Raises SettingsError and BackendUnavailable."""
+def measure(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan) -> Iterator[Point]:
+    """Yield each point as soon as it is measured. Raises SettingsError and BackendUnavailable."""
     runs = [(name, steps, backend) for backend in plan.backends for name in plan.recipes for steps in plan.steps or (None,)]
-    free = [rival for backend in plan.backends for rival in _rivals(on_backend(model, backend), yardstick, scale, plan)]
+    free = [baseline for backend in plan.backends for baseline in _baselines(on_backend(model, backend), truth, scale, plan)]
     count = len(model.model.gaussians(model.any_camera()))
     bar = tqdm(total=len(free) + len(runs) * plan.repeats + len(RENDERERS) * plan.renderers, disable=None, desc=f"tradeoff x{scale:g}")
     first: Adapted | None = None
     with bar:
-        for rival in free:
-            yield _judged(Point(scale, rival.kind, rival.name, rival.backend, count), rival.show, yardstick, plan.repeats)
+        for baseline in free:
+            yield _measured(Point(scale, baseline.kind, baseline.name, baseline.backend, count), baseline.render, truth, plan.repeats)
             bar.update()
         for backend in plan.backends if runs else ():
-            warm_up(on_backend(model, backend), scale, yardstick.adapt_on)
+            warm_up(on_backend(model, backend), scale, truth.adapt_on)
         for name, steps, backend in runs:
-            points, adapted = _run(on_backend(model, backend), yardstick, scale, plan, (name, steps), bar)
+            points, adapted = _run(on_backend(model, backend), truth, scale, plan, (name, steps), bar)
             yield from points
             first = first or adapted
         for point, show in _renderers(model, first, scale) if plan.renderers else ():
-            yield _judged(point, show, yardstick, plan.repeats)
+            yield _measured(point, show, truth, plan.repeats)
             bar.update()
 
 
@@ -114,65 +116,65 @@ def on_backend(model: Wrapped, name: str) -> Wrapped:
     return Wrapped(model.model, model.cameras, name, model.trained, model.threads)
 
 
-def _rivals(model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan) -> list[Rival]:
-    """Everything that needs no adapting, but what is the truth itself."""
-    found = rivals(model, scale, yardstick.shrink_by, filters=_filters(model), samples=plan.supersampling)
-    found += [base_in(plan.viewer, model, scale)] if plan.viewer else []
-    return [rival for rival in found if not (yardstick.is_resized_base and rival.name == RESIZED)]
+def _baselines(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan) -> list[Baseline]:
+    """All baselines, except the one that is the truth itself."""
+    found = baselines(model, scale, truth.shrink_by, filters=_filters(model), samples=plan.supersampling)
+    found += [base_in_viewer(plan.viewer, model, scale)] if plan.viewer else []
+    return [baseline for baseline in found if not (truth.is_resized_base and baseline.name == RESIZED)]
 
 
 def _filters(model: Wrapped) -> list[str]:
-    """Every filter but the one that the model was trained with: first those of every table."""
+    """All screen filters except that of the model's training; those of the other tables come first."""
     return [name for name in (*FILTERS, *sorted(SCREEN_FILTERS - set(FILTERS))) if name != model.trained.screen_filter]
 
 
 def left_out(model: Wrapped, plan: Plan) -> list[str]:
-    """The filters that a backend of the plan lacks, in sentences."""
-    on = [on_backend(model, name) for name in plan.backends]
-    return [f"there is no {name} filter, since {why}" for each in on for name in _filters(each) if (why := each.lacks(name))]
+    """The filters that backends of the plan lack, in sentences."""
+    wrapped = [on_backend(model, name) for name in plan.backends]
+    return [f"there is no {name} filter, since {reason}" for each in wrapped for name in _filters(each) if (reason := each.lacks(name))]
 
 
-def _judged(point: Point, show: Show, yardstick: Yardstick, repeats: int) -> Point:
-    """`point` with its dB and its milliseconds a frame, the mean over the views in each repeat."""
-    times, decibels = [], []
+def _measured(point: Point, show: RenderView, truth: GroundTruth, repeats: int) -> Point:
+    """Measure the PSNR and the milliseconds per frame of a point: the means over the views in each repeat."""
+    times, psnrs = [], []
     with torch.no_grad():
-        watch = warm_watch(show, yardstick.views[0])
+        watch = warm_stopwatch(show, truth.views[0])
         for repeat in range(repeats):
             watch.seconds = 0.0
-            for view in yardstick.views:
+            for view in truth.views:
                 with watch:
                     image = show(view)
                 if repeat == 0:
-                    decibels.append(yardstick.psnr(view, image))
-            times.append(1000 * watch.seconds / len(yardstick.views))
-    return replace(point, psnr_db=Spread.of([statistics.fmean(decibels)]), ms_per_frame=Spread.of(times))
+                    psnrs.append(truth.psnr(view, image))
+            times.append(1000 * watch.seconds / len(truth.views))
+    return replace(point, psnr_db=Spread.of([statistics.fmean(psnrs)]), ms_per_frame=Spread.of(times))
 
 
 def _run(
-    model: Wrapped, yardstick: Yardstick, scale: float, plan: Plan, run: tuple[str, int | None], bar: tqdm
+    model: Wrapped, truth: GroundTruth, scale: float, plan: Plan, run: tuple[str, int | None], bar: tqdm
 ) -> tuple[list[Point], Adapted]:
-    """The points of a recipe, of so many steps, on its way and at its end, over all repeats, and the first repeat's model."""
+    """Run a recipe (with a number of steps) in all repeats; return its intermediate and final points, and the model of the first repeat."""
     recipe, steps = run
-    way: dict[int, list[tuple[float, float]]] = {}  # after so many steps: seconds and dB of each repeat that went so far
+    measured: dict[int, list[tuple[float, float]]] = {}  # by step: seconds and dB of each repeat that took as many steps
 
     @torch.no_grad()
-    def look(step: int, seconds: float, show: Show) -> None:
-        if step in LOOKS:
-            quality = statistics.fmean(yardstick.psnr(view, show(view.zoomed(scale))) for view in yardstick.views)
-            way.setdefault(step, []).append((seconds, quality))
+    def observe(step: int, seconds: float, show: RenderView) -> None:
+        if step in OBSERVED_STEPS:
+            quality = statistics.fmean(truth.psnr(view, show(view.zoomed(scale))) for view in truth.views)
+            measured.setdefault(step, []).append((seconds, quality))
 
     runs, ends = [], []
     for repeat in range(plan.repeats):
         settings: dict[str, Any] = {"seed": plan.seed + repeat} | ({} if steps is None else {"steps": steps})
-        runs.append(adapted := model.adapt(scale, recipe=recipe, viewer=plan.viewer, cameras=yardstick.adapt_on, observe=look, **settings))
+        runs.append(adapted := model.adapt(scale, recipe=recipe, viewer=plan.viewer, cameras=truth.adapt_on, observe=observe, **settings))
         report = adapted.report
         end = Point(scale, "adapted", _name(recipe, steps), adapted.backend.name, report.gaussians_after, ended_by=report.ended_by)
-        ends.append(_judged(replace(end, adapt_seconds=Spread.of([report.seconds["total"]])), _shows(adapted, scale), yardstick, 1))
+        ends.append(_measured(replace(end, adapt_seconds=Spread.of([report.seconds["total"]])), _shows(adapted, scale), truth, 1))
         bar.update()
-    on_the_way = replace(ends[0], ms_per_frame=None, ended_by="")
+    intermediate = replace(ends[0], ms_per_frame=None, ended_by="")
     points = [
-        replace(on_the_way, step=step, **_spreads(adapt_seconds=[seconds for seconds, _ in seen], psnr_db=[quality for _, quality in seen]))
-        for step, seen in way.items()
+        replace(intermediate, step=step, **_spreads(adapt_seconds=[seconds for seconds, _ in values], psnr_db=[quality for _, quality in values]))
+        for step, values in measured.items()
     ]
     return [*points, _over_repeats(ends)], runs[0]
 
@@ -182,33 +184,33 @@ def _name(recipe: str, steps: int | None) -> str:
 
 
 def _spreads(**values: Sequence[float]) -> dict[str, Any]:
-    return {name: Spread.of(each) for name, each in values.items()}
+    return {name: Spread.of(repeats) for name, repeats in values.items()}
 
 
 def _over_repeats(ends: Sequence[Point]) -> Point:
-    """One point from those of all repeats."""
+    """The final points of all repeats as one point."""
     measured = {name: [getattr(end, name).median for end in ends] for name in ("psnr_db", "adapt_seconds", "ms_per_frame")}
     return replace(ends[0], ended_by="; ".join(dict.fromkeys(end.ended_by for end in ends)), **_spreads(**measured))
 
 
-def _shows(adapted: Adapted, scale: float) -> Show:
+def _shows(adapted: Adapted, scale: float) -> RenderView:
     return lambda view: adapted.render(view.zoomed(scale)).image
 
 
-def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterator[tuple[Point, Show]]:
-    """The adapted model, or the base without one, drawn by the reference backend with each of RENDERERS."""
+def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterator[tuple[Point, RenderView]]:
+    """The adapted model, or else the base, rendered by the reference backend with each of RENDERERS."""
     backend = get_backend("reference")
-    shown: SplatModel = adapted.model if adapted else model.model
+    splats: SplatModel = adapted.model if adapted else model.model
     effects = adapted.effects if adapted else model.effects(scale)
-    who = adapted.report.settings.recipe if adapted else BASE
+    title = adapted.report.settings.recipe if adapted else BASE
     seconds = Spread.of([adapted.report.seconds["total"]]) if adapted else NOTHING
-    count = len(shown.gaussians(model.any_camera()))
+    count = len(splats.gaussians(model.any_camera()))
     for name, settings, dtype in RENDERERS:
-        point = Point(scale, "renderer", f"{who}, {name}", backend.name, count, adapt_seconds=seconds)
-        yield point, _drawn(backend, shown, replace(effects, settings=settings), dtype, scale)
+        point = Point(scale, "renderer", f"{title}, {name}", backend.name, count, adapt_seconds=seconds)
+        yield point, _render_with(backend, splats, replace(effects, settings=settings), dtype, scale)
 
 
-def _drawn(backend: Backend, model: SplatModel, effects: Effects, dtype: torch.dtype, scale: float) -> Show:
+def _render_with(backend: Backend, model: SplatModel, effects: Effects, dtype: torch.dtype, scale: float) -> RenderView:
     def show(view: Camera) -> Tensor:
         camera = view.zoomed(scale)
         return backend.render(model.gaussians(camera).to(dtype=dtype), camera, effects).image

@@ -1,4 +1,4 @@
-"""A tradeoff from beginning to end: every scale measured, and what was measured written, also when it is interrupted."""
+"""A complete tradeoff: every scale is measured, and the results are written, also after an interruption."""
 
 from __future__ import annotations
 
@@ -15,26 +15,25 @@ from mipmap_plugin.wrap import Interrupted, Wrapped
 
 
 def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan, views: int | None, folder: Folder) -> list[Tradeoff]:
-    """Measure and write into `folder`. `scene`: with photographs to judge by; `views`: how many of them at most.
+    """Measure, and write the results to `folder`. `scene`: with photographs to compare with; `views`: maximum number of them.
 
-    Ctrl-C raises Interrupted after what was measured until then is written. Raises SettingsError, BackendUnavailable, OutputExists
-    and OutputError.
+    Ctrl-C writes the results so far and raises Interrupted. Raises SettingsError, BackendUnavailable, OutputExists and OutputError.
     """
     if 1 in scales:
-        raise SettingsError("at scale 1 the base is right as it is, and nothing is to be traded; give another scale")
-    yardsticks = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
+        raise SettingsError("at scale 1 the base needs no adaptation; give another scale")
+    truths = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
     notes = left_out(model, plan) + (not_exposed(model.model) if scene else [])
-    found = [Tradeoff(scale, yardstick.label, [], notes) for scale, yardstick in zip(scales, yardsticks, strict=True)]
+    tradeoffs = [Tradeoff(scale, truth.label, [], notes) for scale, truth in zip(scales, truths, strict=True)]
     try:
-        for each, yardstick in zip(found, yardsticks, strict=True):
-            for point in measure(model, yardstick, each.scale, plan):
-                each.points.append(point)
+        for tradeoff, truth in zip(tradeoffs, truths, strict=True):
+            for point in measure(model, truth, tradeoff.scale, plan):
+                tradeoff.points.append(point)
     except KeyboardInterrupt:
-        measured = [each for each in found if each.points]
+        measured = [tradeoff for tradeoff in tradeoffs if tradeoff.points]
         if not measured:
             raise Interrupted("interrupted; nothing was measured yet") from None
         write(folder, measured, complete=False)
-        count = sum(len(each.points) for each in measured)
-        raise Interrupted(f"interrupted; the {count} points that were measured until then are in {folder.path}; --overwrite replaces them") from None
-    write(folder, found, complete=True)
-    return found
+        count = sum(len(tradeoff.points) for tradeoff in measured)
+        raise Interrupted(f"interrupted; the {count} points measured so far are in {folder.path}; --overwrite replaces them") from None
+    write(folder, tradeoffs, complete=True)
+    return tradeoffs

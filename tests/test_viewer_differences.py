@@ -8,8 +8,9 @@ import tiny
 import torch_checkpoints
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.evaluation import looks
+from mipmap_plugin.evaluation import viewer_differences as module
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.evaluation.viewer_differences import viewer_differences
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.wrap import Wrapped
 
@@ -26,7 +27,7 @@ def decibels(sentence: str) -> dict[str, float]:
 def test_each_viewer_is_as_far_from_training_as_its_pictures_are(tmp_path):
     model = loaded(tmp_path)
     views = [model.cameras[nth] for nth in (0, 2, 4)]
-    told = decibels(looks.looks(model))
+    told = decibels(viewer_differences(model))
     assert list(told) == ["spark", "playcanvas", "gaussian-splats-3d", "antialiased"]  # classic is the same
     for viewer, number in told.items():
         assert number == pytest.approx(fmean(psnr(model.render(v, viewer=viewer).image, model.render(v).image) for v in views), abs=0.051)
@@ -34,22 +35,22 @@ def test_each_viewer_is_as_far_from_training_as_its_pictures_are(tmp_path):
 
 def test_what_was_trained_with_compensation_looks_wrong_in_a_classic_viewer(tmp_path):
     model = loaded(tmp_path, trained=TrainedScale("antialiased"))
-    told = looks.looks(model)
+    told = viewer_differences(model)
     assert "antialiased the same" in told and decibels(told)["classic"] < decibels(told)["spark"]
 
 
 def test_fewer_views_are_drawn_of_more_splats_and_none_of_too_many(tmp_path, monkeypatch):
     model = loaded(tmp_path)
-    monkeypatch.setattr(looks, "SPLATS", 119)
-    assert looks.looks(model).endswith("at x1 in 1 view")
-    monkeypatch.setattr(looks, "SPLATS", 59)
+    monkeypatch.setattr(module, "SPLATS", 119)
+    assert viewer_differences(model).endswith("at x1 in 1 view")
+    monkeypatch.setattr(module, "SPLATS", 59)
     monkeypatch.setattr(model, "render", None)  # nothing is drawn
-    assert looks.looks(model).startswith("not drawn: 60 splats on 768 pixels take too long")
+    assert viewer_differences(model).startswith("not drawn: 60 splats on 768 pixels take too long")
 
 
 def test_a_slow_backend_draws_nothing(tmp_path):
     model = wrap_model(tiny.folder(tmp_path / "model"), backend="reference")
-    assert looks.looks(model).startswith("not drawn: only the reference backend can, which takes too long")
+    assert viewer_differences(model).startswith("not drawn: only the reference backend can, which takes too long")
 
 
 def test_where_training_drew_what_only_a_slow_backend_draws_nothing_is_drawn(tmp_path, monkeypatch):
@@ -57,9 +58,9 @@ def test_where_training_drew_what_only_a_slow_backend_draws_nothing_is_drawn(tmp
     own = wrap_model(model.model, backend="reference").backend()
     chosen = model.backend
     monkeypatch.setattr(model, "backend", lambda *, viewer=None, **options: chosen(viewer=viewer, **options) if viewer else own)
-    assert looks.looks(model).startswith("not drawn")
+    assert viewer_differences(model).startswith("not drawn")
 
 
 def test_a_file_of_another_project_is_not_drawn_and_the_remedy_is_said(tmp_path):
     model = wrap_model(torch_checkpoints.gsplat_folder(tmp_path / "run", torch_checkpoints.splats()), cameras=tiny.cameras(1))
-    assert looks.looks(model).startswith("not drawn: its own project alone opens such a file; `mipmap-plugin adapt --scale 1 --viewer NAME")
+    assert viewer_differences(model).startswith("not drawn: its own project alone opens such a file; `mipmap-plugin adapt --scale 1 --viewer NAME")
