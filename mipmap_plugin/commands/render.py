@@ -13,6 +13,7 @@ from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+from mipmap_plugin.screen_filters import Name
 
 if TYPE_CHECKING:
     from mipmap_plugin.backends.base import Rendered
@@ -25,7 +26,7 @@ def render(
     output: Path,
     scale: Scale = 1.0,
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    screen_filter: Literal["trained", "scaled", "classic", "antialiased", "mip", "analytic", "window"] = "trained",
+    screen_filter: Literal["trained", "scaled"] | Name = "trained",
     viewer: str | None = None,
     supersampling: int = 1,
     filter_3d: bool = False,

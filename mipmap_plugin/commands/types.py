@@ -11,6 +11,7 @@ import tyro
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
+from mipmap_plugin.screen_filters import TrainedName
 
 
 def read_scale(text: str) -> float:
@@ -43,5 +44,5 @@ Scale = Annotated[
 ]
 Scales = tyro.conf.UseAppendAction[list[Scale]]
 Background = Literal["white", "black"]
-ScreenFilter = Literal["classic", "antialiased", "mip", "analytic"]
+ScreenFilter = TrainedName
 Checkpoint = tyro.conf.Positional[Path]
