@@ -48,7 +48,8 @@ class Camera:
     def center(self) -> Tensor:
         """The camera's position in the world, [3] float64."""
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
-        return -torch.linalg.solve(rotation, translation)
+        center: Tensor = -torch.linalg.solve(rotation, translation)
+        return center
 
     def to_camera(self, points: Tensor) -> Tensor:
         """Transform world points [N, 3] to camera space [N, 3]: x right, y down, z forward.

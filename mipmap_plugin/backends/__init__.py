@@ -33,7 +33,7 @@ def get_backend(name: str) -> Backend:
     """The backend `name`. Raises SettingsError if it is unknown, PluginError if it does not load or has another API version."""
     factory = BACKENDS.get(name)
     try:
-        backend = factory()
+        backend: Backend = factory()
     except Exception as error:  # a third-party constructor may fail in any way; one broken plug-in must not break the others
         raise PluginError(f"backend {name!r} cannot be created: {type(error).__name__}: {error}") from error
     if getattr(backend, "api_version", None) != API_VERSION:

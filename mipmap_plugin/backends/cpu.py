@@ -54,7 +54,7 @@ class CpuBackend:
         g = gaussians if packing is None else packed(gaussians, camera, packing)
         ranks = buckets.ranks(gaussians, camera).numpy() if effects.settings.bucketed else None
         tensors = g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances
-        image, alpha = _Draw.apply(camera, effects, ranks, *tensors)
+        image, alpha = _Draw.apply(camera, effects, ranks, *tensors)  # type: ignore[no-untyped-call]  # torch's
         return Rendered(image, alpha)
 
 

@@ -58,7 +58,7 @@ class TritonBackend:
         """
         self._check.require(Needs.of(gaussians, effects, gradients=True))
         g = gaussians
-        image, alpha = _Draw.apply(camera, effects, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)
+        image, alpha = _Draw.apply(camera, effects, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)  # type: ignore[no-untyped-call]  # torch's
         return Rendered(image, alpha)
 
 

@@ -67,7 +67,8 @@ def _load(backbone: str, file: Path | None) -> nn.Module:
         network.net.load_state_dict({name: weights[torchvision_name] for name, torchvision_name in torchvision_names.items()})
     except (KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{file} holds no {backbone} backbone as torchvision saves it; leave it out to download one") from error
-    return network
+    measure: nn.Module = network
+    return measure
 
 
 def _download(backbone: str) -> dict[str, Tensor]:

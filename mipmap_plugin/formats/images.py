@@ -92,7 +92,8 @@ def is_file(path: Path) -> bool:
 def image_size(path: str | Path) -> tuple[int, int]:
     """(width, height) in px of an image file, from its header alone. Raises SceneError."""
     with _opened(path) as image:
-        return image.size
+        width, height = image.size
+        return width, height
 
 
 def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> Path:

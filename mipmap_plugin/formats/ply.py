@@ -226,7 +226,8 @@ def _read_through_plyfile(path: Path, header: Header) -> np.ndarray:
         file.seek(header.body)
         content = "".join([*declared, "end_header\n"]).encode() + file.read()
     try:
-        return PlyData.read(io.BytesIO(content))["vertex"].data
+        rows: np.ndarray = PlyData.read(io.BytesIO(content))["vertex"].data
+        return rows
     except (PlyParseError, ValueError, OverflowError) as error:
         raise CheckpointError(f"{path} is damaged or truncated ({error}); download or export it again") from error
 

@@ -38,7 +38,8 @@ def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:
     for comment in comments:
         if comment.startswith(PROVENANCE + " {"):
             try:
-                return json.loads(comment.removeprefix(PROVENANCE))
+                record: dict[str, Any] = json.loads(comment.removeprefix(PROVENANCE))
+                return record
             except (json.JSONDecodeError, RecursionError):
                 return None
     return None

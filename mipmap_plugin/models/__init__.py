@@ -42,7 +42,7 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
         raise CheckpointError(f"{checkpoint.path}: {not_loaded(checkpoint.family)}")
     load = load_target(family.name, family.load) if isinstance(family.load, str) else family.load
     try:
-        model = load(path, iteration=iteration)
+        model: SplatModel = load(path, iteration=iteration)
     except (MipmapPluginError, OSError, MemoryError):
         raise
     except Exception as error:  # third-party code may fail in any way

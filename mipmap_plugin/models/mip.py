@@ -202,7 +202,8 @@ def filter_3d_of(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
     seen = nearest.isfinite()
     if not seen.any():
         raise CheckpointError("no training camera sees a splat, so the 3D filter is undefined; give the cameras that it was trained with")
-    return torch.where(seen, nearest, nearest[seen].max()) / max(camera.fx for camera in cameras) * FILTER_VARIANCE**0.5
+    depth, deviation = torch.where(seen, nearest, nearest[seen].max()), float(FILTER_VARIANCE**0.5)
+    return depth / max(camera.fx for camera in cameras) * deviation
 
 
 def _trained(family: str, trained: TrainedScale) -> TrainedScale:

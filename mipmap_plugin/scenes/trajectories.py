@@ -110,7 +110,9 @@ def rotation_matrix(vector: Tensor) -> Tensor:
     """The rotations [..., 3, 3] by |vector| radians around `vector` [..., 3]; the exponential."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3)))
+    cross = torch.unflatten(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1), -1, (3, 3))
+    rotations: Tensor = torch.linalg.matrix_exp(cross)
+    return rotations
 
 
 def _on_arc(centers: Tensor, forwards: Tensor, along: Tensor) -> Tensor:
@@ -163,9 +165,9 @@ def _farthest(places: Tensor, taken: Tensor, count: int) -> list[int]:
 
 def _sky_directions(up: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Unit vectors [count, 3] at evenly spaced azimuths and random elevations above the horizon whose normal is `up` (unit)."""
-    east = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[up.abs().argmin()])
+    east: Tensor = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[up.abs().argmin()])
     east = east / east.norm()
-    north = torch.linalg.cross(up, east)
+    north: Tensor = torch.linalg.cross(up, east)
     start, chance = torch.rand((), generator=generator, dtype=up.dtype), torch.rand(count, 1, generator=generator, dtype=up.dtype)
     azimuth = (torch.arange(count, dtype=up.dtype)[:, None] / count + start) * 2 * math.pi
     low, high = ORBIT_ELEVATIONS

@@ -80,7 +80,8 @@ def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
     In graphdeco-inria before commit 0f125cb, and in its descendants, the x of the translation has the opposite sign. That is
     the same camera only if this x is 0, as in all of NeRF-Synthetic; this is the exact inverse.
     """
-    return torch.linalg.inv(camera_to_world @ OPENGL_TO_OPENCV)
+    world_to_camera: Tensor = torch.linalg.inv(camera_to_world @ OPENGL_TO_OPENCV)
+    return world_to_camera
 
 
 def _first_file(folder: Path, *names: str) -> list[Path]:

@@ -64,4 +64,5 @@ def _morton(means: Tensor) -> Tensor:
     """Morton code of each center, [N] int64: interleaved bits of x, y and z in a grid of 2^MORTON_BITS cells per axis of their bounding box."""
     low, high = means.amin(0), means.amax(0)
     cells = ((means - low) * 2**MORTON_BITS / (high - low).clamp_min(torch.finfo(means.dtype).tiny)).clamp_max(2**MORTON_BITS - 1).long()
-    return sum(((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3))
+    bits = [((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3)]
+    return sum(bits, torch.zeros_like(cells[:, 0]))

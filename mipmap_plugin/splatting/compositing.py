@@ -153,5 +153,5 @@ def _pixel_centers(tiles: Tensor, tiles_x: int, tile: int) -> Tensor:
 
 def _untile(tiles: Tensor, tiles_x: int, tile: int, camera: Camera) -> Tensor:
     """Assemble tiles [tiles, tile², C] into an image [H, W, C]."""
-    grid = tiles.unflatten(1, (tile, tile)).unflatten(0, (-1, tiles_x))
+    grid: Tensor = tiles.unflatten(1, (tile, tile)).unflatten(0, (-1, tiles_x))
     return grid.transpose(1, 2).flatten(2, 3).flatten(0, 1)[: camera.height, : camera.width]

@@ -48,7 +48,10 @@ def round_to(values: Tensor, steps: Tensor) -> Tensor:
 def _straight_through(values: Tensor, rounded: Tensor) -> Tensor:
     """`rounded` with the gradient of `values`; values that are not finite are not rounded."""
     rounded = torch.where(values.isfinite(), rounded.to(values), values).detach()
-    return rounded if not values.requires_grad else _StraightThrough.apply(values, rounded)
+    if not values.requires_grad:
+        return rounded
+    kept: Tensor = _StraightThrough.apply(values, rounded)  # type: ignore[no-untyped-call]  # torch's
+    return kept
 
 
 class _StraightThrough(torch.autograd.Function):
@@ -85,7 +88,7 @@ def _scales(scales: Tensor, least: float, most: float, step: float) -> Tensor:
 
 def _quaternions(quats: Tensor, quantize: Callable[[Tensor], Tensor]) -> Tensor:
     """Quantize the rotations of [N, 4] wxyz. Norms are kept, because gradients scale with them; a zero quaternion stays."""
-    length = quats.norm(dim=1, keepdim=True)
+    length: Tensor = quats.norm(dim=1, keepdim=True)
     unit = torch.where(length > 0, quats / torch.where(length > 0, length, 1.0), quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
     return quantize(torch.where(unit[:, :1] < 0, -unit, unit)) * length
 

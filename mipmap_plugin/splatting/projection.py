@@ -49,7 +49,7 @@ def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: flo
     margin = frozen_beyond * half
     u, v = torch.minimum(torch.maximum(slopes, -left - margin), 2 * half - left + margin).unbind(-1)
     per_x, per_y, zero = camera.fx / depths, camera.fy / depths, torch.zeros_like(depths)
-    return torch.stack([per_x, zero, -per_x * u, zero, per_y, -per_y * v], -1).unflatten(-1, (2, 3))
+    return torch.unflatten(torch.stack([per_x, zero, -per_x * u, zero, per_y, -per_y * v], -1), -1, (2, 3))
 
 
 def _from_factors(factor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -15,7 +15,7 @@ def rotations(quats: Tensor) -> Tensor:
     entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
                2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
-    return torch.stack(entries, -1).unflatten(-1, (3, 3))
+    return torch.unflatten(torch.stack(entries, -1), -1, (3, 3))
 
 
 def unit(quats: Tensor) -> Tensor:
@@ -40,7 +40,8 @@ def unit_quaternions(quats: Tensor) -> Tensor:
     is_zero = largest < torch.finfo(quats.dtype).tiny
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
     scaled = torch.where(is_zero, identity, quats / torch.where(is_zero, 1.0, largest))
-    return scaled / scaled.norm(dim=1, keepdim=True)
+    unit: Tensor = scaled / scaled.norm(dim=1, keepdim=True)
+    return unit
 
 
 def quaternions(rotation: Tensor) -> Tensor:
@@ -55,7 +56,8 @@ def quaternions(rotation: Tensor) -> Tensor:
         torch.stack([yx - xy, xz + zx, zy + yz, z], dim=1),
     ]
     quats = torch.stack(rows, dim=1)[torch.arange(len(rotation), device=rotation.device), squares.argmax(dim=1)]
-    return quats / quats.norm(dim=1, keepdim=True)
+    unit: Tensor = quats / quats.norm(dim=1, keepdim=True)
+    return unit
 
 
 def quaternion_product(first: Tensor, second: Tensor) -> Tensor:

@@ -126,4 +126,4 @@ def ellipse_box(axes: Tensor, slopes: Tensor, reach: Tensor | float) -> tuple[Te
 def _inverse(matrices: Tensor) -> Tensor:
     """Inverses of [N, 2, 2], not finite for singular matrices."""
     (a, b), (c, d) = (row.unbind(-1) for row in matrices.unbind(1))
-    return torch.stack([d, -b, -c, a], -1).unflatten(-1, (2, 2)) / (a * d - b * c)[:, None, None]
+    return torch.unflatten(torch.stack([d, -b, -c, a], -1), -1, (2, 2)) / (a * d - b * c)[:, None, None]

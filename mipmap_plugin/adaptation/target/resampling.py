@@ -46,7 +46,7 @@ class _Resample(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         matrix, transposed = ctx.matrices
-        return _Resample.apply(gradient, transposed, matrix), None, None
+        return _Resample.apply(gradient, transposed, matrix), None, None  # type: ignore[no-untyped-call]  # torch's
 
 
 def resample(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
@@ -56,7 +56,7 @@ def resample(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
         if image.shape[axis] != size[axis]:
             first = image.movedim(axis, 0)
             matrices = matrix_of(first.shape[0], size[axis], method, image.device, image.dtype)
-            resampled = _Resample.apply(first.flatten(1), *matrices)
+            resampled = _Resample.apply(first.flatten(1), *matrices)  # type: ignore[no-untyped-call]  # torch's
             image = resampled.unflatten(1, first.shape[1:]).movedim(0, axis)
     return image
 

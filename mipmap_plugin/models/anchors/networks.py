@@ -6,6 +6,7 @@ import io
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -106,7 +107,7 @@ class _Appearance(nn.Module):
         self.embedding = nn.Embedding(count, size)
 
     def forward(self, index: Tensor) -> Tensor:
-        return self.embedding(index)
+        return cast(Tensor, self.embedding(index))
 
 
 def _traced(name: str, state: dict[str, Tensor]) -> bytes:

@@ -32,8 +32,9 @@ def _axes(scales: Tensor, quats: Tensor) -> Tensor:
     """The axes of each ellipsoid, rotated by its quaternion, as rows [N, 3, 3]."""
     axes = torch.diag_embed(scales)
     w, xyz = quats[:, None, :1], quats[:, None, 1:].expand_as(axes)
-    turned = torch.linalg.cross(xyz, axes)
-    return axes + 2 * (w * turned + torch.linalg.cross(xyz, turned))
+    turned: Tensor = torch.linalg.cross(xyz, axes)
+    rotated: Tensor = axes + 2 * (w * turned + torch.linalg.cross(xyz, turned))
+    return rotated
 
 
 def _radius(axes: Tensor, u: Tensor, v: Tensor, depth: Tensor, camera: Camera) -> Tensor:

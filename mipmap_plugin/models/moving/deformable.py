@@ -150,7 +150,7 @@ def kernel_covariances(quats: Tensor, scales: Tensor) -> Tensor:
     entries = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
                2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
                2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
-    factors = torch.stack(entries, -1).unflatten(-1, (3, 3)) * scales[:, None, :]
+    factors = torch.unflatten(torch.stack(entries, -1), -1, (3, 3)) * scales[:, None, :]
     return factors @ factors.mT
 
 
