@@ -282,7 +282,7 @@ def test_backends_check_prints_a_table_and_fails_if_a_case_does(run, monkeypatch
     outcomes.pop()
     assert run("backends", "--check", "reference")[0] == 0
     refused(run("backends", "--check", "gpu"), "there is no 'gpu'")
-    refused(run("backends", "--full"), "say what, with --check NAME")
+    refused(run("backends", "--full"), "give --check NAME")
 
 
 @pytest.mark.parametrize("full", [False, True])
