@@ -66,15 +66,15 @@ def main(
     """
     wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
     scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
-    judge = Evaluator(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
-    scored = dict(views="given", cameras=[view.camera for view in judge.views])
+    evaluator = Evaluator(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
+    scored = dict(views="given", cameras=[view.camera for view in evaluator.views])
     warm_up(wrapped, scale, wrapped.cameras)
     for name in only or ABLATIONS:
         recipe, variants = ABLATIONS[name]
         rows = []
         for variant, settings in variants.items():
             adapted = wrapped.adapt(scale, recipe=recipe, **{"patience": None, **settings, **(scored if variant == SCORED else {})})
-            rows.append(adapted_row(variant, adapted, judge))
+            rows.append(adapted_row(variant, adapted, evaluator))
         text = f"## {name}: the `{recipe}` recipe on {base} at x{scale:g}\n\n{table(rows)}\n"
         print(text, flush=True)
         output.mkdir(parents=True, exist_ok=True)

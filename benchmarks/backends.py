@@ -34,7 +34,7 @@ from mipmap_plugin.formats.atomic import write_json
 # Imports and compilation are done on this scene before anything is timed.
 WARM_UP: Name = "T"
 
-# Scenes that are measured for how costs grow; two threads tell nothing more there.
+# Scenes that are measured for how costs grow; two threads show nothing more there.
 GROWING = frozenset(name for pair in GROWTH.values() for name in pair)
 
 
@@ -53,10 +53,10 @@ def main(
         scene: A, B, C; T (tiny); N1 and N10, P1 and P10 (growth). May be repeated; by default, without checkpoints, all but T.
         checkpoint: A PLY or a model folder, of which the first view is measured. May be repeated.
         backend: A backend's name. May be repeated; by default all that can do it, and gsplat's torch twins.
-        output: Where the JSON goes.
+        output: Path of the JSON.
         runs: How many of each; the median counts.
-        keep: Add to what an older JSON holds, so that a long measurement can be made in pieces; what is measured again is replaced.
-        scaling: Compare two threads with one, which tells nothing on a busy machine and takes half of the time.
+        keep: Add to the rows of an older JSON, so that a long measurement can be done in parts; rows measured again are replaced.
+        scaling: Compare two threads with one; meaningless on a busy machine, and half of the run time.
     """
     by_default = [] if checkpoint else [name for name in SPECS if name != WARM_UP]
     sources: list[Name | Path] = [*(scene or by_default), *checkpoint]
@@ -77,12 +77,12 @@ def main(
 def installed(wanted: tuple[str, ...]) -> tuple[list[str], dict[str, str]]:
     """The backends to measure, and why the others are not. Raises SettingsError for an unknown name."""
     needs = Needs("cpu", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
-    found = survey(needs)
-    unknown = [name for name in wanted if name not in found]
+    reasons = survey(needs)
+    unknown = [name for name in wanted if name not in reasons]
     if unknown:
-        raise SettingsError(f"there is no backend {unknown[0]!r}; known are {', '.join(found)}")
-    asked = {name: found[name] for name in wanted or found}
-    return [name for name, lacks in asked.items() if not lacks], {name: "; ".join(lacks) for name, lacks in asked.items() if lacks}
+        raise SettingsError(f"there is no backend {unknown[0]!r}; known are {', '.join(reasons)}")
+    selected = {name: reasons[name] for name in wanted or reasons}
+    return [name for name, lacks in selected.items() if not lacks], {name: "; ".join(lacks) for name, lacks in selected.items() if lacks}
 
 
 def measure_all(
@@ -128,7 +128,7 @@ def facts(rows: Rows, sizes: list[Size], reasons: dict[str, str]) -> dict[str, A
 
 
 def machine() -> dict[str, Any]:
-    """Where and with what; the load tells whether wall times can be believed."""
+    """The machine and the versions; the load shows whether wall times are reliable."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     return {"cpu": _cpu(), "cpus": os.cpu_count(), "system": platform.platform(), "load_at_the_end": load, "versions": versions()}
 
@@ -144,7 +144,7 @@ def _try(failed: dict[str, str], what: str, *call: Any) -> Any:
     """The result of `fresh(*call)`; None, with the reason in `failed`, where it breaks."""
     try:
         return fresh(*call)
-    except Exception as error:  # a stranger's backend may fail in any way, or run out of memory; the others are measured all the same
+    except Exception as error:  # a third-party backend may fail in any way, or run out of memory; the others are still measured
         failed[what] = f"{type(error).__name__}: {error}"
         return None
 

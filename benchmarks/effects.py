@@ -79,7 +79,7 @@ class Bench:
         self.backend, _ = choose_backend(backend, needs)
 
     def model(self, degree: int = 3, room: int = 3) -> VanillaModel:
-        """The scene's splats with SH up to `degree`, and room for more that is zero."""
+        """The scene's splats with SH up to `degree`, and zeros up to degree `room`."""
         coefficients = self.parameters["shN"][:, : (room + 1) ** 2 - 1].clone()
         coefficients[:, (degree + 1) ** 2 - 1 :] = 0
         held = {**self.parameters, "shN": coefficients}
@@ -100,25 +100,25 @@ def pairs(bench: Bench, folder: Path) -> Iterator[Pair]:
     yield from _anchors(bench, folder)
     filtered = MipModel("mip", full, torch.full((len(full),), 0.005))
     yield Pair("3D filter", "Mip-Splatting", bench.draw(filtered.gaussians), bench.draw(full.gaussians), True)
-    given = bench.draw(lambda camera: _with_covariances(full.gaussians(camera)))
-    yield Pair("covariances", "given for the same splats", given, bench.draw(full.gaussians), False)
+    with_covariances = bench.draw(lambda camera: _with_covariances(full.gaussians(camera)))
+    yield Pair("covariances", "given for the same splats", with_covariances, bench.draw(full.gaussians), False)
     classic = bench.draw(full.gaussians)
     yield Pair("compensation", "antialiased", bench.draw(full.gaussians, Effects(3, "antialiased")), classic, True)
     yield Pair("screen filter: analytic", "Analytic-Splatting", bench.draw(full.gaussians, Effects(3, "analytic", 0.0)), classic, True)
     for n in (2, 4):
         yield Pair(f"supersampling, {n} x {n}", "any", bench.draw(full.gaussians, Effects(3, supersampling=n)), classic, True)
-    yield from _asked_for(bench, full)
+    yield from _on_request(bench, full)
     yield from _adapting(bench)
 
 
-def _asked_for(bench: Bench, model: VanillaModel) -> Iterator[Pair]:
-    """What a person asks for beside the image, or of its colors."""
+def _on_request(bench: Bench, model: VanillaModel) -> Iterator[Pair]:
+    """What a user requests besides the image, or of its colors."""
     image, camera = bench.draw(model.gaussians), bench.camera
 
     def with_(draw: Callable[..., Tensor]) -> Tensor:
         gaussians = model.gaussians(camera)
-        shown = bench.backend.render(gaussians, camera, Effects(3)).image
-        return torch.cat([shown, draw(bench.backend, gaussians, camera, Effects(3)).reshape(*camera.size, -1)], -1)
+        rendered = bench.backend.render(gaussians, camera, Effects(3)).image
+        return torch.cat([rendered, draw(bench.backend, gaussians, camera, Effects(3)).reshape(*camera.size, -1)], -1)
 
     for name, draw in {"depth": geometry.depth, "normals": geometry.normals}.items():
         yield Pair(name, "any", partial(with_, draw), image, True, change="the same, and more")
@@ -133,9 +133,9 @@ def _fields(bench: Bench) -> Iterator[Pair]:
         moved = MovingModel(name, canonical, field)
         yield Pair("time", name, bench.draw(moved.gaussians), bench.draw(canonical.gaussians), True)
     state = {name: torch.zeros_like(held) if name.startswith("gaussian_") else held for name, held in moving.deform_state().items()}
-    canonical, still = bench.model(), DeformNetwork(state)
-    asked = bench.draw(lambda camera: still(canonical, camera.time or 0.0))
-    yield Pair("time", "a still scene of Deformable-3D-Gaussians", asked, bench.draw(MovingModel("", canonical, still).gaussians), False)
+    canonical, unmoved = bench.model(), DeformNetwork(state)
+    evaluated = bench.draw(lambda camera: unmoved(canonical, camera.time or 0.0))
+    yield Pair("time", "a still scene of Deformable-3D-Gaussians", evaluated, bench.draw(MovingModel("", canonical, unmoved).gaussians), False)
 
 
 def _with_covariances(gaussians: Gaussians) -> Gaussians:
@@ -168,7 +168,7 @@ def _facing(side: float) -> Tensor:
 
 
 def _adapting(bench: Bench) -> Iterator[Pair]:
-    """What adapting may do besides, with one image of the result. No gradient is asked for here: the steps have their own."""
+    """What adapting may do besides, with one image of the result. Without gradients: those of the steps are part of them."""
     wrapped = wrap_model(VanillaModel(bench.parameters, TrainedScale()), cameras=[bench.camera], backend=bench.backend.name)
 
     def steps(scale: float, count: int | None = None, **settings: object) -> Draw:

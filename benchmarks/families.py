@@ -1,10 +1,10 @@
-"""Every family there and back: loaded, rendered, adapted, saved, loaded again and judged by true pictures.
+"""Every family end to end: loaded, rendered, adapted, saved, loaded again and compared with true images.
 
     python benchmarks/families.py
     python benchmarks/families.py --only octree --only gof --output /tmp/families
 
 Makes a small scene of each family (family_scenes.py) in a temporary folder, adapts its base to x1/4 and x4 with the `default`
-recipe, and judges what the saved file shows. Prints a Markdown table and writes families.md and families.json.
+recipe, and evaluates the saved file. Prints a Markdown table and writes families.md and families.json.
 """
 
 from __future__ import annotations
@@ -108,14 +108,14 @@ def measure(family: str, folder: Path) -> Row:
         file = folder / f"adapted_{len(changes)}"
         adapt, adapted = timed(partial(base.adapt, scale))
         save, _ = timed(partial(adapted.save, file))
-        evaluate, changes[name] = timed(partial(judge, scene, base, file, scale))
+        evaluate, changes[name] = timed(partial(compare, scene, base, file, scale))
         seconds.append((load, render, adapt, save, evaluate))
-    means = {step: fmean(each) for step, each in zip(STEPS, zip(*seconds, strict=True), strict=True)}
+    means = {step: fmean(durations) for step, durations in zip(STEPS, zip(*seconds, strict=True), strict=True)}
     return Row(kind.name, kind.limit, quality(scene, lambda view: base.render(view).image, 1.0), means, changes)
 
 
-def judge(scene: Scene, base: Wrapped, file: Path, scale: float) -> Change:
-    """The base and the adapted file, each as its own viewer draws it."""
+def compare(scene: Scene, base: Wrapped, file: Path, scale: float) -> Change:
+    """Compare the base and the adapted file with the truth, each rendered by its own convention."""
     adapted = wrap_model(file, cameras=[])
     shows = [lambda view, model=model: model.render(view.zoomed(scale)).image for model in (base, adapted)]
     qualities = [quality(scene, show, scale) for show in shows]

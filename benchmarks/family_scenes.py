@@ -1,4 +1,4 @@
-"""A small scene of each family: a checkpoint in its exact format, true pictures at every scale, and a base trained on those at x1.
+"""A small scene of each family: a checkpoint in its exact format, true images at every scale, and a base trained on those at x1.
 
 The generators are those of the tests. What they write is taken for the world: it is drawn without any dilation, many times finer than
 the pictures. The base starts from it with every number disturbed, and is trained on the pictures at x1 in the family's own
@@ -73,8 +73,8 @@ def _filtered(family: str) -> Callable[[Path], object]:
 
 def _anchors(family: str) -> Callable[[Path], object]:
     layout = anchor_checkpoints.Layout(family, features=16, splats=5, distance=("opacity_mlp",))
-    shown = {"extra_level": np.full(ANCHORS, 2.0)} if family == "octree" else {}  # every level at x1, and coarser ones from afar
-    return lambda folder: anchor_checkpoints.write(folder, layout, count=ANCHORS, **shown)
+    changes = {"extra_level": np.full(ANCHORS, 2.0)} if family == "octree" else {}  # every level at x1, and coarser ones from afar
+    return lambda folder: anchor_checkpoints.write(folder, layout, count=ANCHORS, **changes)
 
 
 def _gsplat(antialiased: str) -> Callable[[Path], object]:
@@ -112,7 +112,7 @@ class Scene:
 
 
 class Pictures:
-    """True pictures of a world, each drawn once at the finest scale and shrunk from there."""
+    """True images of a world, rendered once per view at the finest scale and shrunk from there."""
 
     def __init__(self, world: SplatModel) -> None:
         self._world, self._finest = world, dict[Camera, Tensor]()
@@ -134,7 +134,7 @@ class Pictures:
 
 
 def views(count: int, split: str, moves: bool = False) -> list[Camera]:
-    """Views all around the ball, other ones for each split, and for a moving scene at times all over 0..1."""
+    """Views all around the ball, different ones for each split, and for a moving scene at times spread over 0..1."""
     width, height = SIZE
     seen = tiny.cameras(count, seed={"train": 1, "test": 9}[split], split=split, width=width, height=height)
     return [replace(view, time=number * 5 % count / (count - 1)) for number, view in enumerate(seen)] if moves else seen

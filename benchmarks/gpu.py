@@ -50,9 +50,9 @@ class Scene:
 
     @classmethod
     def of(cls, splats: int, width: int, height: int, device: str) -> Scene:
-        made = make_to(Spec(splats, width, height, SPREAD))
-        raw = {name: torch.from_numpy(array).to(device).requires_grad_() for name, array in made.raw.items()}
-        return cls(raw, made.camera, torch.from_numpy(made.weights).to(device))
+        generated = make_to(Spec(splats, width, height, SPREAD))
+        raw = {name: torch.from_numpy(array).to(device).requires_grad_() for name, array in generated.raw.items()}
+        return cls(raw, generated.camera, torch.from_numpy(generated.weights).to(device))
 
     @property
     def parameter_bytes(self) -> int:
@@ -94,12 +94,12 @@ def main(
 def served(wanted: Sequence[str], device: str) -> tuple[list[str], dict[str, str]]:
     """The backends that can be measured on `device`, and why the others cannot."""
     found = survey(Needs(device, torch.float32, gradients=True, sh_degree=3, screen_filter="classic"))
-    asked = {name: found.get(name, ["there is no such backend"]) for name in wanted or found}
-    return [name for name, lacks in asked.items() if not lacks], {name: "; ".join(lacks) for name, lacks in asked.items() if lacks}
+    selected = {name: found.get(name, ["there is no such backend"]) for name in wanted or found}
+    return [name for name, lacks in selected.items() if not lacks], {name: "; ".join(lacks) for name, lacks in selected.items() if lacks}
 
 
 def measure_all(backends: Sequence[str], cases: Sequence[tuple[int, int, int]], device: str, runs: int) -> tuple[list[Speed], list[Failure]]:
-    """Every backend on every (splats, width, height). What one cannot do, for want of memory say, does not end the others."""
+    """Every backend on every (splats, width, height). A failure of one, such as too little memory, does not end the others."""
     rows, failures = [], []
     for count, width, height in cases:
         scene = Scene.of(count, width, height, device)
@@ -163,7 +163,7 @@ def save(
     failed = {name: [outcome.case for outcome in outcomes if not outcome.passed] for name, outcomes in checked.items()}
     records = {"machine": known, "copied_bytes_per_second": bandwidth, "failed_cases": failed}
     lists = {"speed": rows, "not_measured": failures, "adaptation": adapted}
-    write_json(folder / f"{name}.json", records | {key: [asdict(row) for row in each] for key, each in lists.items()}, overwrite=True)
+    write_json(folder / f"{name}.json", records | {key: [asdict(row) for row in entries] for key, entries in lists.items()}, overwrite=True)
     (folder / f"{name}.md").write_text(text + "\n")
 
 

@@ -1,4 +1,4 @@
-"""Real bases adapted on a GPU to their knee, judged on real test images as on the processor (protocol P3)."""
+"""Real bases adapted on a GPU to their knee, evaluated on real test images as on the processor (protocol P3)."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def _of_base(data: Path, base: str, backend: str, device: str, settings: dict) -
     here = load_model(data / "checkpoints" / "bases" / base)
     wrapped = wrap_model(here.to(device), cameras=own_cameras(here), backend=backend)
     scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
-    judge = Evaluator(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"])
+    evaluator = Evaluator(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"])
     wrapped.adapt(1 / 2, **{**settings, "steps": 10})  # compiles what is to be compiled
     rows = []
     for scale in SCALES[base]:
         if scale == 1:
             continue
         adapted = wrapped.adapt(scale, **settings)
-        report, psnr_db = adapted.report, adapted_row("", adapted, judge).psnr_db
+        report, psnr_db = adapted.report, adapted_row("", adapted, evaluator).psnr_db
         steps = report.curve[-1].step if report.curve else 0
         took = dict(seconds=report.seconds["total"], steps=steps, ended_by=report.ended_by, peak_mib=report.peak_memory_mib)
         rows.append(Adaptation(base, scale, backend, psnr_db=psnr_db, processor_db=on_processor(base, scale), **took))

@@ -38,16 +38,16 @@ def write(path: Path, splats: int, chunk: int = 50_000) -> Path:
     return path
 
 
-def peak() -> int:
-    """Bytes that this process held at most. Linux tells them of the process alone; `getrusage` counts what its parent held, too."""
+def peak_memory() -> int:
+    """Peak memory of this process, bytes. On Linux of the process alone; `getrusage` includes that of its parent."""
     if STATUS.exists():
         return 1024 * int(re.search(r"VmHWM:\s+(\d+) kB", STATUS.read_text())[1])
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def held() -> int:
-    """Bytes that this process holds now; where the system does not tell, what it held at most."""
-    return 1024 * int(re.search(r"VmRSS:\s+(\d+) kB", STATUS.read_text())[1]) if STATUS.exists() else peak()
+def memory_in_use() -> int:
+    """Memory of this process now, bytes; its peak where the system does not report it."""
+    return 1024 * int(re.search(r"VmRSS:\s+(\d+) kB", STATUS.read_text())[1]) if STATUS.exists() else peak_memory()
 
 
 def load(path: Path) -> None:
@@ -56,9 +56,9 @@ def load(path: Path) -> None:
     from mipmap_plugin.models.vanilla import load_vanilla  # imports are not billed
 
     del load_vanilla
-    before, began = held(), time.perf_counter()
+    before, began = memory_in_use(), time.perf_counter()
     model = load_model(path)
-    print(time.perf_counter() - began, peak() - before, len(model.parameters()["means"]))
+    print(time.perf_counter() - began, peak_memory() - before, len(model.parameters()["means"]))
 
 
 def measure(path: Path) -> tuple[float, int, int]:
@@ -73,12 +73,12 @@ def main() -> None:
     parser.add_argument("--splats", type=int, default=1_000_000)
     parser.add_argument("--checkpoint", type=Path, help="a PLY of yours, instead of a generated one")
     parser.add_argument("--load", type=Path, help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.load:
-        load(asked.load)
+    options = parser.parse_args()
+    if options.load:
+        load(options.load)
         return
     with tempfile.TemporaryDirectory() as folder:
-        path = asked.checkpoint or write(Path(folder) / "large.ply", asked.splats)
+        path = options.checkpoint or write(Path(folder) / "large.ply", options.splats)
         size = path.stat().st_size
         runs = [measure(path) for _ in range(RUNS)]
     seconds = sorted(run[0] for run in runs)

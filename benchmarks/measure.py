@@ -126,7 +126,7 @@ def measure_scaling(backend: str, file: Path, runs: int) -> Scaling:
 
 
 def _neighbor(backend: str, file: Path, far: Connection) -> None:
-    """Does the same on one thread, once each time it is asked to."""
+    """Does the same on one thread, once per request."""
     torch.set_num_threads(1)
     job = Job(backend, file)
     while far.recv():

@@ -1,4 +1,4 @@
-"""How exact the backends are: float32 against float64 over scale, distance and shape, and the field's known faults beside ours.
+"""How exact the backends are: float32 against float64 over scale, distance and shape, and known errors of usual formulas beside our own.
 
     python benchmarks/numerics.py          # a minute; prints the tables, writes results/numerics.md and docs/numerics.png
 
@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from numerics_usual import UsualFormulas, gsplat_compensation_slope, mip_light, published_gradient_share, unnormalized_axes
+from numerics_usual import UsualFormulas, gsplat_compensation_slope, mip_compensation, published_gradient_share, unnormalized_axes
 
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.conformance.cases import HardCase, crowd, far_from_the_origin, odd_row, view
@@ -70,7 +70,7 @@ def _gap(actual: Answer, exact: Answer) -> tuple[float, float]:
     return image, max(gradients, default=0.0)
 
 
-# The field's faults, each measured on the least that shows it.
+# Known errors of usual formulas, each measured on the smallest example.
 
 
 def vanishing_gradients() -> list[Row]:
@@ -79,8 +79,8 @@ def vanishing_gradients() -> list[Row]:
     for zoom in (1, 1 / 4, 1 / 16, 1 / 64):
         eps2d = 0.3 * zoom
         share = published_gradient_share(torch.tensor(eps2d**2, dtype=torch.float64))
-        ours = _scale_gradient(eps2d, torch.float32) / _scale_gradient(eps2d, torch.float64)
-        rows.append((f"{eps2d:.3g}", f"{float(share):.3f}", f"{ours:.6f}"))
+        own = _scale_gradient(eps2d, torch.float32) / _scale_gradient(eps2d, torch.float64)
+        rows.append((f"{eps2d:.3g}", f"{float(share):.3f}", f"{own:.6f}"))
     return rows
 
 
@@ -97,10 +97,10 @@ def compensation_slopes() -> list[Row]:
     floor, rows = LEAST_COMPENSATION["antialiased"], []
     for ratio in (1e-2, 1e-4, 1e-5, 1e-6, 1e-8):
         value = torch.tensor([ratio], dtype=torch.float64, requires_grad=True)
-        ours = torch.autograd.grad(_compensation(value).sum(), value)[0]
+        own = torch.autograd.grad(_compensation(value).sum(), value)[0]
         step = ratio * 1e-4
         exact = (_compensation(value.detach() + step) - _compensation(value.detach() - step)) / (2 * step)
-        rows.append((f"{ratio:g}", f"{float(exact):.4g}", f"{float(gsplat_compensation_slope(value.detach(), floor)):.4g}", f"{float(ours):.4g}"))
+        rows.append((f"{ratio:g}", f"{float(exact):.4g}", f"{float(gsplat_compensation_slope(value.detach(), floor)):.4g}", f"{float(own):.4g}"))
     return rows
 
 
@@ -119,8 +119,8 @@ def deleted_light() -> list[Row]:
     for sigma in (1.0, 0.1, 0.05, 0.032, 0.03, 0.01, 0.001):
         det = torch.tensor([sigma**4])
         round_ = Projected(torch.zeros(1, 2), torch.ones(1), det.sqrt(), torch.zeros(1), det.sqrt(), det)
-        ours = footprint(round_, torch.ones(1), "mip", 0.1).opacities
-        rows.append((f"{sigma:g}", f"{sigma**2 / (sigma**2 + 0.1):.5f}", f"{float(mip_light(det, 0.1)):.5f}", f"{float(ours):.5f}"))
+        own = footprint(round_, torch.ones(1), "mip", 0.1).opacities
+        rows.append((f"{sigma:g}", f"{sigma**2 / (sigma**2 + 0.1):.5f}", f"{float(mip_compensation(det, 0.1)):.5f}", f"{float(own):.5f}"))
     return rows
 
 
@@ -133,12 +133,12 @@ def determinants(turns: int = 2000) -> list[Row]:
         factor = (axes * torch.tensor([length, 0.01], dtype=torch.float64)).float()
         factor = torch.cat([factor, torch.zeros(turns, 2, 1)], -1)
         exact = _dilated_det(factor.double())
-        ours = _dilated_det(factor)
+        own = _dilated_det(factor)
         xx, xy, yy, _ = _from_factors(factor)
         usual = (xx + 0.3) * (yy + 0.3) - xy * xy
-        off = [((det.double() - exact).abs() / exact) for det in (usual, ours)]
+        off = [((det.double() - exact).abs() / exact) for det in (usual, own)]
         rows.append((f"{length:g}", f"{off[0].max():.1e}", f"{float((usual <= 0).double().mean()):.1%}", f"{off[1].max():.1e}", "0.0%"))
-        assert (ours > 0).all()
+        assert (own > 0).all()
     return rows
 
 
@@ -147,17 +147,17 @@ def _dilated_det(factor: torch.Tensor) -> torch.Tensor:
     return det + 0.3 * (xx + yy) + 0.3**2
 
 
-def cut_light() -> list[Row]:
-    """400 faint splats over a frame, zoomed out: the light that the cut at 1/255 takes, with the antialiased filter."""
+def lost_by_cutting() -> list[Row]:
+    """400 faint splats over a frame, zoomed out: the alpha that the cut at 1/255 removes, with the antialiased filter."""
     rows = []
     splats = crowd(400, degree=0)
     faint = Gaussians(splats.means, splats.quats, splats.scales / 8, splats.opacities / 4, splats.sh)
     for zoom in (1, 1 / 2, 1 / 4, 1 / 8):
         camera = view(64, 48).zoomed(zoom)
-        light = []
+        coverage = []
         for settings in (RenderSettings(), RenderSettings(min_alpha=1e-6)):
-            light.append(float(get_backend("reference").render(faint, camera, Effects(0, "antialiased", settings=settings)).alpha.mean()))
-        rows.append((f"x1/{round(1 / zoom)}", f"{1 - light[0] / light[1]:.1%}"))
+            coverage.append(float(get_backend("reference").render(faint, camera, Effects(0, "antialiased", settings=settings)).alpha.mean()))
+        rows.append((f"x1/{round(1 / zoom)}", f"{1 - coverage[0] / coverage[1]:.1%}"))
     return rows
 
 
@@ -188,7 +188,7 @@ FAULTS: dict[str, tuple[Row, Callable[[], list[Row]]]] = {
         ("length, px", "xx·yy - xy²: worst relative error", "of them ≤ 0", "here: worst", "of them ≤ 0"),
         determinants,
     ),
-    "Light lost to the cut at 1/255": (("zoom", "lost, of what there is without the cut"), cut_light),
+    "Light lost to the cut at 1/255": (("zoom", "lost, of what there is without the cut"), lost_by_cutting),
     "Mean alpha of a scene that comes close": (("distance, units", "near plane 0.2", "near plane 0.001"), near_planes),
     "Volume of a splat with a quaternion that is not of length 1": (("norm", "as the kernel of 3DGS sees it", "here"), quaternions),
 }

@@ -1,4 +1,4 @@
-"""The field's usual formulas, a few lines each, to be measured beside ours. What is published is named; the words are our own."""
+"""Usual formulas of the field, a few lines each, for comparison. Each names its source; none is copied."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class UsualFormulas:
 
 
 def flattened(gaussians: Gaussians, place: Tensor, camera: Camera) -> Tensor:
-    """[N, 2, 2] px²: J W Σ Wᵀ Jᵀ, with Σ made first."""
+    """[N, 2, 2] px²: J W Σ Wᵀ Jᵀ, with Σ computed first."""
     half = place.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2 * (1 + FRUSTUM_MARGIN)
     u, v = (place[:, :2] / place[:, 2:]).clamp(-half, half).unbind(-1)
     zero, z = torch.zeros_like(u), place[:, 2]
@@ -73,11 +73,11 @@ def gsplat_compensation_slope(ratio: Tensor, floor: float) -> Tensor:
     return 0.5 / (ratio.sqrt().clamp_min(floor) + 1e-6)
 
 
-def mip_light(det: Tensor, eps2d: float) -> Tensor:
-    """The share of its opacity that Mip-Splatting leaves to a round splat: none at all where det is 1e-6 px⁴ or less."""
+def mip_compensation(det: Tensor, eps2d: float) -> Tensor:
+    """Mip-Splatting's compensation of a round splat's opacity: 0 where det is 1e-6 px⁴ or less."""
     variance = det.sqrt()
-    light = ((det / ((variance + eps2d) ** 2 + 1e-6)) + 1e-6).sqrt()
-    return torch.where(det <= 1e-6, 0.0, light)
+    compensation = ((det / ((variance + eps2d) ** 2 + 1e-6)) + 1e-6).sqrt()
+    return torch.where(det <= 1e-6, 0.0, compensation)
 
 
 def unnormalized_axes(quats: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A Markdown page of what was measured on each base, made from the JSON of all of them, so that bases can be measured one at a time."""
+"""A Markdown page of what was measured on each base, written from the JSON files of all, so that bases can be measured one at a time."""
 
 from __future__ import annotations
 

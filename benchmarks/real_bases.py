@@ -3,7 +3,7 @@
     python benchmarks/real_bases.py DATA --only lego_200 --output benchmarks/results
 
 DATA holds `checkpoints/bases/<scene>_<px>` (3DGS model folders) and `images/<scene>` (NeRF-Synthetic folders). Writes
-<base>.json, the rows of `mipmap-plugin evaluate --json`, for each base, and real_bases.md from all that lie in the output folder. Rows of
+<base>.json, the rows of `mipmap-plugin evaluate --json`, for each base, and real_bases.md from all in the output folder. Rows of
 recipes that are not measured again are kept.
 """
 

@@ -4,7 +4,7 @@
     python benchmarks/viewers.py DATA --only lego_200 --scale 0.25 --leave-out viewer
 
 Needs what tests/browser/README.md installs, the rival too. DATA is that of real_bases.py. Writes viewers/<base>.json for each base, and
-viewers.md and viewers.png from all that lie there. Files and viewers that are not measured again keep their rows.
+viewers.md and viewers.png from all in that folder. Files and viewers that are not measured again keep their rows.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Work:
-    """What files are made of."""
+    """The inputs of the files."""
 
     base: Wrapped
     scale: float
@@ -151,7 +151,7 @@ def main(
         for at in scale or SCALES:
             with tempfile.TemporaryDirectory() as folder, Browser() as browser:
                 work = Work(wrapped, at, Path(folder))
-                rows = [row for name in viewer or VIEWERS for row in shown(browser, work, base, name, files, views, pictures)]
+                rows = [row for name in viewer or VIEWERS for row in rows_of_viewer(browser, work, base, name, files, views, pictures)]
             keep(pictures / f"{base}.json", rows)
     measured = [Row(**row) for file in sorted(pictures.glob("*.json"), reverse=True) for row in json.loads(file.read_text())]
     (output / "viewers.md").write_text(page(measured))
@@ -159,10 +159,10 @@ def main(
         drawn.save(output / "viewers.png")
 
 
-def shown(
+def rows_of_viewer(
     browser: Browser, work: Work, base: str, viewer: str, files: Sequence[str], views: Sequence[TestView], pictures: Path
 ) -> list[Row]:
-    """Every file in one viewer. What the picture is made of is written beside the rows."""
+    """Rows of every file in one viewer; the screenshots for the figure are written too."""
     rows = []
     truths = [view.truth(work.scale, PROTOCOL) for view in views]
     for name in files:
@@ -193,9 +193,9 @@ def count_of(ply: Path) -> int:
 def keep(file: Path, rows: Sequence[Row]) -> None:
     """Write the rows, beside those of an earlier run that were not measured again."""
     before = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
-    found = {(row.scale, row.viewer, row.file): row for row in (*before, *rows)}
+    latest = {(row.scale, row.viewer, row.file): row for row in (*before, *rows)}
     ranks = {name: rank for rank, name in enumerate((*VIEWERS, *FILES))}
-    ordered = sorted(found.values(), key=lambda row: (-row.scale, ranks[row.viewer], ranks[row.file]))
+    ordered = sorted(latest.values(), key=lambda row: (-row.scale, ranks[row.viewer], ranks[row.file]))
     write_json(file, [asdict(row) for row in ordered], overwrite=True)
 
 
@@ -217,16 +217,16 @@ def cell(row: Row | None) -> str:
 
 def mosaic(pictures: Path) -> Image.Image | None:
     """A row for each viewer: the truth, then every file; None where the picture's base was not measured."""
-    found = {viewer: {name: pictures / f"{viewer}_{name}.png" for name in FILES} for viewer in VIEWERS}
-    viewers = [viewer for viewer, files in found.items() if any(path.exists() for path in files.values())]
-    names = [name for name in FILES if any(found[viewer][name].exists() for viewer in viewers)]
+    screenshots = {viewer: {name: pictures / f"{viewer}_{name}.png" for name in FILES} for viewer in VIEWERS}
+    viewers = [viewer for viewer, files in screenshots.items() if any(path.exists() for path in files.values())]
+    names = [name for name in FILES if any(screenshots[viewer][name].exists() for viewer in viewers)]
     if not viewers:
         return None
     gap, margin = 10, 20
     sheet = Image.new("RGB", ((HEIGHT + gap) * (len(names) + 1), (HEIGHT + gap + margin) * len(viewers)), "white")
     pen = ImageDraw.Draw(sheet)
     for row, viewer in enumerate(viewers):
-        for column, (title, path) in enumerate([("photograph", pictures / "truth.png"), *((name, found[viewer][name]) for name in names)]):
+        for column, (title, path) in enumerate([("photograph", pictures / "truth.png"), *((name, screenshots[viewer][name]) for name in names)]):
             corner = (column * (HEIGHT + gap), row * (HEIGHT + gap + margin))
             pen.text((corner[0] + 4, corner[1] + 4), f"{viewer}: {title}" if column else title, fill="black")
             if path.exists():

@@ -1,4 +1,4 @@
-"""What is measured on: raw parameters, one view and a loss, made once and handed to every measuring process as a file."""
+"""What is measured on: raw parameters, one view and a loss, generated once and passed to every measuring process as a file."""
 
 from __future__ import annotations
 

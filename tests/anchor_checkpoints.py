@@ -42,34 +42,34 @@ def weights(layout: Layout, seed: int = 0) -> dict[str, dict[str, np.ndarray]]:
     random = np.random.default_rng(seed)
     outputs = {"opacity_mlp": layout.splats, "cov_mlp": 7 * layout.splats, "color_mlp": 3 * layout.splats}
     outputs |= {"feature_bank_mlp": 3} if layout.bank else {}
-    found = {}
+    states = {}
     for name, count in outputs.items():
         width, hidden = layout.inputs(name), layout.features
         shapes = {"0.weight": (hidden, width), "0.bias": (hidden,), "2.weight": (count, hidden), "2.bias": (count,)}
-        found[name] = {key: (random.normal(size=shape) / shape[-1] ** 0.5).astype(np.float32) for key, shape in shapes.items()}
+        states[name] = {key: (random.normal(size=shape) / shape[-1] ** 0.5).astype(np.float32) for key, shape in shapes.items()}
     if layout.appearance:
-        found["appearance"] = {"embedding.weight": random.normal(size=layout.appearance).astype(np.float32)}
-    return found
+        states["appearance"] = {"embedding.weight": random.normal(size=layout.appearance).astype(np.float32)}
+    return states
 
 
 def columns(layout: Layout, count: int = 40, seed: int = 0, **changed: np.ndarray) -> dict[str, np.ndarray]:
     """The columns of the PLY in the original's order, f4. Some anchors' quaternions are turned, though the originals never turn them."""
     random = np.random.default_rng(seed)
     normal = lambda: random.normal(size=count)  # noqa: E731
-    found = {name: 0.5 * normal() for name in "xyz"}
+    values = {name: 0.5 * normal() for name in "xyz"}
     if layout.family == "octree":
-        found |= {"level": random.integers(0, 4, count).astype(float), "extra_level": 0.3 * normal(), "info": np.zeros(count)}
-        found["level"][:4], found["info"][:2] = [0, 1, 2, 3], [VOXEL, STANDARD]
-        smaller = np.log(2) * found["level"]
+        values |= {"level": random.integers(0, 4, count).astype(float), "extra_level": 0.3 * normal(), "info": np.zeros(count)}
+        values["level"][:4], values["info"][:2] = [0, 1, 2, 3], [VOXEL, STANDARD]
+        smaller = np.log(2) * values["level"]
     else:
-        found |= {name: np.zeros(count) for name in ("nx", "ny", "nz")}
+        values |= {name: np.zeros(count) for name in ("nx", "ny", "nz")}
         smaller = 0.0
-    found |= {f"f_offset_{i}": 0.5 * normal() for i in range(3 * layout.splats)}
-    found |= {f"f_anchor_feat_{i}": normal() for i in range(layout.features)}
-    found |= {"opacity": np.full(count, -2.1972246)}
-    found |= {f"scale_{i}": np.log(0.1 if i < 3 else 0.08) - smaller + 0.5 * normal() for i in range(6)}
-    found |= {f"rot_{i}": (i == 0) + 0.3 * normal() for i in range(4)}
-    return {name: column.astype(np.float32) for name, column in (found | changed).items()}
+    values |= {f"f_offset_{i}": 0.5 * normal() for i in range(3 * layout.splats)}
+    values |= {f"f_anchor_feat_{i}": normal() for i in range(layout.features)}
+    values |= {"opacity": np.full(count, -2.1972246)}
+    values |= {f"scale_{i}": np.log(0.1 if i < 3 else 0.08) - smaller + 0.5 * normal() for i in range(6)}
+    values |= {f"rot_{i}": (i == 0) + 0.3 * normal() for i in range(4)}
+    return {name: column.astype(np.float32) for name, column in (values | changed).items()}
 
 
 def write(folder: Path, layout: Layout = Layout(), iteration: int = 30_000, cfg: bool = True, **options) -> Path:

@@ -75,7 +75,7 @@ def open_state(path: Path) -> None:
 
 
 def open_exchange(path: Path) -> None:
-    """What is only told how to be converted counts as read."""
+    """A format for which the error names the command that converts it counts as read."""
     try:
         open_checkpoint(path)
     except CheckpointError as error:

@@ -32,11 +32,11 @@ def brute_force(gaussians, camera, eps2d=0.3, background=(0.0, 0.0, 0.0), screen
     return image + through[..., None] * torch.tensor(background, dtype=torch.float64), 1 - through
 
 
-def dilated(covariance, offset, eps2d, least_light=1.0):
-    """The Gaussian of `covariance` + eps2d·I at each offset [H, W, 2], dimmed to the light that it had, but not below `least_light`."""
+def dilated(covariance, offset, eps2d, least_compensation=1.0):
+    """The Gaussian of `covariance` + eps2d·I at each offset [H, W, 2], scaled to keep its integral, but by `least_compensation` at least."""
     wider = covariance + eps2d * torch.eye(2, dtype=torch.float64)
-    light = (torch.linalg.det(covariance) / torch.linalg.det(wider)).clamp(least_light**2, 1).sqrt()
-    return light * torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(wider), offset))
+    compensation = (torch.linalg.det(covariance) / torch.linalg.det(wider)).clamp(least_compensation**2, 1).sqrt()
+    return compensation * torch.exp(-0.5 * torch.einsum("hwi,ij,hwj->hw", offset, torch.linalg.inv(wider), offset))
 
 
 def alone(falloff, covariance, offset, eps2d, opacity):
@@ -86,8 +86,8 @@ def below(x):
 
 FALLOFFS = {
     "classic": dilated,
-    "antialiased": partial(dilated, least_light=0.005),
-    "mip": partial(dilated, least_light=0.001),
+    "antialiased": partial(dilated, least_compensation=0.005),
+    "mip": partial(dilated, least_compensation=0.001),
     "analytic": integrated,
 }
 

@@ -1,8 +1,8 @@
-"""A device that is none: tensors that say that they lie elsewhere, and lie in the processor's memory all the same.
+"""A pretended device: tensors report another device, and are in the memory of the CPU.
 
-Operations on them compute what a processor does, so that results can be compared to the last bit; one that mixes them with tensors of the
-processor fails as on a GPU, as does one that torch has for processors alone; one for whose answer the host would have to wait for a GPU is noted,
-with the line that asks.
+Operations on them compute what the CPU does, so that results can be compared bit by bit. One that mixes them with tensors of the CPU fails
+as on a GPU, as does one that torch implements for the CPU only. One whose result the host would have to wait for is recorded, with the
+line that calls it.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class Device(TorchDispatchMode):
             self.waits[_asker()] += 1
         if target is not None:
             kwargs["device"] = torch.device("cpu")
-        made = func(*tree_map(_inner, args), **tree_map(_inner, kwargs))
-        return _wrapped(made, tensors) if goes_there else made
+        result = func(*tree_map(_inner, args), **tree_map(_inner, kwargs))
+        return _wrapped(result, tensors) if goes_there else result
 
     @staticmethod
     def _waits(func, args, comes_back: bool) -> bool:
@@ -114,10 +114,10 @@ def _inner(value):
     return value.inner if isinstance(value, Pretended) else value
 
 
-def _wrapped(made, tensors):
+def _wrapped(result, tensors):
     """What was written in place stays the tensor that it was."""
     known = {id(tensor.inner): tensor for tensor in tensors if isinstance(tensor, Pretended)}
-    return tree_map(lambda part: (known[id(part)] if id(part) in known else Pretended(part)) if isinstance(part, torch.Tensor) else part, made)
+    return tree_map(lambda part: (known[id(part)] if id(part) in known else Pretended(part)) if isinstance(part, torch.Tensor) else part, result)
 
 
 def _asker() -> str:

@@ -39,13 +39,13 @@ def test_evaluate_says_which_it_took_and_can_take_upstreams(tmp_path, layout, ca
     checkpoints.write(tmp_path / "m", layout)
     write_cameras(tmp_path / "m/cameras.json", tiny.cameras())
     tiny.scene(tmp_path / "scene")
-    told = {}
+    reports = {}
     for appearance in ("mean", "upstream"):
         arguments = ["evaluate", str(tmp_path / "m"), "--images", str(tmp_path / "scene"), "--scale", "1", "--appearance", appearance, "--json"]
         assert main(arguments) == 0
-        told[appearance] = json.loads(capsys.readouterr().out)
-    decibels = [told[appearance]["rows"][0]["psnr_db"] for appearance in told]
-    notes = {appearance: [note for note in facts["notes"] if "appearance" in note] for appearance, facts in told.items()}
+        reports[appearance] = json.loads(capsys.readouterr().out)
+    decibels = [reports[appearance]["rows"][0]["psnr_db"] for appearance in reports]
+    notes = {appearance: [note for note in facts["notes"] if "appearance" in note] for appearance, facts in reports.items()}
     if layout is WITH:
         assert decibels[0] != decibels[1]
         assert "mean appearance" in notes["mean"][0] and "same number" in notes["upstream"][0]

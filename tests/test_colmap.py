@@ -84,11 +84,11 @@ def test_a_checkpoint_with_cfg_args_has_its_principal_point_in_the_middle(tmp_pa
     assert (camera.cx, camera.cy) == (16, 12)
 
 
-def test_what_was_assumed_is_told(tmp_path):
+def test_notes_say_what_was_assumed(tmp_path):
     write_text_model(tmp_path / "sparse/0", names(9))
     write_photographs(tmp_path / "images", ["000.png", "003.png"])
-    told = " ".join(load_scene(tmp_path, {"eval": False}).notes)
-    assert "every 8th is for testing" in told and "7 of 9 photographs" in told and "not held out" in told
+    notes = " ".join(load_scene(tmp_path, {"eval": False}).notes)
+    assert "every 8th is for testing" in notes and "7 of 9 photographs" in notes and "not held out" in notes
 
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])

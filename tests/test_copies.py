@@ -1,4 +1,4 @@
-"""A copy is no file: what is adapted again is named by its own numbers."""
+"""Copies have no digest of a file; a report of adapting one names the digest of its parameters."""
 
 import anchor_checkpoints
 import mip_checkpoints

@@ -144,12 +144,12 @@ def test_a_row_with_nan_changes_no_other_row(field):
     g = gaussians(50, dtype=torch.float32)
     tensors = {f.name: getattr(g, f.name).clone() for f in fields(g) if getattr(g, f.name) is not None}
     tensors[field][20] = math.nan
-    others = torch.arange(50) != 20
+    rest = torch.arange(50) != 20
     image, _, grads = draw(Gaussians(**tensors), camera(), Effects(1))
-    expected_image, _, expected_grads = draw(g[others], camera(), Effects(1))
+    expected_image, _, expected_grads = draw(g[rest], camera(), Effects(1))
     assert torch.equal(image, expected_image)
     for name, grad in grads.items():
-        assert torch.equal(grad[others], expected_grads[name]) and not grad[20].any()
+        assert torch.equal(grad[rest], expected_grads[name]) and not grad[20].any()
 
 
 @needs_numba

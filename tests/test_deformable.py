@@ -74,12 +74,12 @@ def test_every_variant_agrees_with_an_independent_evaluation(tmp_path, timenet, 
     model = load_model(moving.write_deformable(tmp_path / "m", state))
     raw = {name: tensor.double().numpy() for name, tensor in model.parameters().items()}
     for time in (0.0, 0.37, 1.0):
-        shown = model.gaussians(moving.at(time))
+        splats = model.gaussians(moving.at(time))
         for row in range(0, 60, 7):
             mean, covariance = oracle(state, raw["means"][row], raw["quats"][row], raw["scales"][row], time)
-            np.testing.assert_allclose(shown.means[row].numpy(), mean, atol=1e-5)
-            np.testing.assert_allclose(shown.covariances[row].numpy(), covariance, atol=1e-5 * np.abs(covariance).max())
-        assert torch.equal(shown.opacities, model.parameters()["opacities"].sigmoid())
+            np.testing.assert_allclose(splats.means[row].numpy(), mean, atol=1e-5)
+            np.testing.assert_allclose(splats.covariances[row].numpy(), covariance, atol=1e-5 * np.abs(covariance).max())
+        assert torch.equal(splats.opacities, model.parameters()["opacities"].sigmoid())
 
 
 def test_scales_that_turn_negative_show_what_the_kernel_squares(tmp_path):
@@ -87,10 +87,10 @@ def test_scales_that_turn_negative_show_what_the_kernel_squares(tmp_path):
     state["gaussian_scaling.bias"] -= 0.3  # longer than any splat
     model = load_model(moving.write_deformable(tmp_path / "m", state))
     raw = {name: tensor.double().numpy() for name, tensor in model.parameters().items()}
-    shown = model.gaussians(moving.at(0.5))
-    assert (raw["scales"] < np.log(0.2)).all() and (shown.scales > 0).all()
+    splats = model.gaussians(moving.at(0.5))
+    assert (raw["scales"] < np.log(0.2)).all() and (splats.scales > 0).all()
     _, covariance = oracle(state, raw["means"][3], raw["quats"][3], raw["scales"][3], 0.5)
-    np.testing.assert_allclose(shown.covariances[3].numpy(), covariance, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(splats.covariances[3].numpy(), covariance, rtol=1e-4, atol=1e-6)
 
 
 def test_a_screw_without_a_turn_is_a_shift_and_its_gradient_is_finite():
@@ -110,7 +110,7 @@ def test_screws_of_any_angle_follow_the_published_formula(angle):
     k = cross_matrix(w)
     turned = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
     expected = turned @ point + (angle * np.eye(3) + (1 - np.cos(angle)) * k + (angle - np.sin(angle)) * k @ k) @ v
-    moved = move_along_screw(*(torch.tensor(each, dtype=torch.float64)[None] for each in (point, angle * axis, shift)))
+    moved = move_along_screw(*(torch.tensor(vector, dtype=torch.float64)[None] for vector in (point, angle * axis, shift)))
     np.testing.assert_allclose(moved[0].numpy(), expected, rtol=1e-8, atol=1e-8)
 
 
@@ -121,10 +121,10 @@ def test_no_gradient_passes_through_the_network(tmp_path):
     assert student.parameters()["scales"].grad is None
 
 
-def test_a_camera_without_time_shows_the_moment_0(tmp_path):
+def test_a_camera_without_a_time_renders_time_0(tmp_path):
     model = load_model(moving.write_deformable(tmp_path / "m"))
-    still, start, later = (model.gaussians(moving.at(time)).means for time in (None, 0.0, 1.0))
-    assert torch.equal(still, start) and not torch.equal(start, later)
+    timeless, start, later = (model.gaussians(moving.at(time)).means for time in (None, 0.0, 1.0))
+    assert torch.equal(timeless, start) and not torch.equal(start, later)
     assert any("without a time shows the moment 0" in note for note in model.notes)
 
 
@@ -154,7 +154,7 @@ def test_what_is_saved_loads_again_and_is_laid_out_as_the_project_reads_it(tmp_p
     assert [name for name in names if name.startswith(("scale_", "rot"))] == [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def test_a_single_ply_has_no_room_for_the_network(tmp_path):
+def test_a_single_ply_cannot_hold_the_network(tmp_path):
     model = load_model(moving.write_deformable(tmp_path / "m"))
     with pytest.raises(SettingsError, match=r"give a folder, such as .*out"):
         model.save(tmp_path / "out.ply", provenance={})
@@ -194,9 +194,9 @@ def test_splats_without_the_network_of_their_iteration_are_passed_over(tmp_path)
     newer = folder / "point_cloud/iteration_30000/point_cloud.ply"
     newer.parent.mkdir()
     tiny.ply(newer)
-    found = detect(folder)
-    assert (found.family, found.iteration) == ("deformable", 7000)
-    assert "lacks the network that moves its splats" in found.notes[0]
+    checkpoint = detect(folder)
+    assert (checkpoint.family, checkpoint.iteration) == ("deformable", 7000)
+    assert "lacks the network that moves its splats" in checkpoint.notes[0]
     with pytest.raises(CheckpointError, match=r"deform/iteration_30000/deform\.pth"):
         load_model(folder, iteration=30_000)
 

@@ -86,8 +86,8 @@ def test_result_folders_of_gsplat_and_splatfacto(tmp_path):
         for name in [*names, strays[family]]:
             (tmp_path / family / name).parent.mkdir(parents=True, exist_ok=True)
             torch.save(contents[family], tmp_path / family / name)
-        found = detect(tmp_path / family)
-        assert (found.family, found.path, found.iteration) == (family, tmp_path / family / names[0], 29_999)
+        checkpoint = detect(tmp_path / family)
+        assert (checkpoint.family, checkpoint.path, checkpoint.iteration) == (family, tmp_path / family / names[0], 29_999)
 
 
 @pytest.mark.parametrize(
@@ -111,8 +111,8 @@ def test_newest_iteration_by_number_among_strays(tmp_path):
     write_splats(folder / "point_cloud/iteration_30000/point_cloud.ply")
     (folder / "point_cloud/.DS_Store").touch()
     (folder / "point_cloud/coarse_iteration_99999").mkdir()
-    found = detect(folder)
-    assert (found.iteration, found.folder, found.notes) == (30000, folder, ())
+    checkpoint = detect(folder)
+    assert (checkpoint.iteration, checkpoint.folder, checkpoint.notes) == (30000, folder, ())
     assert detect(folder, iteration=7000).iteration == 7000
     assert detect(folder / "point_cloud/iteration_7000/point_cloud.ply").folder == folder
 
@@ -121,10 +121,10 @@ def test_an_incomplete_newest_iteration_is_passed_over_with_a_note(tmp_path):
     folder = write_model_folder(tmp_path / "m", 7000)
     newest = write_splats(folder / "point_cloud/iteration_30000/point_cloud.ply")
     newest.write_bytes(newest.read_bytes()[:-1])
-    found = detect(folder)
-    assert found.iteration == 7000
-    assert "iteration_7000 is used, since" in found.notes[0]
-    assert "truncated" in found.notes[0]
+    checkpoint = detect(folder)
+    assert checkpoint.iteration == 7000
+    assert "iteration_7000 is used, since" in checkpoint.notes[0]
+    assert "truncated" in checkpoint.notes[0]
     with pytest.raises(CheckpointError, match="truncated"):
         detect(folder, iteration=30000)
 

@@ -1,4 +1,4 @@
-"""Exchange formats are told by their bytes, whatever they are called, and go through splat-transform, or name the command that installs it."""
+"""Exchange formats are recognized by their bytes, not names, and go through splat-transform; without it the error names the command to install it."""
 
 import gzip
 import hashlib
@@ -30,7 +30,7 @@ SPZ = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20)
 
 MADE = [("spz", SPZ), ("spz", gzip.compress(SPZ)), ("ksplat", b"\0\1\0\0" + bytes(6000)), ("splat", RECORD * 3)]
 
-# What stands in for splat-transform: it answers with the PLY beside it, and notes down what it was asked.
+# A stand-in for splat-transform: it returns the PLY beside it, and records its arguments.
 STAND_IN = """#!{python}
 import json, pathlib, shutil, sys
 here = pathlib.Path(__file__).parent
@@ -54,7 +54,7 @@ def tool(tmp_path_factory, monkeypatch):
     return place
 
 
-def asked(tool):
+def tool_request(tool):
     return json.loads((tool / "asked.json").read_text())
 
 
@@ -65,7 +65,7 @@ def sentence(path):
 
 
 @pytest.mark.parametrize(("ending", "content"), MADE, ids=["spz v4", "spz v2", "ksplat", "splat"])
-def test_without_the_tool_a_file_is_told_by_its_bytes_and_gets_the_one_command(tmp_path, ending, content, monkeypatch):
+def test_without_the_tool_a_file_is_recognized_by_its_bytes_and_the_install_command_is_named(tmp_path, ending, content, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     path = tmp_path / f"my scene.{ending}"
     path.write_bytes(content)
@@ -81,7 +81,7 @@ def test_a_file_is_read_under_the_ending_that_the_tool_knows(tmp_path, tool, end
     model = load_model(path)
     assert len(model) == 60 and model.family == "3dgs" and "rounds the trained values" in model.notes[0]
     assert (model.source, model.digest, model.folder) == (path, hashlib.sha256(content).hexdigest(), None)
-    options, source, target, began = asked(tool)
+    options, source, target, began = tool_request(tool)
     assert Path(source).is_absolute() and source.endswith(f".{ending}") and bytes.fromhex(began) == content[:32]
     assert (source == str(path)) == named and not Path(target).exists() and "--quiet" in options
 
@@ -91,10 +91,10 @@ def test_what_the_tool_refuses_is_one_sentence(tmp_path, tool):
     assert "splat-transform does not read it (Invalid header)" in sentence(tmp_path / "a.spz")
 
 
-def test_compressed_ply_is_told_by_its_columns(tmp_path, tool):
+def test_compressed_ply_is_recognized_by_its_columns(tmp_path, tool):
     write(tmp_path / "a.ply", {"packed_position": np.zeros(1, np.int32)})
     assert len(load_model(tmp_path / "a.ply")) == 60
-    assert asked(tool)[1].endswith(".compressed.ply")
+    assert tool_request(tool)[1].endswith(".compressed.ply")
 
 
 @pytest.mark.parametrize("where", ["a.sog", "room", "room/meta.json"])
@@ -106,10 +106,10 @@ def test_sog_as_a_file_and_as_a_folder(tmp_path, tool, where):
     (tmp_path / "room").mkdir()
     (tmp_path / "room/meta.json").write_text(meta)
     assert len(load_model(tmp_path / where)) == 60
-    assert asked(tool)[1] == str(tmp_path / ("a.sog" if where == "a.sog" else "room/meta.json"))
+    assert tool_request(tool)[1] == str(tmp_path / ("a.sog" if where == "a.sog" else "room/meta.json"))
 
 
-def test_npx_is_asked_where_the_tool_is_not_on_the_path(tmp_path, tool):
+def test_npx_is_tried_where_the_tool_is_not_on_the_path(tmp_path, tool):
     """Installed for one project only; nothing is downloaded."""
     (tool / "splat-transform").rename(tool / "real")
     (tool / "npx").write_text(f"#!{sys.executable}\nimport os, sys\nassert sys.argv[1:3] == ['--no-install', 'splat-transform']\n"
@@ -130,19 +130,19 @@ def test_certain_opacities_are_finite(tmp_path, tool):
     assert logits.isfinite().all() and logits[0].sigmoid() > 0.99999
 
 
-def test_adapt_of_a_phones_file_simply_works(tmp_path, tool, capsys):
-    """The result is in the format that came, beside it."""
+def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
+    """The result is written beside the input, in the same format."""
     (tmp_path / "phone.spz").write_bytes(SPZ)
     assert main(["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant"]) == 0
     assert (tmp_path / "phone_x0.25.spz").read_bytes().startswith(b"ply")  # the stand-in's
-    assert asked(tool)[1].endswith("plain.ply") and asked(tool)[2].endswith("made.spz")
+    assert tool_request(tool)[1].endswith("plain.ply") and tool_request(tool)[2].endswith("made.spz")
     assert json.loads((tmp_path / "phone_x0.25.spz.adaptation.json").read_text())["scale"] == 0.25
     assert {path.name for path in tmp_path.iterdir()} == {"phone.spz", "phone_x0.25.spz", "phone_x0.25.spz.adaptation.json"}
     assert main(["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant"]) == 2
     assert "--overwrite" in capsys.readouterr().err
 
 
-def test_what_is_only_read_goes_out_as_a_ply(tmp_path, tool):
+def test_a_format_that_is_only_read_is_saved_as_a_ply(tmp_path, tool):
     (tmp_path / "phone.splat").write_bytes(RECORD * 3)
     assert main(["adapt", str(tmp_path / "phone.splat"), "--scale", "1/4", "--recipe", "instant"]) == 0
     assert len(load_model(tmp_path / "phone_x0.25.ply")) == 60
@@ -157,7 +157,7 @@ def test_no_folder_is_named_as_a_file_of_these_formats_is(tmp_path, name):
 @pytest.mark.parametrize("name", ["out.sog", "out.spz", "out.compressed.ply"])
 def test_any_splats_are_written_so_where_the_name_asks_for_it(tmp_path, tool, name):
     tiny.model().save(tmp_path / name, provenance={})
-    assert asked(tool)[2].endswith(name.partition(".")[2])
+    assert tool_request(tool)[2].endswith(name.partition(".")[2])
     assert len(read_ply(tmp_path / name).columns["x"]) == 60
 
 
@@ -178,7 +178,7 @@ def test_what_no_viewer_of_it_shows_is_not_written(tmp_path, tool, monkeypatch):
         tiny.model().save(tmp_path / "out.spz", provenance={})
 
 
-def test_a_streamed_sog_is_told_too(tmp_path):
+def test_a_streamed_sog_is_recognized_too(tmp_path):
     (tmp_path / "lod-meta.json").write_text(json.dumps({"lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json"]}))
     assert detect(tmp_path).family == "exchange"
 

@@ -1,4 +1,4 @@
-"""A world that lies far from its origin, as georeferenced captures do: what cameras see there is what they see at the origin."""
+"""Scenes far from the origin, such as georeferenced captures: images are the same as at the origin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is written as JSON, every parser reads; outputs take no place that is not theirs, and take it whole."""
+"""JSON output is readable by every parser; outputs replace nothing unasked, and are written completely or not at all."""
 
 import json
 import math
@@ -54,8 +54,8 @@ def test_devices_pipes_and_links_that_lead_nowhere_are_never_replaced(tmp_path, 
     (tmp_path / "dangling").symlink_to(tmp_path / "nothing")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     os.mkfifo(tmp_path / "pipe")
-    for name, told in [("/dev/null", "is a device"), ("pipe", "is a pipe"), ("dangling", "is a link to something that is not there"), ("loop", "")]:
-        with pytest.raises((OutputExists, OutputError), match=rf"{name}.*{told}"):
+    for name, reason in [("/dev/null", "is a device"), ("pipe", "is a pipe"), ("dangling", "is a link to something that is not there"), ("loop", "")]:
+        with pytest.raises((OutputExists, OutputError), match=rf"{name}.*{reason}"):
             write(tmp_path / name)
     assert {path.name for path in tmp_path.iterdir()} == {"dangling", "loop", "pipe"} and not Path("/dev/null").is_file()
 
@@ -130,9 +130,9 @@ def test_a_file_can_be_added_to_a_folder_that_is_being_made(tmp_path):
 
 
 def test_an_error_names_the_output_and_not_the_place_where_it_is_made(tmp_path):
-    with pytest.raises(OutputError) as told, new_folder(tmp_path / "a", False) as temporary, new_file(temporary / "b", False):
+    with pytest.raises(OutputError) as reason, new_folder(tmp_path / "a", False) as temporary, new_file(temporary / "b", False):
         raise OSError(28, "No space left on device", "somewhere")
-    assert str(told.value) == f"{tmp_path}/a/b cannot be written: No space left on device"
+    assert str(reason.value) == f"{tmp_path}/a/b cannot be written: No space left on device"
 
 
 @pytest.mark.parametrize("exchanges", [True, False])
@@ -175,8 +175,8 @@ def test_more_runs_than_there_is_room_for_end_in_one_sentence(tmp_path):
     living = [staging.Staging(tmp_path / "a") for _ in range(staging.SLOTS)]
     with pytest.raises(OutputError, match="a cannot be written: 8 other runs are writing to it"):
         text(tmp_path / "a")
-    for each in living:
-        each.close()
+    for handle in living:
+        handle.close()
     text(tmp_path / "a")
 
 

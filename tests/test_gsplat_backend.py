@@ -110,8 +110,8 @@ def test_with_the_cap_of_later_versions_opaque_splats_are_the_references(stand_i
 def test_nothing_is_cut_that_the_reference_draws(stand_in):
     splats = gaussians(1, dtype=torch.float32)
     splats = replace(splats, opacities=torch.ones(1), scales=torch.full((1, 3), 0.4))
-    ours = OnProcessor().render(splats, WIDE, Effects(1))
-    assert torch.equal(ours.alpha > 0, ReferenceBackend().render(splats, WIDE, Effects(1)).alpha > 0)
+    rendered = OnProcessor().render(splats, WIDE, Effects(1))
+    assert torch.equal(rendered.alpha > 0, ReferenceBackend().render(splats, WIDE, Effects(1)).alpha > 0)
 
 
 def test_what_is_missing_is_reported(monkeypatch):

@@ -53,14 +53,14 @@ def test_all_ranks_of_a_step_are_put_together_in_order(tmp_path):
     assert equal(load_model(folder / "ckpts/ckpt_6999_rank7.pt"), raw)
 
 
-def test_a_missing_rank_is_told(tmp_path):
+def test_a_missing_rank_is_named(tmp_path):
     folder = gsplat_folder(tmp_path / "r", splats(), ranks=3)
     (folder / "ckpts/ckpt_6999_rank1.pt").unlink()
     with pytest.raises(CheckpointError, match="rank 1 of step 6999 is missing"):
         load_model(folder)
 
 
-def test_the_newest_step_or_the_one_asked_for(tmp_path):
+def test_the_newest_step_or_the_requested_one(tmp_path):
     raw, older = splats(), splats(seed=1)
     folder = gsplat_folder(tmp_path / "r", raw, step=29_999)
     gsplat_folder(tmp_path / "older", older, ranks=2)
@@ -139,7 +139,7 @@ def test_adapting_raises_the_quality_and_says_classic_in_the_cfg(tmp_path, scale
     assert (folder / "ckpts/ckpt_6999_rank0.pt").read_bytes() == before
 
 
-def test_a_ply_is_written_where_one_is_asked_for(tmp_path):
+def test_a_ply_is_written_on_request(tmp_path):
     raw = splats()
     saved = load_model(gsplat_folder(tmp_path / "r", raw)).save(tmp_path / "out.ply", provenance={})
     assert np.array_equal(read_ply(saved).columns["scale_1"], raw["scales"][:, 1].numpy())

@@ -27,7 +27,7 @@ def spoiled(name: str, row: int, value) -> VanillaModel:
     return model
 
 
-def test_a_healthy_model_has_nothing_to_tell():
+def test_a_healthy_model_has_nothing_to_report():
     health = examine(healthy())
     assert health.sentences() == []
     assert not health.invalid.any()
@@ -44,7 +44,7 @@ def test_a_healthy_model_has_nothing_to_tell():
 )
 def test_oddities_are_counted_and_kept(name, value, sentence):
     health = examine(spoiled(name, 7, value))
-    assert [told for told in health.sentences() if told.startswith(sentence)]
+    assert [sentence_found for sentence_found in health.sentences() if sentence_found.startswith(sentence)]
     assert len(health.sentences()) == 1
     assert not health.invalid.any()
 
@@ -80,13 +80,13 @@ def test_strays_do_not_set_the_extent():
 
 
 @pytest.mark.parametrize(("name", "flag"), [("scales", "scales_look_linear"), ("opacities", "opacities_look_activated")])
-def test_values_that_look_activated_are_told_and_not_changed(name, flag):
+def test_values_that_look_activated_are_reported_and_not_changed(name, flag):
     model = healthy()
     model.parameters()[name].uniform_(0.01, 0.9)
     before = model.parameters()[name].clone()
     health = examine(model)
     assert getattr(health, flag)
-    assert any("export the file again" in told for told in health.sentences())
+    assert any("export the file again" in sentence_found for sentence_found in health.sentences())
     assert torch.equal(model.parameters()[name], before)
 
 

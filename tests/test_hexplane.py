@@ -70,24 +70,24 @@ def test_every_variant_agrees_with_an_independent_evaluation(tmp_path, options, 
         g = model.gaussians(moving.at(time))
         for row in range(0, 60, 7):
             expected = oracle(weights, {name: values[row] for name, values in raw.items()}, time, **variant)
-            shown = (g.means[row], g.scales[row], g.quats[row], g.opacities[row], g.sh[row])
-            for value, want in zip(shown, expected, strict=True):
+            actual = (g.means[row], g.scales[row], g.quats[row], g.opacities[row], g.sh[row])
+            for value, want in zip(actual, expected, strict=True):
                 np.testing.assert_allclose(value.numpy(), np.squeeze(want), rtol=1e-5, atol=1e-5)
     assert g.covariances is None
 
 
 def test_a_switched_off_head_changes_nothing(tmp_path):
     model = load_model(moving.write_hexplane(tmp_path / "m", "no_dx=True, no_ds=True, no_dr=True"))
-    shown, still = model.gaussians(moving.at(0.8)), model.canonical.gaussians()
-    assert all(torch.equal(getattr(shown, name), getattr(still, name)) for name in ("means", "scales", "quats", "opacities", "sh"))
+    moved, canonical = model.gaussians(moving.at(0.8)), model.canonical.gaussians()
+    assert all(torch.equal(getattr(moved, name), getattr(canonical, name)) for name in ("means", "scales", "quats", "opacities", "sh"))
 
 
-def test_without_cfg_args_the_published_defaults_are_taken_and_told(tmp_path):
+def test_without_cfg_args_the_published_defaults_are_used_and_noted(tmp_path):
     folder = moving.write_hexplane(tmp_path / "m")
-    told = load_model(folder).gaussians(moving.at(0.5))
+    with_options = load_model(folder).gaussians(moving.at(0.5))
     (folder / "cfg_args").unlink()
     model = load_model(folder)
-    assert torch.equal(model.gaussians(moving.at(0.5)).means, told.means)
+    assert torch.equal(model.gaussians(moving.at(0.5)).means, with_options.means)
     assert any("opacities and colors are taken to stay" in note for note in model.notes)
 
 

@@ -61,7 +61,7 @@ def test_the_arguments_are_those_of_the_rasterizer(package):
     assert (settings._asdict().get("antialiasing", False)) is False
 
 
-def test_a_point_falls_where_the_camera_says(package):
+def test_a_point_projects_to_where_the_camera_says(package):
     OnProcessor().render(gaussians(2, dtype=torch.float32), WIDE, Effects(1))
     point = torch.tensor([0.4, -0.3, 2.0, 1.0])
     seen = (point @ package.received[0][0].projmatrix).double()
@@ -147,7 +147,7 @@ def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
 def test_the_rasterizer_itself_draws_the_reference():
     """Within what its footprint leaves out, a rim of at most exp(-9/2) of an opacity; so without the suite's tolerances."""
     splats = gaussians(200, dtype=torch.float32).to("cuda")
-    ours = InriaBackend().render(splats, WIDE, Effects(1))
+    actual = InriaBackend().render(splats, WIDE, Effects(1))
     right = ReferenceBackend().render(splats, WIDE, Effects(1))
-    assert float((ours.image - right.image).abs().max()) < 2 * math.exp(-4.5)
-    assert float((ours.image - right.image).square().mean()) < 1e-6
+    assert float((actual.image - right.image).abs().max()) < 2 * math.exp(-4.5)
+    assert float((actual.image - right.image).square().mean()) < 1e-6

@@ -30,7 +30,7 @@ def of_gsplat(path, factor):
 def test_gsplat_divides_the_lens_and_then_fits_it_to_the_picture(tmp_path, width, factor, actual):
     """examples/datasets/colmap.py: K over the factor, times the size of the first photograph over a size that was rounded down."""
     [camera] = tiny.cameras(1, width=width, height=width * 3 // 4)
-    [new] = of_gsplat(tmp_path / "r", factor).as_trained([camera], Capture(smaller=lambda asked: actual if asked == factor else None))
+    [new] = of_gsplat(tmp_path / "r", factor).as_trained([camera], Capture(smaller=lambda wanted: actual if wanted == factor else None))
     floored = width // factor, width * 3 // 4 // factor
     assert (new.width, new.height) == (int(floored[0] * (actual[0] / floored[0])), int(floored[1] * (actual[1] / floored[1])))
     assert new.fx == pytest.approx(camera.fx / factor * actual[0] / floored[0], rel=1e-12)
@@ -62,11 +62,11 @@ def of_nerfstudio(path, scale=1.0, transform=EYE):
     return load_model(folder)
 
 
-@pytest.mark.parametrize(("there", "factor"), [((), 1), ((2,), 2), ((2, 4), 4), ((4,), 1)])
-def test_nerfstudio_halves_as_far_as_there_are_copies(tmp_path, there, factor):
+@pytest.mark.parametrize(("factors", "factor"), [((), 1), ((2,), 2), ((2, 4), 4), ((4,), 1)])
+def test_nerfstudio_halves_as_far_as_there_are_copies(tmp_path, factors, factor):
     scene = transforms(tmp_path / "scene")
-    for each in there:
-        pictures(tmp_path / f"scene/images_{each}", (3300 // each, 2200 // each))
+    for copy in factors:
+        pictures(tmp_path / f"scene/images_{copy}", (3300 // copy, 2200 // copy))
     [camera] = placed(of_nerfstudio(tmp_path / "r"), scene).cameras
     assert (camera.width, camera.fx) == (3300 // factor, 2000 / factor)
 

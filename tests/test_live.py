@@ -80,7 +80,7 @@ def test_a_change_of_the_live_model_does_not_reach_the_copy():
     assert torch.equal(adopted.parameters()["means"] + 1, thing._xyz)
 
 
-def test_each_is_saved_in_its_own_format(tmp_path):
+def test_a_live_model_is_saved_in_its_own_format(tmp_path):
     raw = splats()
     assert adopt(GaussianModel(raw)).save(tmp_path / "inria", provenance={}).name == "point_cloud.ply"
     assert adopt(dict(raw)).save(tmp_path / "gsplat", provenance={}).name == "ckpt_0_rank0.pt"
@@ -166,14 +166,14 @@ class ScaffoldGaussianModel:
 
     def tensors(self):
         held = vars(self).values()
-        return [each for each in held if torch.is_tensor(each)] + [p for each in held if isinstance(each, torch.nn.Module) for p in each.parameters()]
+        return [member for member in held if torch.is_tensor(member)] + [p for m in held if isinstance(m, torch.nn.Module) for p in m.parameters()]
 
 
 def is_same(one, other):
     """Whether two models show the same splats, bit by bit, to a camera of the training and to one of none."""
-    shown = [(one.gaussians(camera), other.gaussians(camera)) for camera in tiny.cameras()]
+    pairs = [(one.gaussians(camera), other.gaussians(camera)) for camera in tiny.cameras()]
     parts = ("means", "scales", "quats", "opacities", "sh")
-    return all(len(a) == len(b) > 5 and all(torch.equal(getattr(a, part), getattr(b, part)) for part in parts) for a, b in shown)
+    return all(len(a) == len(b) > 5 and all(torch.equal(getattr(a, part), getattr(b, part)) for part in parts) for a, b in pairs)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -112,15 +112,15 @@ def test_adapted_in_its_own_filter_it_is_closer_to_the_base(tmp_path, family, sc
     torch.testing.assert_close(loaded.render(small).image, adapted.render(small).image, atol=1e-5, rtol=0)
 
 
-def quality(shown, base, scale):
-    """dB of pictures against the base's own at x1, the larger of the two shrunk."""
-    found = []
+def quality(model, base, scale):
+    """Mean PSNR in dB of a model's images against the base's at x1; the larger of the two is shrunk."""
+    decibels = []
     for view in base.cameras:
-        image, truth = shown.render(view.zoomed(scale)).image.clamp(0, 1), base.render(view).image.clamp(0, 1)
+        image, truth = model.render(view.zoomed(scale)).image.clamp(0, 1), base.render(view).image.clamp(0, 1)
         size = min(image.shape[:2], truth.shape[:2])
         method = "pil-bicubic" if scale < 1 else "area"
-        found.append(psnr(resize(image, size, method), resize(truth, size, method).clamp(0, 1)))
-    return sum(found) / len(found)
+        decibels.append(psnr(resize(image, size, method), resize(truth, size, method).clamp(0, 1)))
+    return sum(decibels) / len(decibels)
 
 
 def test_the_filters_go_with_their_rows_and_do_not_move():
@@ -172,16 +172,16 @@ def test_filters_that_no_camera_sees_are_refused():
         ball().refilter([])
 
 
-def test_a_fused_file_is_told_apart(tmp_path):
-    """It has the columns of 3DGS: known by the options around it, or by what the user says; adapted, it is for renderers that know no 3D filter."""
+def test_a_fused_file_is_recognized_by_its_options_or_given_its_filter(tmp_path):
+    """It has the columns of 3DGS: the options beside it or the user name its filter. Adapted, it is for renderers without a 3D filter."""
     plain = {name: column for name, column in splats().items() if name != "filter_3D"}
     inside = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras())
     assert inside.model.family == "3dgs" and (inside.effects().screen_filter, inside.effects().eps2d) == ("mip", 0.1)
     bare = load_model(ply_files.write(tmp_path / "fused.ply", plain))
     assert bare.trained.screen_filter == "classic" and any("fused" in note for note in bare.notes)
-    told = wrap_model(bare, cameras=tiny.cameras(), screen_filter="mip", backend="reference")
-    assert (told.effects().screen_filter, told.effects().eps2d) == ("mip", 0.1)
-    adapted = told.adapt(0.25, steps=0)
+    wrapped = wrap_model(bare, cameras=tiny.cameras(), screen_filter="mip", backend="reference")
+    assert (wrapped.effects().screen_filter, wrapped.effects().eps2d) == ("mip", 0.1)
+    adapted = wrapped.adapt(0.25, steps=0)
     assert adapted.effects.screen_filter == adapted.model.trained.screen_filter == "classic"
     assert "base mip 0.1 px²; file classic 0.3 px²" in adapted.report.filters
     with pytest.raises(SettingsError, match="no screen filter 'soft'"):
@@ -205,7 +205,7 @@ def test_real_files(shared_data):
     assert torch.isfinite(wrap_model(fused, cameras=[view], screen_filter="mip").render(view).image).all()
 
 
-def test_the_command_line_is_told_the_filter(tmp_path, capsys):
+def test_the_command_line_takes_the_filter(tmp_path, capsys):
     plain = {name: column for name, column in splats().items() if name != "filter_3D"}
     fused = ply_files.write(tmp_path / "fused.ply", plain)
     assert main(["inspect", str(fused), "--screen-filter", "mip"]) == 0
@@ -226,5 +226,5 @@ def test_any_model_can_be_rendered_with_a_3d_filter():
 
 
 def test_a_3d_filter_needs_cameras():
-    with pytest.raises(SettingsError, match="follows from the cameras"):
+    with pytest.raises(SettingsError, match="is computed from the cameras"):
         wrap_model(tiny.model(), cameras=[]).render(tiny.cameras()[0], filter_3d=True)

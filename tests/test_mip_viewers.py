@@ -1,4 +1,4 @@
-"""Families with a `filter_3D` column in viewers, which do not read it: what they show of the file, and files that are made for them."""
+"""Families with a `filter_3D` column in viewers, which ignore it: how they render the file, and files written for them."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def test_fused_splats_look_as_the_base_does(tmp_path, family):
     fused = base.model.fused()
     assert fused.family == "3dgs" and not fused.trained.keeps_filter
     assert not any(tensor.requires_grad for tensor in fused.parameters().values())
-    shown = wrap_model(fused, cameras=tiny.cameras(), backend="reference")
+    fused_model = wrap_model(fused, cameras=tiny.cameras(), backend="reference")
     for view in tiny.cameras(2):
         image = base.render(view).image
         assert image.max() > 0.2
-        torch.testing.assert_close(shown.render(view).image, image, atol=1e-5, rtol=0)
+        torch.testing.assert_close(fused_model.render(view).image, image, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -62,13 +62,13 @@ def test_mip_splatting_itself_smooths(tmp_path):
 @pytest.mark.parametrize(
     ("family", "viewer"), [("mip", "spark"), ("mip", "playcanvas"), ("gof", "spark"), ("gof", "playcanvas"), ("analytic", "playcanvas")]
 )
-def test_at_scale_one_a_viewer_comes_closer_to_the_bases_own_picture(tmp_path, family, viewer):
+def test_at_scale_one_adapting_brings_a_viewer_closer_to_the_bases_own_image(tmp_path, family, viewer):
     base = wrapped(tmp_path, family)
-    made = base.adapt(1, viewer=viewer, recipe="instant")
-    assert made.effects == base.effects(viewer=viewer)
+    adapted = base.adapt(1, viewer=viewer, recipe="instant")
+    assert adapted.effects == base.effects(viewer=viewer)
     for view in tiny.cameras(3, seed=9):  # that nothing was adapted to
         own = base.render(view).image
-        assert psnr(made.render(view).image, own) > psnr(base.render(view, viewer=viewer).image, own) + 3
+        assert psnr(adapted.render(view).image, own) > psnr(base.render(view, viewer=viewer).image, own) + 3
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -76,8 +76,8 @@ def test_at_scale_one_a_viewer_comes_closer_to_the_bases_own_picture(tmp_path, f
 def test_what_is_made_for_a_viewer_is_a_checkpoint_of_3dgs(tmp_path, family, viewer, tag):
     base = wrapped(tmp_path, family)
     write_cameras(base.model.folder / "cameras.json", tiny.cameras())
-    made = base.adapt(1 / 4, viewer=viewer, **BRIEF)
-    saved = made.save(tmp_path / "made")
+    adapted = base.adapt(1 / 4, viewer=viewer, **BRIEF)
+    saved = adapted.save(tmp_path / "made")
     header = read_ply(saved)
     assert "filter_3D" not in header.columns and provenance_of(header.comments)["base"] == sha256(base.model.source)
     assert not {"kernel_size", "load_allres"} & read_cfg_args(tmp_path / "made" / "cfg_args").keys()  # of a filter that it has no more
@@ -86,17 +86,17 @@ def test_what_is_made_for_a_viewer_is_a_checkpoint_of_3dgs(tmp_path, family, vie
     assert len(wrap_model(again).cameras) == 4
     view = tiny.cameras(1)[0].zoomed(1 / 4)
     loaded = wrap_model(again, backend="reference", background=(0.0, 0.0, 0.0))
-    torch.testing.assert_close(loaded.render(view, viewer=viewer).image, made.render(view).image, atol=1e-5, rtol=0)
+    torch.testing.assert_close(loaded.render(view, viewer=viewer).image, adapted.render(view).image, atol=1e-5, rtol=0)
 
 
 def test_the_base_is_neither_changed_nor_overwritten(tmp_path):
     base = wrapped(tmp_path)
     before = {name: tensor.clone() for name, tensor in base.model.parameters().items()}
-    made = base.adapt(1, viewer="spark", **BRIEF)
+    adapted = base.adapt(1, viewer="spark", **BRIEF)
     assert all(torch.equal(base.model.parameters()[name], tensor) for name, tensor in before.items())
     for path in (tmp_path / "model", base.model.source):
         with pytest.raises(OutputExists):
-            made.save(path, overwrite=True)
+            adapted.save(path, overwrite=True)
 
 
 def test_one_file_for_every_viewer(tmp_path):
@@ -114,15 +114,15 @@ def test_an_exchange_format_is_refused_for_its_own_project_only(tmp_path, monkey
 
 @pytest.mark.parametrize("viewer", ["spark", "mip"])
 def test_the_base_as_it_is_is_what_the_viewer_shows_of_its_file(tmp_path, viewer):
-    """Where that is better than any state of a run, it is what is given back."""
+    """The base is returned where it scores better than every state of the run."""
     base = wrapped(tmp_path, "gof")
-    made = base.adapt(1, viewer=viewer, recipe="instant", validation_views=2)
-    view = made.views[-1]  # which alone has chosen
+    adapted = base.adapt(1, viewer=viewer, recipe="instant", validation_views=2)
+    view = adapted.views[-1]  # which alone has chosen
     expected = psnr(base.render(view, viewer=viewer).image, base.render(view).image)
-    assert made.report.validation["the base as it is"] == pytest.approx(expected, abs=1e-3)
+    assert adapted.report.validation["the base as it is"] == pytest.approx(expected, abs=1e-3)
 
 
-def test_fused_splats_may_be_merged_and_others_not(tmp_path):
+def test_only_fused_splats_may_be_merged(tmp_path):
     twins = {name: np.repeat(column, 2) for name, column in splats().items()}
     base = wrap_model(folder(tmp_path / "model", columns=twins), cameras=tiny.cameras(), backend="reference")
     assert len(base.adapt(1 / 4, viewer="playcanvas", steps=0, merge_to=0.5).model) == len(base.model) / 2
@@ -131,8 +131,8 @@ def test_fused_splats_may_be_merged_and_others_not(tmp_path):
 
 
 def test_without_a_viewer_the_filter_stays(tmp_path):
-    made = wrapped(tmp_path).adapt(1 / 4, **BRIEF)
-    assert isinstance(made.model, MipModel) and (made.effects.screen_filter, made.effects.eps2d) == ("mip", 0.1)
+    adapted_model = wrapped(tmp_path).adapt(1 / 4, **BRIEF)
+    assert isinstance(adapted_model.model, MipModel) and (adapted_model.effects.screen_filter, adapted_model.effects.eps2d) == ("mip", 0.1)
 
 
 def test_splats_that_were_fused_elsewhere_leave_the_kernel_size_behind_too(tmp_path):
@@ -153,8 +153,8 @@ def test_who_draws_the_base_has_its_filter_too(tmp_path, monkeypatch):
 
 def test_inspect_says_how_viewers_show_it(tmp_path):
     pytest.importorskip("numba")
-    told = viewer_differences(wrap_model(folder(tmp_path / "model"), cameras=tiny.cameras()))
-    assert told.startswith("spark ") and "playcanvas" in told
+    line = viewer_differences(wrap_model(folder(tmp_path / "model"), cameras=tiny.cameras()))
+    assert line.startswith("spark ") and "playcanvas" in line
 
 
 def test_the_command_converts_it(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""Siblings of the families that are read, and side files: each is read for what it is, or refused by its name."""
+"""Files of related projects, and side files: read as what they are, or refused by name."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ EXPLICIT = {**ANCHORS, **named("f_dc_0", "f_dc_1", "f_dc_2", "opacity")}
     ids=["explicit", "explicit, levels", "anchors", "anchors, levels"],
 )
 def test_octree_anygs_is_refused_by_name(tmp_path, columns):
-    """Its explicit models have all columns of 3DGS, and others that make other splats of them."""
+    """Its explicit models have all columns of 3DGS, and further ones that change the splats."""
     path = write(tmp_path / "a.ply", columns)
     assert detect(path).family == "anygs"
     with pytest.raises(CheckpointError, match="Octree-AnyGS"):
@@ -61,7 +61,7 @@ def test_half_gaussians_are_refused_by_name(tmp_path):
         load_model(write(tmp_path / "a.ply", {**columns, **named("opacity1", "opacity2")}))
 
 
-def test_saga_is_told_which_file_is_its_scene(tmp_path):
+def test_the_error_for_saga_names_the_file_of_its_scene(tmp_path):
     folder = write_model_folder(tmp_path / "m")
     ply = folder / "point_cloud/iteration_7000/point_cloud.ply"
     scene = ply.rename(ply.with_name("scene_point_cloud.ply"))
@@ -104,20 +104,20 @@ def test_one_option_that_is_no_literal_costs_only_itself(tmp_path):
     assert any("far, where, a cannot be read" in note for note in model.notes)
 
 
-def test_that_antialiasing_is_unknown_is_said(tmp_path):
+def test_a_note_says_that_antialiasing_is_unknown(tmp_path):
     new = load_model(write_model_folder(tmp_path / "new", cfg_args="Namespace(sh_degree=3, depths='', train_test_exp=False)"))
     old = load_model(write_model_folder(tmp_path / "old", cfg_args="Namespace(sh_degree=3)"))
     tagged = write_splats(tmp_path / "tag" / "point_cloud.ply", comments=("SplatRenderMode: mip",))
     (tagged.parent / "cfg_args").write_text("Namespace(sh_degree=3, train_test_exp=False)")
-    told = [any("--antialiasing" in note for note in model.notes) for model in (new, old, load_model(tagged.parent))]
-    assert told == [True, False, False]
+    noted = [any("--antialiasing" in note for note in model.notes) for model in (new, old, load_model(tagged.parent))]
+    assert noted == [True, False, False]
 
 
 @pytest.mark.parametrize(
     ("options", "word"),
     [("with_ut: true\nwith_eval3d: true", "with_ut, with_eval3d"), ("use_bilateral_grid: true", "grid"), ("post_processing: ppisp", "correction")],
 )
-def test_what_gsplat_does_otherwise_is_said(tmp_path, options, word):
+def test_a_note_names_what_gsplat_does_differently(tmp_path, options, word):
     folder = gsplat_folder(tmp_path / "r", splats())
     plain = load_model(folder).notes
     with (folder / "cfg.yml").open("a") as file:
@@ -126,7 +126,7 @@ def test_what_gsplat_does_otherwise_is_said(tmp_path, options, word):
     assert len(new) == 1 and word in new[0]
 
 
-def test_what_gsplat_left_off_is_not_said(tmp_path):
+def test_options_that_gsplat_did_not_use_have_no_note(tmp_path):
     folder = gsplat_folder(tmp_path / "r", splats())
     plain = load_model(folder).notes
     with (folder / "cfg.yml").open("a") as file:

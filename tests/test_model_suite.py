@@ -1,4 +1,4 @@
-"""Every built-in family passes the suite that a stranger's has to pass."""
+"""Every built-in family passes the suite for third-party families."""
 
 from functools import partial
 
@@ -25,7 +25,7 @@ WRITERS = {
     "splatfacto": lambda path: torch_checkpoints.splatfacto_folder(path, torch_checkpoints.splats()),
 }
 
-# It needs splat-transform, which is no Python package; tests/test_exchange.py goes the same way with a stand-in.
+# It needs splat-transform, which is no Python package; tests/test_exchange.py tests it with a stand-in.
 ELSEWHERE = {"exchange"}
 
 
@@ -44,8 +44,8 @@ def suite_of(name):
     return Suite
 
 
-for each in WRITERS:
-    globals()[f"Test_{each}"] = suite_of(each)
+for family in WRITERS:
+    globals()[f"Test_{family}"] = suite_of(family)
 
 
 def test_every_family_that_is_loaded_is_in_the_suite():

@@ -15,10 +15,10 @@ from mipmap_plugin.wrap import wrap_model
 
 
 def test_views_without_a_time_get_all_times_evenly_in_random_order():
-    views, told = with_times(tiny.cameras(11), seed=0)
+    views, note = with_times(tiny.cameras(11), seed=0)
     times = [view.time for view in views]
     assert sorted(times) == pytest.approx([step / 10 for step in range(11)]) and times != sorted(times)
-    assert told == "11 of them without a time of their own, spread over 0..1"
+    assert note == "11 of them without a time of their own, spread over 0..1"
     assert [view.time for view in with_times(tiny.cameras(11), seed=0)[0]] == times
     assert [view.time for view in with_times(tiny.cameras(11), seed=1)[0]] != times
 
@@ -26,8 +26,8 @@ def test_views_without_a_time_get_all_times_evenly_in_random_order():
 def test_views_keep_the_times_that_they_have():
     cameras = [replace(camera, time=0.25) for camera in tiny.cameras(3)]
     assert with_times(cameras, seed=0) == (cameras, "at their own times")
-    mixed, told = with_times([*cameras, *tiny.cameras(1)], seed=0)
-    assert ([view.time for view in mixed], told[:4]) == ([0.25, 0.25, 0.25, 0.0], "1 of")
+    mixed, note = with_times([*cameras, *tiny.cameras(1)], seed=0)
+    assert ([view.time for view in mixed], note[:4]) == ([0.25, 0.25, 0.25, 0.0], "1 of")
 
 
 def test_jittered_views_take_the_times_of_the_cameras():
@@ -35,11 +35,11 @@ def test_jittered_views_take_the_times_of_the_cameras():
     assert {view.time for view in jittered(cameras, 8, torch.Generator().manual_seed(0))} == {0.0, 1 / 3, 2 / 3, 1.0}
 
 
-def test_the_report_says_how_a_moving_scene_was_sampled_and_a_still_one_has_no_times(tmp_path):
+def test_the_report_says_how_a_moving_scene_was_sampled_and_that_of_a_static_one_has_no_times(tmp_path):
     moves = wrap_model(moving.write_deformable(tmp_path / "m"), backend="reference").adapt(4, recipe="instant")
     assert moves.report.views == "4 train views and 100 around them, 104 of them without a time of their own, spread over 0..1"
-    still = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(4, recipe="instant")
-    assert "time" not in still.report.views
+    static = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(4, recipe="instant")
+    assert "time" not in static.report.views
 
 
 def test_a_model_on_another_device_moves_as_before(tmp_path):
@@ -51,5 +51,5 @@ def test_a_model_on_another_device_moves_as_before(tmp_path):
 def test_inspect_says_that_the_scene_moves(tmp_path, capsys, write):
     write(tmp_path / "m")
     assert main(["inspect", str(tmp_path / "m")]) == 0
-    told = capsys.readouterr().out
-    assert "is frozen: they adapt as they are before they move" in told and "without a time shows the moment 0" in told
+    output = capsys.readouterr().out
+    assert "is frozen: they adapt as they are before they move" in output and "without a time shows the moment 0" in output

@@ -36,7 +36,7 @@ def dynerf(path, count=4, frames=0):
     return path
 
 
-def as_the_project_turns_them(pose):
+def project_pose(pose):
     """R and T of load_images_path, and getWorld2View2 of both."""
     rotation = -pose[:3, :3]
     rotation[:, 0] = -rotation[:, 0]
@@ -52,14 +52,14 @@ def test_dynerf_cameras_are_those_of_its_loader(tmp_path):
     stored = np.load(tmp_path / "s/poses_bounds.npy")[:, :-2].reshape(-1, 3, 5)
     turned = np.concatenate([stored[..., 1:2], -stored[..., :1], stored[..., 2:4]], -1)
     for camera in (tests[7], trains[0], trains[150], trains[299]):
-        wanted = as_the_project_turns_them(turned[int(camera.name[3:5])])
+        wanted = project_pose(turned[int(camera.name[3:5])])
         assert np.allclose(camera.viewmat.numpy(), wanted, atol=1e-9)
         assert (camera.width, camera.height, camera.fx, camera.time) == (1352, 1014, 730.0, int(camera.name[-4:]) / 300)
     assert sorted(camera.time for camera in trains) == [frame / 300 for frame in range(300)]
     assert {camera.name[:5] for camera in tests} == {"cam00"} and {camera.name[:5] for camera in trains} == {"cam01", "cam02", "cam03"}
 
 
-def test_dynerf_frames_that_were_extracted_go_with_their_cameras(tmp_path):
+def test_extracted_dynerf_frames_belong_to_their_cameras(tmp_path):
     scene = load_scene(dynerf(tmp_path / "s", frames=3))
     assert {path.relative_to(tmp_path / "s").as_posix() for path in scene.images.values()} == {
         *(f"cam00/images/000{i}.png" for i in range(3)), "cam01/images/0000.png", "cam02/images/0001.png", "cam03/images/0002.png",
@@ -118,5 +118,5 @@ def test_a_moving_model_adapts_to_these_cameras_at_their_times(tmp_path):
     """Adaptation takes the time of a view as it is."""
     from mipmap_plugin.adaptation.views import with_times
 
-    views, told = with_times(load_scene(dynerf(tmp_path / "s")).split("train"), seed=0)
-    assert told == "at their own times" and torch.tensor([view.time for view in views]).unique().numel() == 300
+    views, note = with_times(load_scene(dynerf(tmp_path / "s")).split("train"), seed=0)
+    assert note == "at their own times" and torch.tensor([view.time for view in views]).unique().numel() == 300

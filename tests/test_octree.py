@@ -48,7 +48,7 @@ def test_zoom_chooses_the_levels_and_size_does_not(tmp_path):
 
 
 def test_real_networks_decode(tmp_path, shared_data):
-    """The networks of a published checkpoint over anchors of ours, since nobody publishes both."""
+    """The networks of a published checkpoint with synthetic anchors, since nobody publishes both."""
     layout = Layout("octree", features=32, splats=10)
     ply = checkpoints.write(tmp_path / "model", layout)
     for name in ALL:
@@ -65,13 +65,13 @@ def test_real_networks_decode(tmp_path, shared_data):
 @pytest.mark.parametrize("distance", [(), ("opacity_mlp",), ALL])
 def test_the_inputs_follow_from_shapes_and_options(tmp_path, distance, level, bank):
     notes = load(tmp_path, Layout("octree", distance=distance, level=level, bank=bank)).notes
-    told = [note for note in notes if " goes into " in note]
+    inputs = [note for note in notes if " goes into " in note]
     takers = ", ".join(name for name in ALL if name in distance)
     wanted = [f"the distance of the camera goes into {takers}"] if distance else []
-    assert told == wanted + ([f"the anchor's level goes into {', '.join(ALL)}{', feature_bank_mlp' * bank}"] if level else [])
+    assert inputs == wanted + ([f"the anchor's level goes into {', '.join(ALL)}{', feature_bank_mlp' * bank}"] if level else [])
 
 
-def test_without_options_a_doubt_is_said_and_shapes_decide_where_they_can(tmp_path):
+def test_without_options_shapes_decide_and_ambiguous_ones_are_refused(tmp_path):
     refused(checkpoints.write(tmp_path / "a", Layout("octree", level=True), cfg=False), "may be the distance or the level; put the cfg_args")
     model = load(tmp_path, Layout("octree", level=True, bank=True), cfg=False)
     assert any("level goes into opacity_mlp" in note for note in model.notes)

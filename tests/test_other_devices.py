@@ -64,14 +64,14 @@ def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
         there = wrap_model(model.to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference").adapt(scale, **settings)
         there.save(tmp_path / "there")
         write_image(tmp_path / "there.png", there.render(tiny.cameras()[0]).image)
-        found = {name: tensor.cpu() for name, tensor in there.model.parameters().items()}
+        parameters = {name: tensor.cpu() for name, tensor in there.model.parameters().items()}
     assert [point.psnr_db for point in there.report.curve] == pytest.approx([point.psnr_db for point in here.report.curve], abs=1e-3)
     if family == "3dgs" and EXACT:  # networks' products of matrices are taken apart in another way there
-        assert all(torch.equal(tensor, found[name]) for name, tensor in here.model.parameters().items())
+        assert all(torch.equal(tensor, parameters[name]) for name, tensor in here.model.parameters().items())
 
 
 @pytest.mark.parametrize("enough", [True, False])
-def test_growing_is_judged_and_undone_there(enough, monkeypatch):
+def test_harmful_growth_is_undone_there(enough, monkeypatch):
     register_upsampler("mine", lambda image, size: resize(image, size, "lanczos"), replace=True)
     agreements = iter([0.0, *[0.0 if enough else -1.0] * 9])
     monkeypatch.setattr(run, "decibel", lambda _: next(agreements))
@@ -85,14 +85,14 @@ def test_growing_is_judged_and_undone_there(enough, monkeypatch):
 @pytest.mark.parametrize("method", ["box", "area", "bilinear", "pil-bicubic", "lanczos"])
 def test_images_are_resampled_there(method):
     image, weights = torch.rand(24, 32, 3), torch.rand(6, 8, 3)
-    found = []
+    results = []
     with pretended.pretending():
         for device in ("cpu", pretended.DEVICE):
             there = image.to(device).requires_grad_()
             small = resize(there, (6, 8), method)
             (gradient,) = torch.autograd.grad(small, there, weights.to(device))
-            found.append((small.detach().cpu(), gradient.cpu()))
-    assert all(torch.equal(*pair) for pair in zip(*found, strict=True))
+            results.append((small.detach().cpu(), gradient.cpu()))
+    assert all(torch.equal(*pair) for pair in zip(*results, strict=True))
 
 
 @pytest.mark.parametrize("screen_filter", USUAL_EPS2D)
@@ -110,7 +110,7 @@ def test_cloning_and_splitting_there():
     assert adapted.report.gaussians_after > adapted.report.gaussians_before
 
 
-def test_photographs_and_judging_there(tmp_path):
+def test_photographs_and_evaluation_there(tmp_path):
     scene = load_scene(tiny.scene(tmp_path / "scene", train=tiny.cameras(3)))
     with pretended.pretending():
         wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference")
@@ -119,16 +119,16 @@ def test_photographs_and_judging_there(tmp_path):
     assert all(row.psnr_db > 10 for row in rows)
 
 
-@pytest.mark.parametrize("given", [False, True])
-def test_what_other_rasterizers_are_handed_lies_there(given):
+@pytest.mark.parametrize("with_covariances", [False, True])
+def test_arguments_of_other_rasterizers_are_on_the_device(with_covariances):
     splats, view, effects = tiny.gaussians(20), tiny.cameras()[0], Effects(1, "mip", 0.1)
-    if given:
+    if with_covariances:
         splats = replace(splats, covariances=covariances(splats))
     with pretended.pretending():
         there = splats.to(pretended.DEVICE)
-        asked = gsplat.arguments(there, view, effects)
-        asked |= inria.splats_of(inria.filtered(inria.sized(there, view, 2.0), inria.at_the_origin(view), effects))
-    assert {value.device.type for value in asked.values() if isinstance(value, torch.Tensor)} == {pretended.DEVICE}
+        arguments = gsplat.arguments(there, view, effects)
+        arguments |= inria.splats_of(inria.filtered(inria.sized(there, view, 2.0), inria.at_the_origin(view), effects))
+    assert {value.device.type for value in arguments.values() if isinstance(value, torch.Tensor)} == {pretended.DEVICE}
 
 
 @pytest.mark.parametrize("scale", [1 / 2, 2])

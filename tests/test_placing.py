@@ -1,4 +1,4 @@
-"""Checkpoints with a frame of their own meet the scene that they were trained on: cameras are moved, photographs judge."""
+"""Checkpoints with a frame of their own and the scene that they were trained on: cameras are transformed, and photographs show whether rightly."""
 
 import json
 import sys
@@ -22,7 +22,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import placed, wrap_model
 
-# COLMAP's world to that of a nerfstudio transforms.json, and that to the checkpoint's; the file of the run tells their product.
+# COLMAP's world to that of a nerfstudio transforms.json, and that to the checkpoint's; the file of the run holds their product.
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 ORIENTED = np.array([[0.0, 0, 1, 0.5], [1, 0, 0, -0.2], [0, 1, 0, 0.1], [0, 0, 0, 1]])
 SCALE = 0.25
@@ -76,8 +76,8 @@ def test_a_placed_camera_sees_what_its_photograph_shows(run):
     scene = load_scene(source)
     wrapped = wrap_model(folder, cameras=scene, backend="reference")
     for original, camera in zip(scene.cameras, wrapped.cameras, strict=True):
-        shown = wrapped.render(camera).image.clamp(0, 1)
-        assert psnr(shown, scene.image(original, (0, 0, 0))) > 50  # 8 bits
+        image = wrapped.render(camera).image.clamp(0, 1)
+        assert psnr(image, scene.image(original, (0, 0, 0))) > 50  # 8 bits
 
 
 def test_photographs_go_with_their_cameras(run):

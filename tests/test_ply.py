@@ -130,7 +130,7 @@ def test_writes_what_it_reads(tmp_path):
     assert {name: column.tobytes() for name, column in file.columns.items()} == {name: column.tobytes() for name, column in columns.items()}
 
 
-def test_does_not_overwrite_unless_told(tmp_path):
+def test_does_not_overwrite_without_the_option(tmp_path):
     path = write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)})
     with pytest.raises(OutputExists, match="--overwrite"):
         write_ply(path, {"x": np.ones(1, np.float32)})

@@ -136,12 +136,12 @@ def test_projection_equals_gsplat():
         g.means, covariances, view.viewmat[None], k, view.width, view.height, eps2d=0.3, near_plane=0.2, calc_compensations=True
     )
     projected = project(g, view, 0.2)
-    ours = footprint(projected, g.opacities, "antialiased", 0.3)
+    projected_footprint = footprint(projected, g.opacities, "antialiased", 0.3)
     seen = (radii[0] > 0).all(-1) if radii.dim() == 3 else radii[0] > 0
     assert seen.sum() > 100
     torch.testing.assert_close(projected.means2d[seen], means2d[0][seen], atol=1e-8, rtol=1e-8)
     torch.testing.assert_close(projected.depths[seen], depths[0][seen], atol=1e-9, rtol=0)
-    det = ours.across * ours.yy
-    conic = torch.stack([ours.yy / det, -ours.shear * ours.yy / det, (projected.xx + 0.3) / det], -1)
+    det = projected_footprint.across * projected_footprint.yy
+    conic = torch.stack([projected_footprint.yy / det, -projected_footprint.shear * projected_footprint.yy / det, (projected.xx + 0.3) / det], -1)
     torch.testing.assert_close(conic[seen], conics[0][seen], atol=1e-7, rtol=1e-6)
-    torch.testing.assert_close((ours.opacities / g.opacities)[seen], compensation[0][seen].clamp_min(0.005), atol=1e-8, rtol=1e-6)
+    torch.testing.assert_close((projected_footprint.opacities / g.opacities)[seen], compensation[0][seen].clamp_min(0.005), atol=1e-8, rtol=1e-6)

@@ -71,7 +71,7 @@ def test_auto_takes_the_fastest_that_lacks_nothing_and_says_why():
     assert why == "fast: the fastest that can serve the request; fussy cannot: it is not in the mood"
 
 
-def test_on_a_gpu_the_users_own_rasterizer_comes_first_and_what_is_untried_is_said(monkeypatch):
+def test_on_a_gpu_the_users_own_rasterizer_comes_first_and_untested_ones_are_noted(monkeypatch):
     built_in = {"gsplat": "GsplatBackend", "inria": "InriaBackend", "triton": "TritonBackend"}
     for name, kind in built_in.items():
         monkeypatch.setattr(f"mipmap_plugin.backends.{name}.{kind}.lacking", lambda self, needs: [])
@@ -192,7 +192,7 @@ def test_an_installed_backend_that_is_broken_breaks_nothing(install):
     assert "no_such_package" in survey(NEEDS)["bad"][0]
 
 
-def test_targets_are_imported_only_when_asked_for(tmp_path, monkeypatch):
+def test_targets_are_imported_only_when_used(tmp_path, monkeypatch):
     (tmp_path / "lazy_plugin.py").write_text("thing = 'made'")
     monkeypatch.syspath_prepend(tmp_path)
     things = Registry("group", {"lazy": "lazy_plugin:thing"})

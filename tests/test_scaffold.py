@@ -100,7 +100,7 @@ def test_the_prefilter_is_the_originals(size):
     assert 20 < sum(wanted) < 380
 
 
-def test_what_is_inspected_tells_the_layout(tmp_path):
+def test_notes_describe_the_layout(tmp_path):
     notes = load(tmp_path, LAYOUTS["feature bank"]).notes
     assert "40 anchors with 3 splats each, which are decoded for each camera" in notes
     assert "the distance of the camera goes into opacity_mlp, feature_bank_mlp" in notes
@@ -108,8 +108,8 @@ def test_what_is_inspected_tells_the_layout(tmp_path):
 
 
 def test_a_bare_ply_finds_the_networks_beside_it(folder):
-    found = load_model(folder / "point_cloud/iteration_30000/point_cloud.ply")
-    assert (found.family, found.folder) == ("scaffold", folder)
+    model = load_model(folder / "point_cloud/iteration_30000/point_cloud.ply")
+    assert (model.family, model.folder) == ("scaffold", folder)
 
 
 def test_gradients_reach_what_may_move_and_not_the_anchors(folder):
@@ -205,7 +205,7 @@ def test_a_baked_view_is_a_plain_file_that_shows_the_same(folder, tmp_path):
     model = load_model(folder)
     baked = load_model(model.bake(VIEWS[0]).save(tmp_path / "view.ply", provenance={}))
     assert baked.family == "3dgs"
-    one, other = (wrap_model(each, cameras=VIEWS, backend="reference").render(VIEWS[0]).image for each in (model, baked))
+    one, other = (wrap_model(shown, cameras=VIEWS, backend="reference").render(VIEWS[0]).image for shown in (model, baked))
     torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
 
 
@@ -216,9 +216,9 @@ def test_without_cameras_an_orbit_goes_around_the_anchors(folder):
 
 def test_inspecting_examines_what_a_view_shows(folder, capsys):
     assert main(["inspect", str(folder), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["family"], told["sh degree"]) == ("scaffold", "0 in use of 0")
-    assert told["splats"] > 5
+    report = json.loads(capsys.readouterr().out)
+    assert (report["family"], report["sh degree"]) == ("scaffold", "0 in use of 0")
+    assert report["splats"] > 5
 
 
 def test_training_views_beside_the_model_are_numbered(folder):
@@ -317,9 +317,9 @@ def test_an_incomplete_iteration_is_passed_over_for_an_older_whole_one(folder, t
     newest = checkpoints.write(tmp_path / "other", iteration=40_000).parent
     newest.rename(folder / "point_cloud" / "iteration_40000")
     (folder / "point_cloud/iteration_40000/cov_mlp.pt").unlink()
-    found = detect(folder)
-    assert (found.iteration, found.family) == (30_000, "scaffold")
-    assert "incomplete checkpoint, without cov_mlp.pt" in found.notes[0]
+    checkpoint = detect(folder)
+    assert (checkpoint.iteration, checkpoint.family) == (30_000, "scaffold")
+    assert "incomplete checkpoint, without cov_mlp.pt" in checkpoint.notes[0]
     refused(folder / "point_cloud/iteration_40000/point_cloud.ply", "incomplete checkpoint: cov_mlp.pt must lie beside the PLY")
 
 

@@ -1,4 +1,4 @@
-"""Cameras and images from files: real ones agree with each other, broken ones give one sentence each."""
+"""Cameras and images from files: real ones agree with each other, broken ones raise an error of one sentence."""
 
 import json
 import math

@@ -104,7 +104,7 @@ def test_a_folder_is_written_that_nerfstudio_finds_beside_the_old_one(tmp_path):
 
 def test_colors_without_sh_come_back_as_the_same_colors(tmp_path):
     raw = splats(bands=0)
-    raw["sh0"][0] = 12.0  # a color that float32 cannot tell from 1
+    raw["sh0"][0] = 12.0  # a color that float32 rounds to 1
     model = load_model(splatfacto_folder(tmp_path / "r", raw))
     written = load_torch_unsafely(model.save(tmp_path / "out.ckpt", provenance={}))["pipeline"]["_model.gauss_params.features_dc"]
     assert torch.allclose(written.sigmoid(), raw["sh0"][:, 0].sigmoid(), atol=1e-6)
@@ -166,7 +166,7 @@ def test_adapting_raises_the_quality_and_leaves_the_base_alone(tmp_path, scale):
 # Notes and refusals
 
 
-def test_what_is_not_applied_is_told(tmp_path):
+def test_notes_name_what_is_not_applied(tmp_path):
     pipeline = {**splatfacto_state(splats()), "_model.camera_optimizer.pose_adjustment": torch.zeros(3, 6)}
     torch.save(splatfacto_content(pipeline), tmp_path / "a.ckpt")
     notes = " ".join(load_model(tmp_path / "a.ckpt").notes)

@@ -70,7 +70,7 @@ def by_the_paper(splats, view, eps2d=0.5, near=0.2):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_image_is_the_papers(seed):
+def test_the_image_is_that_of_the_papers_formula(seed):
     splats = flat(gaussians(60, seed=seed))
     image = ReferenceBackend().render(splats, camera(), EFFECTS).image
     torch.testing.assert_close(image, by_the_paper(splats, camera()), atol=1e-9, rtol=0)
@@ -99,7 +99,7 @@ def test_what_is_smaller_than_a_pixel_is_still_a_dot():
         assert float(alpha.sum()) == pytest.approx(0.8 * 2 * math.pi * width, rel=0.05)
 
 
-def test_gradients_are_those_of_differences():
+def test_gradients_equal_finite_differences():
     splats = flat(gaussians(12, seed=3))
     tensors, held = leaves(splats)
     weights = torch.rand(32, 40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
@@ -201,7 +201,7 @@ def test_rendered_by_its_own_convention(tmp_path):
     torch.testing.assert_close(wrapped.render(view).image.double(), by_the_paper(wrapped.model.gaussians(), view), atol=2e-5, rtol=0)
 
 
-def test_saved_as_it_came(tmp_path):
+def test_saved_without_change(tmp_path):
     model = load_model(folder(tmp_path / "model"))
     saved = model.save(tmp_path / "copy", provenance={})
     before, after = (read_ply(path).columns for path in (model.source, saved))
@@ -254,7 +254,7 @@ def test_merged_splats_are_flat_again():
     assert flattened(turned) is turned
 
 
-def test_merging_gives_fewer_and_flat(tmp_path):
+def test_merging_returns_fewer_splats_that_are_flat(tmp_path):
     adapted = wrap_model(folder(tmp_path / "model")).adapt(1 / 8, recipe="instant", merge_to=0.3, merging_costs=99)
     assert len(adapted.model) < 50
     assert "scale_2" not in read_ply(adapted.save(tmp_path / "a.ply")).columns
@@ -269,7 +269,7 @@ class GaussianModel:
         self._opacity, self._features_dc, self._features_rest = raw["opacities"][:, None], raw["sh0"], raw["shN"]
 
 
-def test_a_live_object_is_known_by_its_two_scales():
+def test_a_live_object_is_recognized_by_its_two_scales():
     live = GaussianModel()
     model = adopt(live)
     assert isinstance(model, SurfelModel) and model.trained.screen_filter == "surfel"
@@ -277,7 +277,7 @@ def test_a_live_object_is_known_by_its_two_scales():
     assert (model.parameters()["scales"][:, 2] == FLAT).all()
 
 
-def test_inspect_says_what_it_is(tmp_path, capsys):
+def test_inspect_names_the_family(tmp_path, capsys):
     main(["inspect", str(folder(tmp_path / "model"))])
     printed = capsys.readouterr().out
     assert "2dgs" in printed and "surfel, 0.5 px²" in printed

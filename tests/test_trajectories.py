@@ -61,7 +61,7 @@ def test_orbit_stands_above_the_horizon_with_the_vertical_upright():
         assert camera.viewmat[1, 2] < 0  # the image's y axis points down
 
 
-def test_orbit_takes_a_given_vertical():
+def test_orbit_takes_a_vertical():
     assert all(camera.center[0] > 5.0 for camera in orbit(cloud(1, 1, 1), (64, 64), 10, seeded(), up=(2, 0, 0)))
 
 
@@ -71,7 +71,7 @@ def test_orbit_poses_are_rotations():
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(5, dtype=torch.float64))
 
 
-def test_orbit_repeats_with_the_seed_and_only_then():
+def test_orbit_is_the_same_only_for_the_same_seed():
     means = cloud(1, 1, 1)
     first, again, other = (poses(orbit(means, (64, 64), 6, seeded(seed))) for seed in (1, 1, 2))
     assert torch.equal(first, again)
@@ -88,11 +88,11 @@ def test_orbit_without_splats_is_refused():
         orbit(torch.full((3, 3), math.inf), (8, 8), 4, seeded())
 
 
-def test_a_scene_flat_along_y_is_taken_for_colmaps():
+def test_a_scene_flat_along_y_counts_as_y_down():
     assert guess_up(cloud(3, 1, 3)).tolist() == [0, -1, 0]
 
 
-def test_any_other_scene_is_taken_for_z_up():
+def test_any_other_scene_counts_as_z_up():
     assert guess_up(cloud(1, 1, 1)).tolist() == [0, 0, 1]
 
 
@@ -114,14 +114,14 @@ def test_jittered_views_keep_the_lens_and_get_names_of_their_own():
     assert (view.name, view.split) == ("jittered_0007", "train")
 
 
-def test_jittered_views_stay_near_a_given_one():
-    given = torch.stack([camera.center for camera in ring()])
-    neighbor = torch.cdist(given, given).topk(5, largest=False).values.max()
+def test_jittered_views_stay_near_a_camera():
+    centers = torch.stack([camera.center for camera in ring()])
+    neighbor = torch.cdist(centers, centers).topk(5, largest=False).values.max()
     new = torch.stack([camera.center for camera in jittered(ring(), 100, seeded())])
-    assert torch.cdist(new, given).min(dim=1).values.max() < neighbor
+    assert torch.cdist(new, centers).min(dim=1).values.max() < neighbor
 
 
-def test_jittered_views_look_where_the_given_ones_looked():
+def test_jittered_views_look_where_the_cameras_looked():
     cosine = (forwards(jittered(ring(), 100, seeded())) @ forwards(ring()).T).max(dim=1).values
     assert cosine.min() > math.cos(math.radians(25))
 
@@ -143,9 +143,9 @@ def test_parallel_cameras_have_views_on_the_line_through_both_and_a_little_beyon
 
 def test_cameras_around_something_have_views_as_far_from_it_as_they_are():
     focus = torch.linalg.lstsq(*sights(ring())).solution
-    given = torch.stack([(camera.center - focus).norm() for camera in ring()])
+    distances = torch.stack([(camera.center - focus).norm() for camera in ring()])
     new = torch.stack([(view.center - focus).norm() for view in jittered(ring(), 50, seeded(), amount=0.0)])
-    torch.testing.assert_close(new, given.mean().expand(50))
+    torch.testing.assert_close(new, distances.mean().expand(50))
 
 
 def sights(cameras: list[Camera]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -187,13 +187,13 @@ def test_views_are_spread_over_the_times_of_the_cameras_too():
     assert 8 <= sum(times) <= 32
 
 
-def test_jittered_repeats_with_the_seed_and_only_then():
+def test_jittered_is_the_same_only_for_the_same_seed():
     first, again, other = (poses(jittered(ring(), 6, seeded(seed))) for seed in (1, 1, 2))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
 
-def test_one_camera_is_turned_on_the_spot():
+def test_a_single_camera_is_rotated_in_place():
     only = ring()[:1]
     views = jittered(only, 5, seeded())
     torch.testing.assert_close(torch.stack([v.center for v in views]), only[0].center.expand(5, 3))
@@ -208,7 +208,7 @@ def test_no_camera_is_refused():
 @pytest.mark.parametrize("name", ["bases/lego_200", "flowers_r8"])
 def test_views_around_real_cameras_keep_their_distance(shared_data, name):
     cameras = load_scene(shared_data / "checkpoints" / name).cameras
-    given = torch.stack([camera.center for camera in cameras])
+    old = torch.stack([camera.center for camera in cameras])
     new = torch.stack([camera.center for camera in jittered(cameras, 50, seeded())])
-    radius = (given - given.mean(dim=0)).norm(dim=1)
-    assert torch.cdist(new, given).min(dim=1).values.max() < 0.25 * radius.max()
+    radius = (old - old.mean(dim=0)).norm(dim=1)
+    assert torch.cdist(new, old).min(dim=1).values.max() < 0.25 * radius.max()

@@ -50,7 +50,7 @@ def draw(backend, g: Gaussians, view, effects: Effects):
     return image.detach(), alpha.detach(), {name: grad for name, grad in grads.items() if grad is not None}
 
 
-def ours(g: Gaussians, view=WIDE, effects: Effects = Effects(1)):  # noqa: B008
+def triton_result(g: Gaussians, view=WIDE, effects: Effects = Effects(1)):  # noqa: B008
     return draw(TritonBackend().render, g.to(dtype=torch.float32), view, effects)
 
 
@@ -66,7 +66,7 @@ def test_equals_a_sum_over_every_pixel(screen_filter, eps2d):
     g = gaussians(30, dtype=torch.float32)
     effects = Effects(1, screen_filter, eps2d, (0.2, 0.5, 0.9))
     right = draw(lambda *scene: brute_force(*scene[:2], eps2d, effects.background, screen_filter), g.to(dtype=torch.float64), WIDE, effects)
-    result = ours(g, WIDE, effects)
+    result = triton_result(g, WIDE, effects)
     assert set(result[2]) == {"means", "quats", "scales", "opacities", "sh"}
     assert_equal(result, right)
 
@@ -74,21 +74,21 @@ def test_equals_a_sum_over_every_pixel(screen_filter, eps2d):
 @pytest.mark.parametrize("degree", [0, 2, 3, 4])
 def test_every_harmonic_has_its_gradient(degree):
     g, view, effects = gaussians(12, degree, dtype=torch.float32), camera(16, 16), Effects(degree)
-    assert_equal(ours(g, view, effects), draw(ReferenceBackend().render, g.to(dtype=torch.float64), view, effects))
+    assert_equal(triton_result(g, view, effects), draw(ReferenceBackend().render, g.to(dtype=torch.float64), view, effects))
 
 
 def test_a_near_plane_of_0_divides_by_nothing():
     g, effects = gaussians(12, dtype=torch.float32), Effects(1, near_plane=0.0)
     g.means[0] = camera(16, 16).center.float()
     g.means[1, 2] = -5.0
-    image, alpha, grads = ours(g, camera(16, 16), effects)
+    image, alpha, grads = triton_result(g, camera(16, 16), effects)
     seen = draw(ReferenceBackend().render, g[torch.arange(12) > 1].to(dtype=torch.float64), camera(16, 16), effects)
     assert_equal((image, alpha, {name: grad[2:] for name, grad in grads.items()}), seen)
     assert not any(grad[:2].any() for grad in grads.values())
 
 
 def test_bands_left_out_have_no_gradient():
-    grads = ours(gaussians(12, 3), camera(16, 16))[2]
+    grads = triton_result(gaussians(12, 3), camera(16, 16))[2]
     assert grads["sh"][:, :4].any() and not grads["sh"][:, 4:].any()
 
 
@@ -96,7 +96,7 @@ def test_covariances_need_not_be_symmetric_to_have_their_gradient():
     g = gaussians(12).to(dtype=torch.float32)
     tilted = covariances(g) + 1e-4 * torch.randn(12, 3, 3, generator=torch.Generator().manual_seed(3))
     g = replace(g, covariances=tilted)
-    result = ours(g, camera(16, 16))
+    result = triton_result(g, camera(16, 16))
     assert set(result[2]) == {"means", "opacities", "sh", "covariances"}
     assert_equal(result, draw(ReferenceBackend().render, g.to(dtype=torch.float64), camera(16, 16), Effects(1)))
 
@@ -106,16 +106,16 @@ def test_pixels_stop_where_they_should():
     g = replace(g, opacities=0.9 + 0.1 * g.opacities, scales=3 * g.scales)
     right = draw(ReferenceBackend().render, g.to(dtype=torch.float64), camera(16, 16), Effects(1))
     assert (right[1] > 0.999).double().mean() > 0.5
-    assert_equal(ours(g, camera(16, 16)), right, 1e-4)
+    assert_equal(triton_result(g, camera(16, 16)), right, 1e-4)
 
 
 def test_sums_in_one_order_are_the_same_sums():
     """In this mode torch also fills new memory with NaN, so reading uninitialized memory would be noticed."""
     g, view = gaussians(12), camera(24, 20)
-    right = ours(g, view)
+    right = triton_result(g, view)
     try:
         torch.use_deterministic_algorithms(True)
-        first, again = ours(g, view), ours(g, view)
+        first, again = triton_result(g, view), triton_result(g, view)
     finally:
         torch.use_deterministic_algorithms(False)
     assert torch.equal(first[0], right[0]) and torch.equal(first[1], right[1])

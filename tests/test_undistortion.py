@@ -1,4 +1,4 @@
-"""Lenses that bend: a point of the world is where the pinhole says, in the photograph that was undistorted for it."""
+"""Lens distortion: in the undistorted photograph a point of the world is where the pinhole camera projects it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ POINTS = torch.tensor([[-0.25, -0.18, 1.0], [0.22, 0.2, 1.0], [0.3, -0.15, 1.0],
 
 
 def photograph(model, params, size=(WIDTH, HEIGHT)):
-    """A soft dot for each point, where the lens puts it."""
+    """A soft dot for each point, where the lens projects it."""
     lens = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)
     lens.rescale(*size)
     ys, xs = torch.meshgrid(torch.arange(size[1]) + 0.5, torch.arange(size[0]) + 0.5, indexing="ij")
@@ -62,7 +62,7 @@ def nerfstudio_scene(path, model):
     return load_scene(path)
 
 
-def dots_lie_where(camera: Camera, image: torch.Tensor) -> None:
+def assert_dots_at(camera: Camera, image: torch.Tensor) -> None:
     assert tuple(image.shape[:2]) == camera.size
     for x, y, z in POINTS.tolist():
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
@@ -74,44 +74,44 @@ def dots_lie_where(camera: Camera, image: torch.Tensor) -> None:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_points_of_a_colmap_scene_lie_where_its_pinhole_says(tmp_path, model):
+def test_points_of_a_colmap_scene_are_where_its_pinhole_projects_them(tmp_path, model):
     scene = colmap_scene(tmp_path, model)
-    dots_lie_where(scene.cameras[0], scene.image(scene.cameras[0], (0, 0, 0)))
+    assert_dots_at(scene.cameras[0], scene.image(scene.cameras[0], (0, 0, 0)))
 
 
 def test_photographs_that_were_shrunk_since_are_undistorted_at_their_size(tmp_path):
     scene = colmap_scene(tmp_path, "OPENCV", (2 * WIDTH, 2 * HEIGHT))
-    dots_lie_where(scene.cameras[0], scene.image(scene.cameras[0], (0, 0, 0)))
+    assert_dots_at(scene.cameras[0], scene.image(scene.cameras[0], (0, 0, 0)))
     assert scene.cameras[0].fx == 320
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
-def test_points_of_a_nerfstudio_scene_lie_where_its_pinhole_says(tmp_path, model):
+def test_points_of_a_nerfstudio_scene_are_where_its_pinhole_projects_them(tmp_path, model):
     scene = nerfstudio_scene(tmp_path / "s", model)
-    dots_lie_where(scene.cameras[0], scene.image(scene.cameras[0], (0, 0, 0)))
+    assert_dots_at(scene.cameras[0], scene.image(scene.cameras[0], (0, 0, 0)))
     assert any("bend" in note for note in scene.notes)
 
 
-def test_it_is_the_undistorting_that_does_it(tmp_path):
-    """The same image looked at as it is: some dot is elsewhere."""
+def test_without_undistortion_points_are_elsewhere(tmp_path):
+    """In the distorted photograph, some dot is not where the pinhole projects it."""
     scene = colmap_scene(tmp_path, "OPENCV")
     pinhole = Camera(WIDTH, HEIGHT, 160, 158, 103, 72, torch.eye(4))
     with pytest.raises(AssertionError):
-        dots_lie_where(pinhole, photograph("OPENCV", LENSES["OPENCV"]))
+        assert_dots_at(pinhole, photograph("OPENCV", LENSES["OPENCV"]))
     assert scene.cameras[0].size != pinhole.size
 
 
-def test_a_scene_through_a_lens_gives_cameras_to_adapt_with_and_images_to_judge_by(tmp_path):
+def test_a_distorted_scene_has_cameras_to_adapt_with_and_images_to_evaluate_on(tmp_path):
     scene = nerfstudio_scene(tmp_path / "s", "OPENCV")
     wrapped = wrap_model(tiny.model(), cameras=scene)
     assert wrapped.adapt(1 / 4, steps=1, views="given").report.views == "the 1 given views"
     [view] = protocols.test_views(scene, scene.cameras[0], (0.0, 0.0, 0.0))
-    dots_lie_where(view.camera, view.truth(1.0, protocols.PROTOCOLS["P3"]))
+    assert_dots_at(view.camera, view.truth(1.0, protocols.PROTOCOLS["P3"]))
     with pytest.raises(SettingsError, match=r"P4.*bends"):
         view.truth(1.0, protocols.PROTOCOLS["P4"])
 
 
-def test_without_pycolmap_the_poses_serve_and_the_photographs_do_not(tmp_path, monkeypatch):
+def test_without_pycolmap_the_poses_are_usable_and_the_photographs_are_not(tmp_path, monkeypatch):
     nerfstudio_scene(tmp_path / "s", "OPENCV")
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     scene = load_scene(tmp_path / "s")
@@ -121,8 +121,8 @@ def test_without_pycolmap_the_poses_serve_and_the_photographs_do_not(tmp_path, m
         scene.image(scene.cameras[0], (0, 0, 0))
 
 
-def test_a_project_that_divides_a_bent_scene_divides_what_is_left_of_it(tmp_path):
-    """gsplat's factor applies to the undistorted lens; the copies on the disk are still bent."""
+def test_projects_that_downscale_a_distorted_scene_downscale_its_undistorted_size(tmp_path):
+    """gsplat's factor applies to the undistorted camera; the smaller copies on disk are distorted."""
     scene = colmap_scene(tmp_path, "OPENCV")
     write_image(tmp_path / "images_2" / names(1)[0], photograph("OPENCV", LENSES["OPENCV"], (WIDTH // 2, HEIGHT // 2)))
     model = load_model(gsplat_folder(tmp_path / "r", splats(), normalized="false"))

@@ -83,8 +83,8 @@ def test_rgb_stands_in_for_dc(tmp_path, full):
     columns = {name: column for name, column in splat_columns(2, 0).items() if not name.startswith("f_dc")}
     colors = {name: np.array([full, 0 * full], full.dtype) for name in ("red", "green", "blue")}
     model = load_vanilla(write(tmp_path / "a.ply", {**columns, **colors}))
-    shown = 0.5 + 0.28209479177387814 * model.gaussians().sh[:, 0]
-    torch.testing.assert_close(shown, torch.tensor([[1.0] * 3, [0.0] * 3]))
+    rendered_colors = 0.5 + 0.28209479177387814 * model.gaussians().sh[:, 0]
+    torch.testing.assert_close(rendered_colors, torch.tensor([[1.0] * 3, [0.0] * 3]))
     assert not model.notes
 
 
@@ -130,15 +130,15 @@ def test_a_model_with_hostile_cfg_args_loads_without_them(tmp_path):
         ((), "classic"),
     ],
 )
-def test_header_tag_tells_the_screen_filter(tmp_path, comments, screen_filter):
+def test_header_tag_names_the_screen_filter(tmp_path, comments, screen_filter):
     model = load_vanilla(write_splats(tmp_path / "a.ply", comments=comments))
     assert model.trained.screen_filter == screen_filter
 
 
-def test_exposure_is_told(tmp_path):
+def test_notes_describe_the_exposure(tmp_path):
     folder = write_model_folder(tmp_path / "m", cfg_args="Namespace(sh_degree=3, train_test_exp=True)")
     identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
-    for content, told in {
+    for content, note in {
         json.dumps({"a": identity}): "only identities",
         json.dumps({"a": identity, "b": [[2, 0, 0, 0], *identity[1:]]}): "changes 1 of 2 images",
         "[]": "cannot be read",
@@ -146,7 +146,7 @@ def test_exposure_is_told(tmp_path):
         (folder / "exposure.json").write_text(content)
         notes = load_vanilla(folder).notes
         assert "train_test_exp" in notes[0]
-        assert told in notes[1]
+        assert note in notes[1]
 
 
 # The model
@@ -224,7 +224,7 @@ def test_reshape_keeps_leaves_and_stays_finite_at_the_ends():
         model.reshape(lambda _: (torch.ones(1, 3), torch.ones(3)))
 
 
-def test_replace_parameters_takes_the_very_tensors():
+def test_replace_parameters_keeps_the_same_tensors():
     model = raw_model(3).copy()
     fresh = {name: tensor.detach()[:2].clone().requires_grad_() for name, tensor in model.parameters().items()}
     model.replace_parameters(fresh)
@@ -275,7 +275,7 @@ def test_written_columns_are_those_of_3dgs(tmp_path):
     assert not any(file.columns[name].any() for name in ("nx", "ny", "nz"))
 
 
-def test_header_keeps_foreign_comments_and_replaces_our_own(tmp_path):
+def test_header_keeps_foreign_comments_and_replaces_those_of_this_package(tmp_path):
     model = load_vanilla(write_splats(tmp_path / "a.ply", comments=("Exported from Brush", "SplatRenderMode: mip", "antialiased 1")))
     once = load_vanilla(model.save(tmp_path / "b.ply", provenance={"scale": 2}))
     comments = read_ply(once.save(tmp_path / "c.ply", provenance={**PROVENANCE, "name": "Brüder\n"})).comments
@@ -288,7 +288,7 @@ def test_header_says_default_for_the_classic_filter(tmp_path):
     assert "SplatRenderMode: default" in read_ply(raw_model().save(tmp_path / "a.ply", provenance={})).comments
 
 
-def test_extra_columns_travel_until_rows_change(tmp_path):
+def test_extra_columns_are_kept_until_rows_change(tmp_path):
     segment = np.arange(5, dtype=np.int32)
     model = load_vanilla(write(tmp_path / "a.ply", {"segment": segment, **splat_columns(5)}))
     assert model.notes == ["extra columns are carried along: segment"]
@@ -327,7 +327,7 @@ def test_folder_of_a_model_without_an_iteration(tmp_path, iteration):
     assert read_cfg_args(tmp_path / "out/cfg_args")["sh_degree"] == 3
 
 
-def test_folder_is_replaced_only_when_told_and_only_a_models(tmp_path):
+def test_only_a_model_folder_is_replaced_and_only_with_the_option(tmp_path):
     old, new = raw_model(2), raw_model(3)
     old.save(tmp_path / "out", provenance={})
     with pytest.raises(OutputExists, match="--overwrite"):

@@ -1,4 +1,4 @@
-"""What `inspect` says of viewers."""
+"""The line of `inspect` on how viewers render a checkpoint."""
 
 import re
 from statistics import fmean
@@ -24,19 +24,19 @@ def decibels(sentence: str) -> dict[str, float]:
     return {name: float(number) for name, number in re.findall(r"(\S+) ([\d.]+) dB", sentence)}
 
 
-def test_each_viewer_is_as_far_from_training_as_its_pictures_are(tmp_path):
+def test_the_difference_of_a_viewer_is_that_of_its_images(tmp_path):
     model = loaded(tmp_path)
     views = [model.cameras[nth] for nth in (0, 2, 4)]
-    told = decibels(viewer_differences(model))
-    assert list(told) == ["spark", "playcanvas", "gaussian-splats-3d", "antialiased"]  # classic is the same
-    for viewer, number in told.items():
+    differences = decibels(viewer_differences(model))
+    assert list(differences) == ["spark", "playcanvas", "gaussian-splats-3d", "antialiased"]  # classic is the same
+    for viewer, number in differences.items():
         assert number == pytest.approx(fmean(psnr(model.render(v, viewer=viewer).image, model.render(v).image) for v in views), abs=0.051)
 
 
 def test_what_was_trained_with_compensation_looks_wrong_in_a_classic_viewer(tmp_path):
     model = loaded(tmp_path, trained=TrainedScale("antialiased"))
-    told = viewer_differences(model)
-    assert "antialiased the same" in told and decibels(told)["classic"] < decibels(told)["spark"]
+    line = viewer_differences(model)
+    assert "antialiased the same" in line and decibels(line)["classic"] < decibels(line)["spark"]
 
 
 def test_fewer_views_are_drawn_of_more_splats_and_none_of_too_many(tmp_path, monkeypatch):
@@ -61,6 +61,6 @@ def test_where_training_drew_what_only_a_slow_backend_draws_nothing_is_drawn(tmp
     assert viewer_differences(model).startswith("not drawn")
 
 
-def test_a_file_of_another_project_is_not_drawn_and_the_remedy_is_said(tmp_path):
+def test_a_file_of_another_project_is_not_rendered_and_the_note_says_what_to_do(tmp_path):
     model = wrap_model(torch_checkpoints.gsplat_folder(tmp_path / "run", torch_checkpoints.splats()), cameras=tiny.cameras(1))
     assert viewer_differences(model).startswith("not drawn: its own project alone opens such a file; `mipmap-plugin adapt --scale 1 --viewer NAME")

@@ -1,4 +1,4 @@
-"""Viewers: each rule against what its shader says, worked out by hand for one splat in the middle of a picture."""
+"""Viewers: every rule against its shader, computed by hand for one splat in the middle of an image."""
 
 import math
 from dataclasses import fields, replace
@@ -66,7 +66,7 @@ def test_playcanvas_drops_a_splat_whose_longer_axis_is_less_than_two_half_pixels
 
 
 @BOTH
-def test_webgpu_asks_for_the_size_along_x_and_y(backend):
+def test_webgpu_tests_the_size_along_x_and_y(backend):
     slanted = splat(0.06, 0.0001, turn=math.pi / 4)  # 0.03 px² along x and along y
     assert alpha(backend, "playcanvas", slanted).max() > 0
     assert alpha(backend, "playcanvas-webgpu", slanted).max() == 0
@@ -82,7 +82,7 @@ def test_webgpu_drops_a_splat_that_contributes_less_than_three(backend):
 
 
 @BOTH
-def test_cesium_drops_what_is_smaller_than_two_pixels_of_its_own(backend):
+def test_cesium_drops_splats_smaller_than_two_of_its_pixels(backend):
     # sqrt(2·(16v + 0.3)) >= 2: v >= 0.10625 px²
     assert alpha(backend, "cesium", splat(0.106, 0.01)).max() == 0
     assert alpha(backend, "cesium", splat(0.107, 0.01)).max() > 0
@@ -96,15 +96,15 @@ def test_cesium_drops_what_is_smaller_than_two_pixels_of_its_own(backend):
     ("viewer", "more"), [("playcanvas", 0.075), ("gaussian-splats-3d", 0.3), ("cesium", 0.01875), ("babylon", 0.075), ("antimatter15", 0.0)]
 )
 def test_a_viewer_dilates_by_its_own_variance(backend, viewer, more):
-    shown = alpha(backend, viewer, splat(4.0, 1.0, 0.8))
+    rendered = alpha(backend, viewer, splat(4.0, 1.0, 0.8))
     end = math.exp(-4) if viewer == "playcanvas" else 0.0
     for x in (1, 3):
         weight = math.exp(-(x**2) / 2 / (4.0 + more))
-        assert shown[MIDDLE, MIDDLE + x] == pytest.approx(0.8 * (weight - end) / (1 - end), abs=2e-5)
+        assert rendered[MIDDLE, MIDDLE + x] == pytest.approx(0.8 * (weight - end) / (1 - end), abs=2e-5)
 
 
 @BOTH
-def test_playcanvas_fades_and_others_cut_at_the_root_of_eight(backend):
+def test_playcanvas_fades_and_other_viewers_cut_at_the_root_of_eight(backend):
     # Dilated to 1 px²: pixels at 2 and 3 lie this side and that of 2.83 standard deviations.
     faded = alpha(backend, "playcanvas", splat(0.925, 0.925, 0.9))
     end = math.exp(-4)
@@ -116,7 +116,7 @@ def test_playcanvas_fades_and_others_cut_at_the_root_of_eight(backend):
 
 
 @BOTH
-def test_spark_looks_at_alpha_after_compensation(backend):
+def test_spark_compares_alpha_after_compensation(backend):
     # A needle of 2 by v px² keeps sqrt(2v / (2.3·(v + 0.3))) of its opacity.
     def share(v):
         return math.sqrt(2 * v / (2.3 * (v + 0.3)))
@@ -129,7 +129,7 @@ def test_spark_looks_at_alpha_after_compensation(backend):
 
 
 @BOTH
-def test_antialiasing_makes_playcanvas_keep_the_light(backend):
+def test_with_antialiasing_playcanvas_compensates_opacity(backend):
     whole, kept = (alpha(backend, viewer, splat(0.2, 0.1))[MIDDLE, MIDDLE] for viewer in ("playcanvas", "playcanvas-aa"))
     assert kept / whole == pytest.approx(math.sqrt(0.2 * 0.1 / (0.275 * 0.175)), rel=1e-5)
 
@@ -153,11 +153,11 @@ def test_gaussian_splats_3d_drops_small_round_splats(backend):
 
 @BOTH
 def test_gaussian_splats_3d_draws_a_round_splat_upright(backend):
-    shown = alpha(backend, "gaussian-splats-3d", splat(1.0, 1.0, 0.8))
+    rendered = alpha(backend, "gaussian-splats-3d", splat(1.0, 1.0, 0.8))
     for step in (1, 2):
         down, across = (0.8 * math.exp(-(step**2) / 2 / (1.3 + sign * math.sqrt(0.1))) for sign in (1, -1))
-        assert shown[MIDDLE + step, MIDDLE] == pytest.approx(down, abs=1e-5)
-        assert shown[MIDDLE, MIDDLE + step] == pytest.approx(across, abs=1e-5)
+        assert rendered[MIDDLE + step, MIDDLE] == pytest.approx(down, abs=1e-5)
+        assert rendered[MIDDLE, MIDDLE + step] == pytest.approx(across, abs=1e-5)
 
 
 @BOTH
@@ -166,11 +166,11 @@ def test_gaussian_splats_3d_turns_a_nearly_round_splat(backend):
     a, b, d = 1.15 + 0.3, 0.15, 1.15 + 0.3  # of variances 1.3 and 1.0, turned by 45 degrees
     middle, spread = (a + d) / 2, math.sqrt(max(0.1, ((a + d) / 2) ** 2 - (a * d - b * b)))
     x, y = b / math.hypot(b, middle + spread - a), (middle + spread - a) / math.hypot(b, middle + spread - a)
-    shown = alpha(backend, "gaussian-splats-3d", splat(1.3, 1.0, 0.8, turn=math.pi / 4))
+    rendered = alpha(backend, "gaussian-splats-3d", splat(1.3, 1.0, 0.8, turn=math.pi / 4))
     for dx, dy in ((1, 1), (1, -1), (2, 0), (0, 2)):
         along, across = dx * x + dy * y, dx * y - dy * x
         weight = math.exp(-(along**2 / (middle + spread) + across**2 / (middle - spread)) / 2)
-        assert shown[MIDDLE + dy, MIDDLE + dx] == pytest.approx(0.8 * weight, abs=2e-5)
+        assert rendered[MIDDLE + dy, MIDDLE + dx] == pytest.approx(0.8 * weight, abs=2e-5)
 
 
 @BOTH
@@ -190,51 +190,51 @@ def weight(dx: float, dy: float, across: float, down: float) -> float:
 
 @BOTH
 @pytest.mark.parametrize(("viewer", "most"), [("spark", 512), ("gaussian-splats-3d", 1024), ("antimatter15", 1024)])
-def test_a_half_axis_is_no_longer_than_the_viewer_lets_it(backend, viewer, most):
+def test_half_axes_are_limited_as_the_viewer_does(backend, viewer, most):
     """Root of eight standard deviations are a half-axis: its variance is at most most²/8, and the other's stays."""
     effects = find_viewer(viewer).effects(Effects(0))
     effects = replace(effects, screen_filter="classic", settings=replace(effects.settings, packing=None, picture_step=None))
     wide = replace(camera(), width=2400, height=3, cx=1200.0, cy=1.5)
-    shown = backend.render(splat(1e7, 4.0, 0.8), wide, effects).alpha[1]
-    assert shown[1200 + most - 1].item() == pytest.approx(weight(most - 0.5, 0, most**2 / 8, 4), abs=1e-4)
-    assert shown[1200 + most + 1] == 0 < shown[1200 - most + 1]
+    rendered = backend.render(splat(1e7, 4.0, 0.8), wide, effects).alpha[1]
+    assert rendered[1200 + most - 1].item() == pytest.approx(weight(most - 0.5, 0, most**2 / 8, 4), abs=1e-4)
+    assert rendered[1200 + most + 1] == 0 < rendered[1200 - most + 1]
 
 
 @BOTH
 def test_in_playcanvas_each_half_axis_fits_into_the_picture(backend):
     # 21 px are the picture's shorter side: a variance of 21²/8 px² at most; at 45 degrees the other axis keeps 4 px².
-    shown, end = alpha(backend, "playcanvas", splat(900.0, 4.0, 0.8, turn=math.pi / 4)), math.exp(-4)
+    rendered, end = alpha(backend, "playcanvas", splat(900.0, 4.0, 0.8, turn=math.pi / 4)), math.exp(-4)
     for x, y in ((3, 3), (6, 5), (2, -2)):
         along, across = (x + y) / math.sqrt(2), (x - y) / math.sqrt(2)
         whole = weight(along, across, SIZE**2 / 8, 4.075) / 0.8
-        assert shown[MIDDLE + y, MIDDLE + x].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+        assert rendered[MIDDLE + y, MIDDLE + x].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
 
 
 @BOTH
 def test_a_round_splat_fits_into_the_picture_too(backend):
-    shown, end = alpha(backend, "playcanvas", splat(900.0, 900.0, 0.8)), math.exp(-4)
+    rendered, end = alpha(backend, "playcanvas", splat(900.0, 900.0, 0.8)), math.exp(-4)
     whole = weight(6, 3, SIZE**2 / 8, SIZE**2 / 8) / 0.8
-    assert shown[MIDDLE + 3, MIDDLE + 6].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+    assert rendered[MIDDLE + 3, MIDDLE + 6].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
 
 
 @BOTH
 def test_webgpu_makes_the_whole_splat_smaller(backend):
     # Of 900 px² across, 21²/8 are left, and of 90 down as large a share.
-    shown, end = alpha(backend, "playcanvas-webgpu", splat(900.0, 90.0, 0.8)), math.exp(-4)
+    rendered, end = alpha(backend, "playcanvas-webgpu", splat(900.0, 90.0, 0.8)), math.exp(-4)
     share = SIZE**2 / 8 / 900.075
     whole = weight(5, 2, 900.075 * share, 90.075 * share) / 0.8
-    assert shown[MIDDLE + 2, MIDDLE + 5].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+    assert rendered[MIDDLE + 2, MIDDLE + 5].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
 
 
 @BOTH
-def test_a_half_axis_at_its_limit_does_not_feel_its_length(backend):
+def test_a_half_axis_at_its_limit_has_no_gradient(backend):
     leaves, splats = differentiable(splat(900.0, 4.0, 0.8))
     alpha(backend, "playcanvas", splats)[MIDDLE + 2, MIDDLE + 4].backward()
     across, down = leaves["scales"].grad[0, :2].abs().tolist()
     assert across < 1e-4 * down
 
 
-# What a culled splat feels
+# Gradients of a culled splat
 
 
 CULLED = [("playcanvas", splat(0.04, 0.02)), ("playcanvas-webgpu", splat(0.1, 0.2, 0.4)), ("gaussian-splats-3d", splat(0.015, 0.014))]
@@ -242,11 +242,11 @@ CULLED = [("playcanvas", splat(0.04, 0.02)), ("playcanvas-webgpu", splat(0.1, 0.
 
 @BOTH
 @pytest.mark.parametrize(("viewer", "culled"), CULLED, ids=[name for name, _ in CULLED])
-def test_a_culled_splat_is_not_drawn_and_grows_where_it_is_missed(backend, viewer, culled):
+def test_a_culled_splat_is_not_rendered_and_its_gradient_makes_it_grow_where_it_is_missing(backend, viewer, culled):
     leaves, splats = differentiable(culled)
-    shown = alpha(backend, viewer, splats)
-    assert (shown == 0).all()
-    (shown.sum() * -1).backward()  # the loss falls as the splat appears
+    rendered = alpha(backend, viewer, splats)
+    assert (rendered == 0).all()
+    (rendered.sum() * -1).backward()  # the loss falls as the splat appears
     assert all(leaf.grad.isfinite().all() for leaf in leaves.values() if leaf.grad is not None)
     assert leaves["scales"].grad[0, :2].min() <= 0 and leaves["scales"].grad[0, 0] < 0
     assert leaves["scales"].grad[0, :2].abs().max() > 1e-3
@@ -260,29 +260,29 @@ def test_a_culled_splat_that_is_in_the_way_does_not_grow(backend, viewer, culled
     assert leaves["scales"].grad[0, 0] > 0
 
 
-def test_only_a_contribution_that_is_too_little_feels_its_opacity():
+def test_only_too_small_a_contribution_has_a_gradient_to_the_opacity():
     (_, small), (_, faint) = CULLED[0], CULLED[1]
-    felt = []
+    gradients_of_opacity = []
     for viewer, culled in (("playcanvas", small), ("playcanvas-webgpu", faint)):
         leaves, splats = differentiable(culled)
         alpha(BACKENDS[0], viewer, splats).sum().backward()
-        felt.append(leaves["opacities"].grad.item())
-    assert felt[0] == 0 < felt[1]
+        gradients_of_opacity.append(leaves["opacities"].grad.item())
+    assert gradients_of_opacity[0] == 0 < gradients_of_opacity[1]
 
 
 def test_steps_along_the_gradient_bring_a_splat_back():
     scales = splat(0.03, 0.03).scales.log().requires_grad_()
     optimizer = torch.optim.Adam([scales], lr=0.02)
     for _ in range(60):
-        shown = alpha(BACKENDS[1], "playcanvas", replace(splat(0.03, 0.03), scales=scales.exp()))
+        rendered = alpha(BACKENDS[1], "playcanvas", replace(splat(0.03, 0.03), scales=scales.exp()))
         optimizer.zero_grad()
-        (shown[MIDDLE, MIDDLE] - 0.9).square().backward()
+        (rendered[MIDDLE, MIDDLE] - 0.9).square().backward()
         optimizer.step()
-    assert shown[MIDDLE, MIDDLE].item() == pytest.approx(0.9, abs=0.02)
+    assert rendered[MIDDLE, MIDDLE].item() == pytest.approx(0.9, abs=0.02)
 
 
 @BOTH
-def test_a_large_splat_does_not_feel_the_cull(backend):
+def test_the_cull_adds_no_gradient_to_a_large_splat(backend):
     gradients = []
     for settings in (find_viewer("playcanvas").settings, replace(find_viewer("playcanvas").settings, min_variance=0.0)):
         leaves, splats = differentiable(splat(4.0, 3.0))
@@ -301,8 +301,8 @@ def test_spark_clips_colors_and_shows_them_in_steps(backend):
     effects = replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
 
     def color(value):
-        shown = backend.render(splat(40.0, 40.0, 1.0, value), camera(), effects)
-        return (shown.image[MIDDLE, MIDDLE, 0] / shown.alpha[MIDDLE, MIDDLE]).item()
+        rendered = backend.render(splat(40.0, 40.0, 1.0, value), camera(), effects)
+        return (rendered.image[MIDDLE, MIDDLE, 0] / rendered.alpha[MIDDLE, MIDDLE]).item()
 
     assert color(1.7) == pytest.approx(1.0, abs=1e-6)
     assert color(100.4 / 255) == pytest.approx(100 / 255, abs=1e-6)
@@ -314,14 +314,14 @@ def test_a_color_in_steps_keeps_its_gradient(backend):
     leaves, splats = differentiable(splat(40.0, 40.0, 1.0, 0.2 / 255))  # shown as black, and not black
     effects = find_viewer("spark").effects(Effects(0))
     effects = replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
-    shown = backend.render(splats, camera(), effects)
-    shown.image[MIDDLE, MIDDLE, 0].backward()
-    assert leaves["sh"].grad[0, 0, 0] == pytest.approx(C0 * shown.alpha[MIDDLE, MIDDLE].item(), rel=1e-4)
+    rendered = backend.render(splats, camera(), effects)
+    rendered.image[MIDDLE, MIDDLE, 0].backward()
+    assert leaves["sh"].grad[0, 0, 0] == pytest.approx(C0 * rendered.alpha[MIDDLE, MIDDLE].item(), rel=1e-4)
 
 
 @BOTH
 def test_spark_sorts_by_distance(backend):
-    """Of two splats the one that lies less deep may lie further from the eye, where it lies aside."""
+    """The splat of lesser depth may be farther from the camera, if it is off-axis."""
     near, far = splat(900.0, 900.0, 1.0, 1.0, means=(0.0, 0.0, 10.0)), splat(900.0, 900.0, 1.0, 0.0, means=(4.6, 0.0, 9.9))
     pair = Gaussians(*(torch.cat([getattr(near, f.name), getattr(far, f.name)]) for f in fields(near) if f.name != "covariances"))
     wide = replace(camera(), width=120, cx=60.0)
@@ -340,19 +340,19 @@ def test_buckets_are_finer_near_the_camera():
     means[1:, 0] = torch.tensor([4.0, 3.0, 2.0, 1.0, 0.0])  # Morton's order is that of x
     scales = torch.full((6, 3), 1e-3)
     scales[0] = 240.0  # the box ends at two of them
-    found = ranks(Gaussians(means, torch.ones(6, 4), scales, torch.ones(6), torch.zeros(6, 1, 3)), camera())
-    assert found[1] < found[2] < min(found[3:])  # by depth
-    assert found[5] < found[4] < found[3]  # by x
+    places = ranks(Gaussians(means, torch.ones(6, 4), scales, torch.ones(6), torch.zeros(6, 1, 3)), camera())
+    assert places[1] < places[2] < min(places[3:])  # by depth
+    assert places[5] < places[4] < places[3]  # by x
 
 
 @BOTH
-def test_playcanvas_sees_no_order_within_a_bucket(backend):
-    """A box so deep that two splats lie in one bucket: the one of the lower cell along x is in front, though it lies behind."""
+def test_playcanvas_does_not_sort_within_a_bucket(backend):
+    """In a bounding box so deep that two splats share a bucket, the one in the lower cell along x is composited in front, though it is behind."""
     near, far = splat(40.0, 40.0, 1.0, 1.0, means=(0.01, 0.0, 10.0)), splat(40.0, 40.0, 1.0, 0.0, means=(-0.01, 0.0, 10.01))
     large = replace(splat(1.0, 1.0, means=(0.0, 0.0, -50.0)), scales=torch.full((1, 3), 1e3))
     drawn = {}
-    for others in ((), (large,)):
-        parts = (near, far, *others)
+    for context in ((), (large,)):
+        parts = (near, far, *context)
         together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(near) if f.name != "covariances"))
         drawn[len(parts)] = backend.render(together, camera(), find_viewer("playcanvas").effects(Effects(0))).image[MIDDLE, MIDDLE, 0].item()
     assert drawn[2] > 0.9 and drawn[3] < 0.1
@@ -367,20 +367,20 @@ def test_the_order_is_one_or_the_other():
 
 
 @BOTH
-def test_a_picture_is_rounded_after_each_splat_from_the_back(backend):
+def test_an_8_bit_image_is_rounded_after_every_splat_from_the_back(backend):
     settings = RenderSettings(min_alpha=0.5 / 255, max_alpha=0.999, min_transmittance=1e-6, picture_step=1 / 255)
     parts = [splat(30.0, 30.0, opacity, color, means=(0.0, 0.0, depth)) for opacity, color, depth in ((0.01, 0.3, 9.0), (0.3, 0.9, 10.0))]
     both = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(parts[0]) if f.name != "covariances"))
-    shown = backend.render(both, camera(), Effects(0, settings=settings, background=(0.2, 0.2, 0.2)))
+    rendered = backend.render(both, camera(), Effects(0, settings=settings, background=(0.2, 0.2, 0.2)))
     behind = round(255 * (0.3 * 0.9 + 0.7 * 0.2)) / 255
-    assert shown.image[MIDDLE, MIDDLE, 0].item() == pytest.approx(round(255 * (0.01 * 0.3 + 0.99 * behind)) / 255, abs=1e-6)
+    assert rendered.image[MIDDLE, MIDDLE, 0].item() == pytest.approx(round(255 * (0.01 * 0.3 + 0.99 * behind)) / 255, abs=1e-6)
 
 
 @BOTH
 def test_a_splat_of_less_than_half_a_step_is_not_seen_and_has_its_gradient(backend):
     leaves, splats = differentiable(splat(30.0, 30.0, 0.01, 0.5))
     settings = [RenderSettings(picture_step=step) for step in (1 / 255, None)]
-    images = [backend.render(splats, camera(), Effects(0, settings=each, background=(0.6, 0.6, 0.6))).image for each in settings]
+    images = [backend.render(splats, camera(), Effects(0, settings=choice, background=(0.6, 0.6, 0.6))).image for choice in settings]
     assert (images[0] == images[0][0, 0]).all() and not (images[1] == images[1][0, 0]).all()
     gradients = [torch.autograd.grad(image.sum(), list(leaves.values()), retain_graph=True) for image in images]
     for rounded, exact in zip(*gradients, strict=True):
@@ -411,10 +411,10 @@ def test_on_the_web_the_projection_is_frozen_nowhere(backend):
         ball = Gaussians(torch.tensor([[slope * 2, 0.0, 2.0]]), *shape, torch.tensor([0.9]), torch.zeros(1, 1, 3))
         variance = (f * sigma / 2) ** 2 * (1 + slope**2)
         dx = 20.5 - (SIZE / 2 + f * slope)
-        shown = backend.render(ball, near, Effects(0, eps2d=0.0, settings=RenderSettings(frozen_beyond=math.inf))).alpha
-        assert shown[MIDDLE, 20].item() == pytest.approx(0.9 * math.exp(-(dx**2) / variance / 2), abs=1e-5)
+        rendered = backend.render(ball, near, Effects(0, eps2d=0.0, settings=RenderSettings(frozen_beyond=math.inf))).alpha
+        assert rendered[MIDDLE, 20].item() == pytest.approx(0.9 * math.exp(-(dx**2) / variance / 2), abs=1e-5)
     frozen = backend.render(ball, near, Effects(0, eps2d=0.0)).alpha
-    assert frozen[MIDDLE, 20] < shown[MIDDLE, 20] - 0.01
+    assert frozen[MIDDLE, 20] < rendered[MIDDLE, 20] - 0.01
 
 
 # Packing
@@ -448,7 +448,7 @@ def test_packed_twice_is_packed():
     assert torch.allclose(once.scales, twice.scales) and torch.allclose(once.opacities, twice.opacities) and torch.allclose(once.sh, twice.sh)
 
 
-def test_colors_that_are_kept_downwards():
+def test_colors_are_rounded_down():
     kept = packed(splat(1.0, 1.0, 100.9 / 255, 100.9 / 255), camera(), find_viewer("gaussian-splats-3d").settings.packing)
     assert kept.opacities.item() * 255 == pytest.approx(100, abs=1e-3) and (0.5 + C0 * kept.sh[0, 0, 0].item()) * 255 == pytest.approx(100, abs=1e-3)
 
@@ -463,19 +463,19 @@ def test_gradients_pass_packing_as_they_are():
 # Records
 
 
-def test_what_a_viewer_does_is_on_and_the_rest_is_off():
-    told = {}
-    for viewer in (each.name for each in BUILT_IN):
-        told[viewer] = {part.name for part in explain(find_viewer(viewer).effects(Effects(0)), splat(1.0, 1.0)) if part.on}
-    assert told["classic"] == {"screen filter"}
+def test_effects_of_a_viewer_are_on_and_the_rest_is_off():
+    active = {}
+    for viewer in (record.name for record in BUILT_IN):
+        active[viewer] = {part.name for part in explain(find_viewer(viewer).effects(Effects(0)), splat(1.0, 1.0)) if part.on}
+    assert active["classic"] == {"screen filter"}
     web = {"screen filter", "edge", "size limit", "packing", "rounded picture"}
-    assert told["spark"] == web | {"compensation", "frame", "color limit", "order by distance"}
-    assert told["playcanvas"] == web | {"size cull", "color limit", "coarse order"}
-    assert told["playcanvas-webgpu"] == told["playcanvas"] - {"coarse order"} | {"contribution cull"}
-    assert told["gaussian-splats-3d"] == web | {"frame", "stretching"}
+    assert active["spark"] == web | {"compensation", "frame", "color limit", "order by distance"}
+    assert active["playcanvas"] == web | {"size cull", "color limit", "coarse order"}
+    assert active["playcanvas-webgpu"] == active["playcanvas"] - {"coarse order"} | {"contribution cull"}
+    assert active["gaussian-splats-3d"] == web | {"frame", "stretching"}
 
 
-def test_the_usual_viewers_ask_for_nothing_new():
+def test_the_usual_viewers_have_the_usual_settings():
     assert all(find_viewer(name).settings == USUAL for name in ("classic", "antialiased", "mip"))
     assert find_viewer("classic").effects(Effects(2)) == Effects(2)
 
@@ -485,7 +485,7 @@ def test_supersplat_is_playcanvas_and_every_record_is_under_its_name():
     assert all(find_viewer(viewer.name) is viewer and viewer.source and viewer.title for viewer in BUILT_IN)
 
 
-def test_an_unknown_viewer_is_told_the_known_ones():
+def test_the_error_for_an_unknown_viewer_names_the_known_ones():
     with pytest.raises(SettingsError, match=r"there is no 'sparks'; choose from antialiased, .*, spark, supersplat"):
         find_viewer("sparks")
 
@@ -493,9 +493,9 @@ def test_an_unknown_viewer_is_told_the_known_ones():
 def test_a_new_viewer_is_one_record():
     register_viewer("blurry", Viewer("blurry", "A blurry one", "nowhere", "classic", 2.0))
     model = wrap_model(tiny.model(), cameras=tiny.cameras(1), backend="reference")
-    shown = model.render(tiny.cameras(1)[0], viewer="blurry").image
+    rendered = model.render(tiny.cameras(1)[0], viewer="blurry").image
     expected = model.render(tiny.cameras(1)[0]).image
-    assert not torch.allclose(shown, expected)
+    assert not torch.allclose(rendered, expected)
     register_viewer("wrong", 3)
     with pytest.raises(PluginError, match=r"viewer 'wrong' must be a .*, got int"):
         find_viewer("wrong")
@@ -547,12 +547,12 @@ def wrapped() -> Wrapped:
     return wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="reference")
 
 
-def test_a_model_is_drawn_as_the_viewer_does():
+def test_a_model_is_rendered_as_in_the_viewer():
     model, view = wrapped(), tiny.cameras(1)[0]
-    shown = model.render(view, viewer="playcanvas")
+    rendered = model.render(view, viewer="playcanvas")
     expected = ReferenceBackend().render(model.model.gaussians(view), view, find_viewer("playcanvas").effects(model.effects()))
-    assert torch.equal(shown.image, expected.image)
-    assert not torch.allclose(shown.image, model.render(view).image)
+    assert torch.equal(rendered.image, expected.image)
+    assert not torch.allclose(rendered.image, model.render(view).image)
 
 
 def test_depth_is_no_color():
@@ -565,7 +565,7 @@ def test_a_viewer_has_its_own_screen_filter():
         wrapped().render(tiny.cameras(1)[0], screen_filter="mip", viewer="spark")
 
 
-def test_the_command_draws_as_a_viewer(tmp_path, capsys):
+def test_the_command_renders_as_in_a_viewer(tmp_path, capsys):
     folder = tiny.folder(tmp_path / "model")
     words = ["render", str(folder), "--output", str(tmp_path / "out"), "--viewer", "supersplat"]
     assert cli.main(words) == 0

@@ -1,4 +1,4 @@
-"""The benchmark of effects compares what it says that it compares."""
+"""The benchmark of effects measures the pairs that it names."""
 
 import sys
 from pathlib import Path

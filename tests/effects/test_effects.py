@@ -28,12 +28,12 @@ def wrapped(splats, **trained):
     return wrap_model(VanillaModel.from_gaussians(splats, TrainedScale(**trained)), cameras=tiny.cameras(1), backend="reference")
 
 
-def told(effects: Effects, splats: Gaussians) -> dict:
+def states(effects: Effects, splats: Gaussians) -> dict:
     return {effect.name: (effect.on, effect.reason) for effect in explain(effects, splats)}
 
 
 def test_a_plain_scene_calls_for_the_screen_filter_only():
-    assert told(Effects(sh_degree=0), with_bands(0, 3)) == {
+    assert states(Effects(sh_degree=0), with_bands(0, 3)) == {
         "view-dependent geometry": (False, "the splats are the same for every camera"),
         "levels of detail": (False, "all splats are used at every distance"),
         "time": (False, "the scene does not move"),
@@ -65,29 +65,29 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
 
 def test_everything_on():
     splats = tiny.gaussians(4)
-    given = Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, torch.eye(3).expand(4, 3, 3))
+    splats_with_covariances = Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh, torch.eye(3).expand(4, 3, 3))
     of_model = [replace(effect, on=True) for effect in MODEL_EFFECTS]
     everything = RenderSettings(
         radius=3.0, min_variance=1.0, min_contribution=1.0, least_spread=1.0, max_color=1.0, radial=True, packing=Packing(), picture_step=0.1,
         frame=1.0, max_half_axis=1.0,
     )  # fmt: skip
-    asked = Effects(1, "antialiased", 0.1, supersampling=4, settings=everything, outputs=("depth", "normals"))
-    effects = explain(asked, given, of_model, recipe("paper", 4), 4)
+    requested = Effects(1, "antialiased", 0.1, supersampling=4, settings=everything, outputs=("depth", "normals"))
+    effects = explain(requested, splats_with_covariances, of_model, recipe("paper", 4), 4)
     assert [effect.name for effect in effects if not effect.on] == ["coarse order"]  # there is another already
-    assert told(Effects(settings=RenderSettings(bucketed=True)), splats)["coarse order"][0]
+    assert states(Effects(settings=RenderSettings(bucketed=True)), splats)["coarse order"][0]
     reasons = {effect.name: effect.reason for effect in effects}
     assert [reasons[name] for name in ("supersampling", "covariances")] == ["16 samples per pixel", "the model provides them"]
     assert reasons["upsampler"] == "bicubic enlarges the base's image to the truth"
     assert reasons["densification statistics"] == "splats with gradients above 0.0002 are cloned or split"
-    assert not told(Effects(eps2d=0.0), splats)["screen filter"][0]
+    assert not states(Effects(eps2d=0.0), splats)["screen filter"][0]
 
 
-def test_each_effect_tells_its_cost():
+def test_the_line_of_an_effect_names_its_cost():
     on = explain(Effects(2, supersampling=3), with_bands(2, 3))
     off = explain(Effects(0), with_bands(0, 3))
-    said = {effect.name: str(effect) for effect in on}
-    assert said["supersampling"] == "supersampling: on, 9 samples per pixel (costs 9 times the pixels)"
-    assert said["view-dependent color"].endswith("(costs a direction and 9 of 16 coefficients per splat)")
+    lines = {effect.name: str(effect) for effect in on}
+    assert lines["supersampling"] == "supersampling: on, 9 samples per pixel (costs 9 times the pixels)"
+    assert lines["view-dependent color"].endswith("(costs a direction and 9 of 16 coefficients per splat)")
     assert str(off[6]).endswith("(saves a direction and 15 of 16 coefficients per splat)")
     assert all(effect.reason and effect.cost for effect in (*on, *off))
 
@@ -105,7 +105,7 @@ def test_why_no_upsampler_is_called_for(scale, settings, reason):
     assert [(effect.on, effect.reason) for effect in effects if effect.name == "upsampler"] == [(False, reason)]
 
 
-# What families say of themselves
+# Effects of the families
 
 
 def on(path) -> dict[str, Effect]:
@@ -157,7 +157,7 @@ def test_a_3d_filter_is_applied_where_its_project_does(tmp_path):
 # Who carries them
 
 
-def test_images_and_reports_carry_them():
+def test_images_and_reports_list_effects():
     model = wrapped(with_bands(1, 3))
     adapted = model.adapt(1 / 4, steps=1, extra_views=0)
     camera = tiny.cameras(1)[0].zoomed(1 / 4)
@@ -169,7 +169,7 @@ def test_images_and_reports_carry_them():
     assert Report(**json.loads(json.dumps(report.model_dump()))) == report
 
 
-def test_inspect_prints_them(tmp_path, capsys):
+def test_inspect_prints_effects(tmp_path, capsys):
     assert cli.main(["inspect", str(tiny.folder(tmp_path / "plain"))]) == 0
     out = capsys.readouterr().out
     assert all(f"{effect.name}: " in out for effect in explain(Effects(), tiny.gaussians(1)))

@@ -1,4 +1,4 @@
-"""Exposure: a view is shown as its photograph was exposed only where that is asked for, by the photograph's name."""
+"""Exposure: applied only on request, and looked up by the name of the photograph."""
 
 import json
 from dataclasses import replace
@@ -29,8 +29,8 @@ def base(path, exposures=None):
     return wrap_model(folder, backend="reference")
 
 
-def line(shown) -> tuple[bool, str]:
-    [effect] = [effect for effect in shown.effects if effect.name == "exposure"]
+def line(result) -> tuple[bool, str]:
+    [effect] = [effect for effect in result.effects if effect.name == "exposure"]
     return effect.on, effect.reason
 
 
@@ -41,20 +41,20 @@ def test_each_color_is_a_row_times_the_matrix_plus_the_last_column():
     assert blue == pytest.approx([0.1 + 0.01, 0.0 + 0.02, 2.0 - 0.03])
 
 
-def test_a_view_is_shown_by_the_exposure_of_its_name(tmp_path):
+def test_a_view_is_rendered_with_the_exposure_of_its_name(tmp_path):
     model = base(tmp_path / "a", {"view_0": IDENTITY, "view_1": WARM})
     first, second = model.cameras[:2]
     plain = model.render(second, supersampling=2)
-    shown = model.render(second, supersampling=2, exposure=True)
-    torch.testing.assert_close(shown.image, exposed(plain.image, torch.tensor(WARM)))
-    assert not torch.equal(shown.image, plain.image) and torch.equal(shown.alpha, plain.alpha)
+    rendered = model.render(second, supersampling=2, exposure=True)
+    torch.testing.assert_close(rendered.image, exposed(plain.image, torch.tensor(WARM)))
+    assert not torch.equal(rendered.image, plain.image) and torch.equal(rendered.alpha, plain.alpha)
     assert torch.equal(model.render(first, exposure=True).image, model.render(first).image)
 
 
-@pytest.mark.parametrize(("written", "asked"), [("view_1.JPG", "view_1"), ("a/view.1.png", "a/view.1"), ("view.1", "view.1")])
-def test_a_name_may_lack_its_suffix(tmp_path, written, asked):
+@pytest.mark.parametrize(("written", "view_name"), [("view_1.JPG", "view_1"), ("a/view.1.png", "a/view.1"), ("view.1", "view.1")])
+def test_a_name_may_lack_its_suffix(tmp_path, written, view_name):
     model = base(tmp_path / "a", {"other.png": IDENTITY, written: WARM})
-    assert model.model.traits.exposures.of(replace(model.cameras[0], name=asked)).tolist() == WARM
+    assert model.model.traits.exposures.of(replace(model.cameras[0], name=view_name)).tolist() == WARM
 
 
 def test_a_view_of_another_name_is_refused(tmp_path):
@@ -66,7 +66,7 @@ def test_a_view_of_another_name_is_refused(tmp_path):
 @pytest.mark.parametrize("exposures", [None, IDENTITY, WARM])
 def test_off_it_is_not_computed_and_forced_on_an_identity_changes_nothing(tmp_path, monkeypatch, exposures):
     model, calls = base(tmp_path / "a", exposures and {"view_0": exposures}), []
-    monkeypatch.setattr(adapted, "exposed", lambda *given: calls.append(given) or exposed(*given))
+    monkeypatch.setattr(adapted, "exposed", lambda *arguments: calls.append(arguments) or exposed(*arguments))
     image = model.render(model.cameras[0]).image
     model.adapt(1 / 4, steps=1, extra_views=0).render(model.cameras[0].zoomed(1 / 4))
     assert calls == []
@@ -95,23 +95,23 @@ def test_the_line_says_on_or_off_and_why(tmp_path, exposures, reason):
         assert line(model.render(model.cameras[1], exposure=True)) == (True, "requested; exposure.json has an entry for this view")
 
 
-def test_without_one_it_cannot_be_asked_for(tmp_path):
+def test_exposure_cannot_be_requested_without_one(tmp_path):
     model = base(tmp_path / "a")
     with pytest.raises(SettingsError, match="exposure: the checkpoint has none; leave it out"):
         model.render(model.cameras[0], exposure=True)
 
 
-def test_an_adapted_model_keeps_them_and_its_folder_too(tmp_path):
+def test_an_adapted_model_and_its_folder_keep_exposures(tmp_path):
     model = base(tmp_path / "a", {"view_1": WARM})
     adapted, small = model.adapt(1 / 4, recipe="instant"), model.cameras[1].zoomed(1 / 4)
-    shown = adapted.render(small, exposure=True).image
-    torch.testing.assert_close(shown, exposed(adapted.render(small).image, torch.tensor(WARM)))
+    rendered = adapted.render(small, exposure=True).image
+    torch.testing.assert_close(rendered, exposed(adapted.render(small).image, torch.tensor(WARM)))
     adapted.save(tmp_path / "b")
     again = wrap_model(tmp_path / "b", backend="reference").render(small, exposure=True)
-    torch.testing.assert_close(again.image, shown, atol=1e-5, rtol=0)
+    torch.testing.assert_close(again.image, rendered, atol=1e-5, rtol=0)
 
 
-def test_families_around_the_splats_of_3dgs_have_theirs(tmp_path):
+def test_families_built_on_3dgs_have_exposures_too(tmp_path):
     splats = base(tmp_path / "a", {"view_1": WARM}).model
     around = [MipModel("mip", splats, torch.ones(len(splats))), MovingModel("deformable", splats, SimpleNamespace(is_still=True, cost=""))]
     assert [model.traits.exposures is splats.traits.exposures for model in around] == [True, True]
@@ -124,7 +124,7 @@ def test_images_that_were_exposed_differently_are_not_adapted_to(tmp_path):
     base(tmp_path / "b", {"view_1": IDENTITY}).adapt(2, images=scene, steps=1)
 
 
-def test_the_command_asks_for_it(tmp_path, capsys):
+def test_the_command_has_an_option_for_exposure(tmp_path, capsys):
     base(tmp_path / "a", {"view_0": WARM})
     words = ["render", str(tmp_path / "a"), "--output", str(tmp_path / "out"), "--backend", "reference"]
     assert cli.main([*words, "--exposure"]) == 2

@@ -55,35 +55,35 @@ def leaves_of(image: torch.Tensor) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("used", [0, 1, 2, 3])
-def test_bands_above_the_last_lit_one_are_not_evaluated(monkeypatch, used):
-    asked = []
-    monkeypatch.setattr(reference, "colors", lambda *given: asked.append(given[-1]) or harmonics.colors(*given))
+def test_bands_above_the_last_nonzero_one_are_not_evaluated(monkeypatch, used):
+    degrees = []
+    monkeypatch.setattr(reference, "colors", lambda *arguments: degrees.append(arguments[-1]) or harmonics.colors(*arguments))
     splats = with_bands(used, 3)
     model = wrapped(splats)
     image = model.render(tiny.cameras(1)[0]).image
-    assert asked == [used]
+    assert degrees == [used]
     forced = reference.ReferenceBackend().render(splats, tiny.cameras(1)[0], Effects(3)).image
     torch.testing.assert_close(image, forced, atol=1e-6, rtol=0)
 
 
 def test_bands_that_are_off_stay_off_while_adapting(monkeypatch):
-    asked = set()
-    monkeypatch.setattr(reference, "colors", lambda *given: asked.add(given[-1]) or harmonics.colors(*given))
+    degrees = set()
+    monkeypatch.setattr(reference, "colors", lambda *arguments: degrees.add(arguments[-1]) or harmonics.colors(*arguments))
     adapted = wrapped(with_bands(1, 3)).adapt(1 / 4, steps=2, extra_views=0)
-    assert asked == {0, 1}  # none for how much light each splat gives, which is gray
+    assert degrees == {0, 1}  # degree 0 for the blend weights, which are rendered in gray
     assert (adapted.model.parameters()["shN"][:, 3:] == 0).all()
 
 
 def test_a_color_that_is_the_same_from_everywhere_needs_no_direction(monkeypatch):
-    asked = counted(monkeypatch, harmonics, "basis")
+    evaluated = counted(monkeypatch, harmonics, "basis")
     splats, camera = with_bands(0, 3), tiny.cameras(1)[0]
     image = wrapped(splats).render(camera).image
-    assert asked == []
+    assert evaluated == []
     torch.testing.assert_close(image, ReferenceBackend().render(splats, camera, Effects(3)).image, atol=1e-6, rtol=0)
-    assert len(asked) == 1
+    assert len(evaluated) == 1
 
 
-def test_the_place_of_a_splat_has_no_gradient_through_a_color_without_direction():
+def test_means_have_no_gradient_through_a_color_without_direction():
     means = torch.zeros(2, 3, requires_grad=True)
     sh = torch.ones(2, 16, 3, requires_grad=True)
     reached = [[leaf.shape for leaf in leaves_of(harmonics.colors(sh, means, torch.ones(3), degree))] for degree in (0, 1)]
@@ -91,7 +91,7 @@ def test_the_place_of_a_splat_has_no_gradient_through_a_color_without_direction(
 
 
 @pytest.mark.parametrize(("used", "moves"), [(0, False), (1, True)])
-def test_coefficients_that_nobody_sees_are_not_in_the_gradient_graph(used, moves):
+def test_unused_coefficients_are_not_in_the_gradient_graph(used, moves):
     graphs = []
 
     def look(step, seconds, show):
@@ -109,8 +109,8 @@ def test_coefficients_that_nobody_sees_are_not_in_the_gradient_graph(used, moves
 # Time
 
 
-def still(state):
-    """A field's weights whose last layers give nothing but zeros."""
+def zero_heads(state):
+    """The weights of a field, with last layers of zeros."""
     heads = ("gaussian_warp", "branch_", "gaussian_rotation", "gaussian_scaling", "deform.3")
     return {name: torch.zeros_like(held) if any(head in name for head in heads) else held for name, held in state.items()}
 
@@ -123,45 +123,45 @@ FIELDS = {
 
 
 @pytest.mark.parametrize("family", FIELDS)
-def test_a_field_that_changes_nothing_is_not_asked(tmp_path, monkeypatch, family):
+def test_a_field_that_changes_nothing_is_not_evaluated(tmp_path, monkeypatch, family):
     kind, write, state = FIELDS[family]
-    model = wrap_model(write(tmp_path / "still", state=still(state())), cameras=tiny.cameras(2), backend="reference")
-    asked = counted(monkeypatch, kind, "__call__")
+    model = wrap_model(write(tmp_path / "still", state=zero_heads(state())), cameras=tiny.cameras(2), backend="reference")
+    evaluated = counted(monkeypatch, kind, "__call__")
     image = model.render(moving.at(0.3)).image
     adapted = model.adapt(1 / 4, **BRIEF)
-    assert asked == [] and "time" not in adapted.report.views
+    assert evaluated == [] and "time" not in adapted.report.views
     assert [effect.on for effect in adapted.report.effects if effect.name == "time"] == [False]
     forced = ReferenceBackend().render(model.model.field(model.model.canonical, 0.3), moving.at(0.3), model.effects()).image
-    assert len(asked) == 1
+    assert len(evaluated) == 1
     torch.testing.assert_close(image, forced, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("family", FIELDS)
-def test_a_field_that_changes_something_is_asked(tmp_path, monkeypatch, family):
+def test_a_field_that_changes_something_is_evaluated(tmp_path, monkeypatch, family):
     kind, write, state = FIELDS[family]
     model = wrap_model(write(tmp_path / "moving", state=state()), cameras=tiny.cameras(2), backend="reference")
     model.backend()  # which asks once what the model needs
-    asked = counted(monkeypatch, kind, "__call__")
+    evaluated = counted(monkeypatch, kind, "__call__")
     model.render(moving.at(0.3))
-    assert len(asked) == 1
+    assert len(evaluated) == 1
 
 
 @pytest.mark.parametrize(("options", "moves"), [("", False), ("apply_rotation=True", True), ("static_mlp=True", True)])
-def test_products_are_never_taken_for_nothing(tmp_path, options, moves):
-    model = wrap_model(moving.write_hexplane(tmp_path / "new", options, still(moving.hexplane_state())), cameras=tiny.cameras(1))
+def test_fields_that_multiply_count_as_moving(tmp_path, options, moves):
+    model = wrap_model(moving.write_hexplane(tmp_path / "new", options, zero_heads(moving.hexplane_state())), cameras=tiny.cameras(1))
     assert model.model.moves == moves
 
 
-def test_a_static_scene_knows_no_field_at_all(monkeypatch):
-    asked = counted(monkeypatch, DeformNetwork, "__call__"), counted(monkeypatch, HexPlane, "__call__")
+def test_a_static_scene_evaluates_no_field(monkeypatch):
+    evaluated = counted(monkeypatch, DeformNetwork, "__call__"), counted(monkeypatch, HexPlane, "__call__")
     assert "time" not in wrapped(with_bands(1, 1)).adapt(1 / 4, **BRIEF).report.views
-    assert asked == ([], [])
+    assert evaluated == ([], [])
 
 
 # Filters and samples
 
 
-def test_without_compensation_the_opacity_is_the_very_same():
+def test_without_compensation_the_opacity_is_unchanged():
     splats = tiny.gaussians(3)
     flat = reference.project(splats, tiny.cameras(1)[0], 0.2)
     assert filters.footprint(flat, splats.opacities, "classic", 0.3).opacities is splats.opacities
@@ -193,10 +193,10 @@ def test_at_scale_one_nothing_is_drawn(monkeypatch):
 
 @pytest.mark.parametrize(("settings", "steps"), [({}, 0), (dict(densify_gradient=1e-9), 2)])
 def test_screen_gradients_are_kept_only_where_something_is_densified(monkeypatch, settings, steps):
-    made, added = counted(monkeypatch, density.ScreenGradients, "__init__"), counted(monkeypatch, density.ScreenGradients, "add")
+    created, added = counted(monkeypatch, density.ScreenGradients, "__init__"), counted(monkeypatch, density.ScreenGradients, "add")
     model = wrapped(with_bands(1, 1))
     adapted = model.adapt(1 / 4, views_per_step=1, **BRIEF, **settings)
-    assert (len(made), len(added)) == (bool(steps), steps)
+    assert (len(created), len(added)) == (bool(steps), steps)
     forced = model.adapt(1 / 4, views_per_step=1, **BRIEF, densify_gradient=1e9)  # kept, and never used
     names = adapted.model.parameters()
     assert steps or all(torch.equal(tensor, names[name]) for name, tensor in forced.model.parameters().items())

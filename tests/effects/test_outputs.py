@@ -1,4 +1,4 @@
-"""Depth and normals beside the image: of known shapes, by any backend, and nothing at all where they are not asked for."""
+"""Depth and normals besides the image: of known shapes, by any backend, and at no cost where they are not requested."""
 
 import math
 import subprocess
@@ -71,40 +71,40 @@ def quaternion(rotation: torch.Tensor) -> list[float]:
 
 @pytest.mark.parametrize("distance", [0.5, 3.0, 1e5])
 def test_the_depth_of_a_plane_is_its_distance_along_the_axis_even_in_the_corners(backend, distance):
-    shown = wrapped(sheet(view(), distance), backend, background=WHITE).render(view(), outputs=["depth"])
-    assert shown.alpha.min() > 0.1 and shown.depth.shape == shown.alpha.shape
-    torch.testing.assert_close(shown.depth, torch.full_like(shown.depth, distance), rtol=2e-6, atol=0)
+    rendered = wrapped(sheet(view(), distance), backend, background=WHITE).render(view(), outputs=["depth"])
+    assert rendered.alpha.min() > 0.1 and rendered.depth.shape == rendered.alpha.shape
+    torch.testing.assert_close(rendered.depth, torch.full_like(rendered.depth, distance), rtol=2e-6, atol=0)
 
 
 def test_the_depth_of_what_is_very_near_is_as_exact(backend):
     camera = replace(view(), viewmat=torch.eye(4))
-    shown = wrapped(sheet(camera, 0.002), backend, near_plane=0.001).render(camera, outputs=["depth"])
-    torch.testing.assert_close(shown.depth, torch.full_like(shown.depth, 0.002), rtol=2e-6, atol=0)
+    rendered = wrapped(sheet(camera, 0.002), backend, near_plane=0.001).render(camera, outputs=["depth"])
+    torch.testing.assert_close(rendered.depth, torch.full_like(rendered.depth, 0.002), rtol=2e-6, atol=0)
 
 
 def test_behind_a_veil_the_depth_is_the_mean_of_what_is_seen(backend):
     at = torch.linalg.inv(view().viewmat) @ torch.tensor([[0, 0, 2, 1], [0, 0, 5, 1]], dtype=torch.float64).T
     splats = flat(at.T[:, :3], [1.0, 0, 0, 0], 50.0)
     splats = replace(splats, scales=torch.full((2, 3), 50.0), opacities=torch.tensor([0.5, 0.8]))
-    shown = wrapped(splats, backend).render(view(), outputs=["depth"]).depth
+    rendered = wrapped(splats, backend).render(view(), outputs=["depth"]).depth
     expected = (0.5 * 2 + 0.5 * 0.8 * 5) / (0.5 + 0.5 * 0.8)
-    torch.testing.assert_close(shown[12, 16], torch.tensor(expected), rtol=1e-3, atol=0)
+    torch.testing.assert_close(rendered[12, 16], torch.tensor(expected), rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize("n", [1, 2])
 def test_where_nothing_is_there_is_no_depth_and_no_direction_whatever_the_background(backend, n):
     splats = tiny.gaussians(3, spread=0.05)
-    shown = wrapped(splats, backend, background=WHITE).render(view(), outputs=BOTH, supersampling=n)
-    empty = shown.alpha == 0
+    rendered = wrapped(splats, backend, background=WHITE).render(view(), outputs=BOTH, supersampling=n)
+    empty = rendered.alpha == 0
     assert empty.any() and not empty.all()
-    assert (shown.depth[empty] == 0).all() and (shown.normals[empty] == 0).all()
-    assert (shown.depth[~empty] > 1).all()
-    torch.testing.assert_close(shown.normals[~empty].norm(dim=-1), torch.ones(int((~empty).sum())))
+    assert (rendered.depth[empty] == 0).all() and (rendered.normals[empty] == 0).all()
+    assert (rendered.depth[~empty] > 1).all()
+    torch.testing.assert_close(rendered.normals[~empty].norm(dim=-1), torch.ones(int((~empty).sum())))
 
 
 def test_samples_are_averaged_by_what_they_show(backend):
-    shown = wrapped(sheet(view(), 3.0), backend).render(view(), outputs=["depth"], supersampling=3)
-    torch.testing.assert_close(shown.depth, torch.full(view().size, 3.0), rtol=2e-6, atol=0)
+    rendered = wrapped(sheet(view(), 3.0), backend).render(view(), outputs=["depth"], supersampling=3)
+    torch.testing.assert_close(rendered.depth, torch.full(view().size, 3.0), rtol=2e-6, atol=0)
 
 
 # Normals
@@ -116,9 +116,9 @@ def test_the_normal_of_a_disc_is_its_short_axis_on_the_side_that_is_seen(backend
     disc = flat(torch.zeros(1, 3), quat, 0.4, opacity)
     axis, camera = rotations(disc.quats)[0, :, 2], view()
     toward = axis * torch.sign(axis @ camera.center.float())
-    shown = wrapped(disc, backend, background=WHITE).render(camera, outputs=["normals"])
-    there = shown.alpha > 0.3 * opacity
-    torch.testing.assert_close(shown.normals[there], toward.expand(int(there.sum()), 3), atol=1e-4, rtol=0)
+    rendered = wrapped(disc, backend, background=WHITE).render(camera, outputs=["normals"])
+    there = rendered.alpha > 0.3 * opacity
+    torch.testing.assert_close(rendered.normals[there], toward.expand(int(there.sum()), 3), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("short", [0, 1, 2])
@@ -126,18 +126,18 @@ def test_the_short_axis_is_found_wherever_it_is_stored(short):
     splats = tiny.gaussians(6)
     splats.scales[:, short] = 1e-4
     expected = rotations(splats.quats)[:, :, short]
-    found = facing(splats, view())
-    torch.testing.assert_close((found * expected).sum(-1).abs(), torch.ones(6))
-    assert ((view().center.float() - splats.means) * found).sum(-1).min() >= 0
+    normals = facing(splats, view())
+    torch.testing.assert_close((normals * expected).sum(-1).abs(), torch.ones(6))
+    assert ((view().center.float() - splats.means) * normals).sum(-1).min() >= 0
 
 
-def test_covariances_say_the_same_and_a_broken_one_spoils_no_other():
+def test_covariances_have_the_same_normals_and_a_broken_one_affects_no_other():
     splats = tiny.gaussians(6)
     factors = rotations(splats.quats) * splats.scales[:, None]
     covariances = factors @ factors.mT
     covariances[0] = math.nan
-    found = facing(replace(splats, covariances=covariances), view())
-    torch.testing.assert_close(found[1:], facing(splats, view())[1:], atol=1e-3, rtol=0)
+    normals = facing(replace(splats, covariances=covariances), view())
+    torch.testing.assert_close(normals[1:], facing(splats, view())[1:], atol=1e-3, rtol=0)
 
 
 # Hard cases
@@ -157,7 +157,7 @@ def test_hard_cases_have_depths_and_directions_that_are_finite(backend, screen_f
 # Beside the image
 
 
-def test_the_image_is_the_very_same(backend):
+def test_outputs_do_not_change_the_image(backend):
     model = wrapped(tiny.with_bands(2, 3), backend, background=WHITE)
     plain, more = model.render(view()), model.render(view(), outputs=BOTH)
     assert torch.equal(plain.image, more.image) and torch.equal(plain.alpha, more.alpha)
@@ -165,15 +165,15 @@ def test_the_image_is_the_very_same(backend):
 
 
 @pytest.mark.parametrize("outputs", [(), ("depth",), ("normals",), BOTH])
-def test_an_image_more_is_drawn_for_each_output_and_none_without(monkeypatch, outputs):
+def test_one_more_image_is_rendered_per_output_and_none_without(monkeypatch, outputs):
     model, drawn = wrapped(tiny.with_bands(2, 3)), []
     real = ReferenceBackend.render
     monkeypatch.setattr(ReferenceBackend, "render", lambda *scene: drawn.append(scene[-1]) or real(*scene))
-    shown = model.render(view(), outputs=outputs)
+    rendered = model.render(view(), outputs=outputs)
     assert len(drawn) == 1 + len(outputs)
     assert [effects.sh_degree for effects in drawn] == [2] + [0] * len(outputs)
-    assert {name for name in BOTH if getattr(shown, name) is not None} == set(outputs)
-    assert {effect.name for effect in shown.effects if effect.on} & set(BOTH) == set(outputs)
+    assert {name for name in BOTH if getattr(rendered, name) is not None} == set(outputs)
+    assert {effect.name for effect in rendered.effects if effect.on} & set(BOTH) == set(outputs)
 
 
 IMPORTED = """
@@ -186,18 +186,18 @@ print("mipmap_plugin.backends.geometry" in sys.modules)
 
 
 @pytest.mark.parametrize("outputs", [[], ["depth"]])
-def test_what_draws_them_is_imported_only_for_them(tmp_path, outputs):
+def test_code_for_outputs_is_imported_only_for_them(tmp_path, outputs):
     folder = tiny.folder(tmp_path / "base", count=5)
     done = subprocess.run([sys.executable, "-c", IMPORTED, str(folder), *outputs], capture_output=True, text=True)
     assert (done.returncode, done.stdout.strip()) == (0, str(bool(outputs))), done.stderr
 
 
-def test_an_adapted_model_draws_them_too():
+def test_an_adapted_model_renders_outputs_too():
     model = wrapped(tiny.gaussians(30))
     adapted = model.adapt(1 / 4, recipe="instant")
     small = view().zoomed(1 / 4)
-    shown = adapted.render(small, outputs=["depth"])
-    assert shown.depth.shape == small.size and torch.equal(shown.image, adapted.render(small).image)
+    rendered = adapted.render(small, outputs=["depth"])
+    assert rendered.depth.shape == small.size and torch.equal(rendered.image, adapted.render(small).image)
 
 
 class Strange:
@@ -213,12 +213,12 @@ class Strange:
         return ReferenceBackend().render(gaussians, camera, known)
 
 
-def test_any_backend_serves_them(monkeypatch):
+def test_any_backend_renders_outputs(monkeypatch):
     model = wrapped(tiny.gaussians(30))
     expected = model.render(view(), outputs=BOTH)
     monkeypatch.setattr(type(model), "backend", lambda *_, **__: (Strange(), "for the test"))
-    shown = model.render(view(), outputs=BOTH)
-    assert torch.equal(shown.depth, expected.depth) and torch.equal(shown.normals, expected.normals)
+    rendered = model.render(view(), outputs=BOTH)
+    assert torch.equal(rendered.depth, expected.depth) and torch.equal(rendered.normals, expected.normals)
 
 
 def test_an_unknown_output_is_refused():
@@ -243,7 +243,7 @@ def test_the_command_writes_arrays_beside_the_pictures(tmp_path, capsys):
     assert np.load(out / "train_view_1_normals.npy").shape == (*camera.size, 3)
 
 
-def test_the_command_replaces_no_array_unasked_and_then_writes_nothing(tmp_path, capsys):
+def test_the_command_replaces_no_array_without_the_option_and_then_writes_nothing(tmp_path, capsys):
     out = tmp_path / "out"
     out.mkdir()
     (out / "train_view_1_normals.npy").write_text("mine")

@@ -1,4 +1,4 @@
-"""Files that are made to hang, to fill the memory or to act: each ends in one sentence, soon, and takes no more than follows from its size."""
+"""Files crafted to hang, exhaust memory or execute code: each is refused quickly, in one sentence, with memory in proportion to its size."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ for kind, path in json.loads(sys.argv[1]):
 
 
 def taken(files: list[tuple[str, Path]]) -> dict[Path, tuple[float, str]]:
-    """By file: the MiB that reading it takes beyond what the process, one for all, had taken before, and the sentence that it ends in."""
+    """By file: by how many MiB reading it raises the peak memory of one process for all, and the message of the error."""
     words = json.dumps([(kind, str(path)) for kind, path in files])
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", MEASURED, words], capture_output=True, text=True, check=False, timeout=100)
     assert done.returncode == 0, done.stderr
-    told = map(json.loads, done.stdout.splitlines())
-    return {Path(path): (memory, said) for path, memory, said in told}
+    lines = map(json.loads, done.stdout.splitlines())
+    return {Path(path): (memory, message) for path, memory, message in lines}
 
 
 def torch_file(path: Path, program: bytes, storages: dict[str, bytes] = {}) -> Path:  # noqa: B006
@@ -191,7 +191,7 @@ def test_dictionaries_whose_methods_are_overwritten_are_refused(tmp_path, name):
         load_model(path)
 
 
-def test_attributes_of_torchs_own_are_none_of_that(tmp_path):
+def test_attributes_of_torchs_own_dictionaries_are_read(tmp_path):
     torch.save(torch.nn.Linear(2, 2).state_dict(), tmp_path / "a.pth")
     assert hasattr(torch.load(tmp_path / "a.pth"), "_metadata")
     assert sorted(read_state_dict(tmp_path / "a.pth")) == ["bias", "weight"]
@@ -278,7 +278,7 @@ def test_the_reason_is_not_cut_off_in_the_advice_of_another_library(tmp_path):
         load_torch(path)
 
 
-def test_what_a_damaged_file_says_at_length_is_not_repeated_at_length(tmp_path):
+def test_long_texts_of_a_damaged_file_are_shortened_in_messages(tmp_path):
     (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement {'a' * 5000} 1\nproperty float x\nend_header\n1\n")
     with pytest.raises(CheckpointError, match=r"has no vertex element.* \.\.\. .*a'\]$") as caught:
         load_model(tmp_path / "a.ply")

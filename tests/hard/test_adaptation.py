@@ -53,7 +53,7 @@ def digest(folder) -> str:
 
 @pytest.mark.parametrize("situation", SITUATIONS)
 @pytest.mark.parametrize("family", FAMILIES)
-def test_it_ends_finite_and_leaves_the_base_alone(folders, family, situation):
+def test_it_ends_finite_and_leaves_the_base_unchanged(folders, family, situation):
     cameras, scale, settings = SITUATIONS[situation]
     base, files = wrapped(folders[family], cameras), digest(folders[family])
     before = state(base.model)

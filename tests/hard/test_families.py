@@ -128,9 +128,9 @@ def check(folder: Path, make: Callable[[Path, list[Change]], Path], changes: lis
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_one_hard_row_neither_spoils_the_others_nor_refuses_them(tmp_path, family):
-    made = {name: check(tmp_path / "work", FAMILIES[family], changes) for name, changes in ROWS.items()}
-    refused = {name for name, outcome in made.items() if outcome == "refused"}
+def test_one_extreme_row_neither_changes_the_other_rows_nor_refuses_the_file(tmp_path, family):
+    outcomes = {name: check(tmp_path / "work", FAMILIES[family], changes) for name, changes in ROWS.items()}
+    refused = {name for name, outcome in outcomes.items() if outcome == "refused"}
     assert refused <= ({"every row the same"} if family == "octree" else set())
 
 

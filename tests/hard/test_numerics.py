@@ -1,4 +1,4 @@
-"""What docs/numerics.md says: errors stay at rounding, and the formulas that are measured beside ours are right where they should be."""
+"""The claims of docs/numerics.md: errors stay at rounding, and the usual formulas that are measured for comparison are right in ordinary scenes."""
 
 import sys
 from pathlib import Path
@@ -27,7 +27,7 @@ def test_the_usual_formulas_are_right_in_ordinary_scenes(sweep):
     assert image < 2e-6 and gradient < 2e-5
 
 
-def test_the_faults_are_the_fields_and_not_ours():
-    assert [float(ours) for _, _, ours in numerics.vanishing_gradients()] == pytest.approx([1] * 4, abs=1e-4)
-    assert all(float(exact) == pytest.approx(float(ours), rel=1e-3) for _, exact, _, ours in numerics.compensation_slopes())
+def test_the_measured_errors_are_those_of_the_usual_formulas_and_not_of_this_package():
+    assert [float(own) for _, _, own in numerics.vanishing_gradients()] == pytest.approx([1] * 4, abs=1e-4)
+    assert all(float(exact) == pytest.approx(float(own), rel=1e-3) for _, exact, _, own in numerics.compensation_slopes())
     assert all(float(worst) < 1e-6 for _, _, _, worst, _ in numerics.determinants(200))

@@ -1,4 +1,4 @@
-"""Families of strangers: recognized beside the built-in ones, and a broken one breaks nothing."""
+"""Third-party families: recognized beside the built-in ones, and a broken one breaks nothing."""
 
 import runpy
 from dataclasses import replace
@@ -25,7 +25,7 @@ def archive(path):
     return path
 
 
-def mine(**changes):
+def custom_family(**changes):
     """A family whose PLY is that of 3DGS with a column of its own."""
     family = Family("mine", "My splats", lambda files: Match(CERTAIN, "column mine") if "mine" in files.columns else None, API_VERSION, load_vanilla)
     return replace(family, **changes)
@@ -46,47 +46,47 @@ class TestOfTheExample(ModelSuite):
         return archive(tmp_path / "scene.npz")
 
 
-def test_what_is_recognized_can_be_read_by_whoever_registers_a_loader(tmp_path):
+def test_a_recognized_family_can_be_read_once_a_loader_is_registered(tmp_path):
     path = ply(tmp_path / "a.ply", "trbf_center")
     with pytest.raises(CheckpointError, match="this is a SpacetimeGaussians checkpoint"):
         load_model(path)
     with pytest.raises(SettingsError, match="replace=True"):
-        register_model("spacetime", mine(name="spacetime"))
+        register_model("spacetime", custom_family(name="spacetime"))
     register_model("spacetime", replace(find_family("spacetime"), load=lambda path, iteration: tiny.model(3)), replace=True)
     assert len(load_model(path)) == 3
 
 
 def test_a_family_may_put_itself_before_another(tmp_path):
     path = ply(tmp_path / "a.ply", "mine", "filter_3D")
-    register_model("mine", mine())
+    register_model("mine", custom_family())
     with pytest.raises(CheckpointError, match=r"claimed by 'mine' \(column mine\) and 'mip' .*; one of these families has to name the other"):
         detect(path)
-    register_model("mine", mine(before=("mip",)), replace=True)
+    register_model("mine", custom_family(before=("mip",)), replace=True)
     assert detect(path).family == "mine"
 
 
-def test_the_surest_is_believed(tmp_path):
+def test_the_most_certain_match_wins(tmp_path):
     path = ply(tmp_path / "a.ply", "mine")
-    register_model("mine", mine(recognize=lambda files: Match(PLAIN - 0.1, "a guess")))
+    register_model("mine", custom_family(recognize=lambda files: Match(PLAIN - 0.1, "a guess")))
     assert detect(path).family == "3dgs"
-    register_model("mine", mine(), replace=True)
+    register_model("mine", custom_family(), replace=True)
     assert detect(path).family == "mine"
 
 
-def test_results_of_a_training_are_found_in_a_place_of_their_own(tmp_path):
+def test_training_results_are_found_where_the_family_keeps_them(tmp_path):
     (tmp_path / "run/weights").mkdir(parents=True)
     for step in (5, 20):
         ply(tmp_path / f"run/weights/step_{step}.ply", "mine")
-    register_model("mine", mine(place=("weights", r"step_(?P<step>\d+)\.ply")))
-    found = detect(tmp_path / "run")
-    assert (found.family, found.path.name, found.iteration) == ("mine", "step_20.ply", 20)
+    register_model("mine", custom_family(place=("weights", r"step_(?P<step>\d+)\.ply")))
+    checkpoint = detect(tmp_path / "run")
+    assert (checkpoint.family, checkpoint.path.name, checkpoint.iteration) == ("mine", "step_20.ply", 20)
     assert detect(tmp_path / "run", iteration=5).path.name == "step_5.ply"
 
 
-def test_a_place_that_another_family_has_too_is_no_claim(tmp_path):
+def test_a_place_that_another_family_shares_is_no_claim(tmp_path):
     (tmp_path / "run/ckpts").mkdir(parents=True)
     torch.save({"splats": {}}, tmp_path / "run/ckpts/ckpt_29999_rank0.pt")
-    register_model("a first one", mine(name="a first one", place=("ckpts", r".*\.pt")))
+    register_model("a first one", custom_family(name="a first one", place=("ckpts", r".*\.pt")))
     assert detect(tmp_path / "run").family == "gsplat"
 
 
@@ -95,47 +95,47 @@ def test_a_place_that_another_family_has_too_is_no_claim(tmp_path):
     [
         ("no_such_package:FAMILY", "cannot be loaded: ModuleNotFoundError"),
         (lambda path: None, "is of type function; make it a mipmap_plugin.models.Family"),
-        (mine(name="other"), "calls itself 'other'"),
-        (mine(api_version=API_VERSION + 1), f"is written for API version {API_VERSION + 1}, but this package has API version {API_VERSION}"),
-        (mine(recognize=lambda files: files.nothing), "has no attribute 'nothing'"),
-        (mine(recognize=lambda files: True), "its recognize returns a bool; it has to be a Match or None"),
-        (mine(before="3dgs"), "`before` must be a tuple of names, got '3dgs'"),
+        (custom_family(name="other"), "calls itself 'other'"),
+        (custom_family(api_version=API_VERSION + 1), f"is written for API version {API_VERSION + 1}, but this package has API version {API_VERSION}"),
+        (custom_family(recognize=lambda files: files.nothing), "has no attribute 'nothing'"),
+        (custom_family(recognize=lambda files: True), "its recognize returns a bool; it has to be a Match or None"),
+        (custom_family(before="3dgs"), "`before` must be a tuple of names, got '3dgs'"),
     ],
 )
-def test_a_broken_family_is_told_of_and_breaks_nothing(tmp_path, target, reason):
+def test_a_broken_family_is_reported_and_breaks_nothing(tmp_path, target, reason):
     register_model("mine", target)
-    found = detect(ply(tmp_path / "a.ply"))
-    assert found.family == "3dgs" and "the family 'mine' failed" in found.notes[0] and reason in found.notes[0]
-    assert wrap_model(found.path).model.family == "3dgs"
+    checkpoint = detect(ply(tmp_path / "a.ply"))
+    assert checkpoint.family == "3dgs" and "the family 'mine' failed" in checkpoint.notes[0] and reason in checkpoint.notes[0]
+    assert wrap_model(checkpoint.path).model.family == "3dgs"
     with pytest.raises(CheckpointError, match="the family 'mine' failed"):
         detect(ply_files.write(tmp_path / "points.ply", {name: np.zeros(2, np.float32) for name in "xyz"}))
 
 
 @pytest.mark.parametrize("place", [("", r"(a\.ply"), ("", r"(?P<step>\w+)\.ply"), "weights", 7])
 def test_a_broken_place_is_passed_over(tmp_path, place):
-    register_model("mine", mine(place=place))
+    register_model("mine", custom_family(place=place))
     assert detect(ply(tmp_path / "a.ply").parent).family == "3dgs"
 
 
 def test_families_that_exclude_one_another_are_named(tmp_path):
-    register_model("mine", mine(before=("yours", "3dgs")))
-    register_model("yours", mine(name="yours", before=("mine",)))
+    register_model("mine", custom_family(before=("yours", "3dgs")))
+    register_model("yours", custom_family(name="yours", before=("mine",)))
     with pytest.raises(CheckpointError, match="claimed by '3dgs', 'mine', 'yours', each of which another comes before"):
         detect(ply(tmp_path / "a.ply", "mine"))
 
 
 def test_a_loader_that_fails_or_reads_its_own_family_alone_says_so(tmp_path):
     path = ply(tmp_path / "a.ply", "mine")
-    register_model("mine", mine(load=lambda path, iteration: {}["means"]))
+    register_model("mine", custom_family(load=lambda path, iteration: {}["means"]))
     with pytest.raises(PluginError, match=r"family 'mine' cannot load .*a\.ply: KeyError: 'means'"):
         load_model(path)
-    register_model("mine", mine(), replace=True)
+    register_model("mine", custom_family(), replace=True)
     with pytest.raises(CheckpointError, match=r"a\.ply is a checkpoint of My splats, which is read in another way; load it with load_model"):
         load_vanilla(path)
 
 
 def test_a_loader_that_cannot_be_imported(tmp_path):
-    register_model("mine", mine(load="no_such_module:load"))
+    register_model("mine", custom_family(load="no_such_module:load"))
     with pytest.raises(PluginError, match="no_such_module"):
         load_model(ply(tmp_path / "a.ply", "mine"))
 
@@ -149,13 +149,13 @@ def test_what_a_loaded_model_lacks_is_named(tmp_path):
 
         def parameters(self): ...
 
-    register_model("mine", mine(load=lambda path, iteration: Half()))
+    register_model("mine", custom_family(load=lambda path, iteration: Half()))
     with pytest.raises(PluginError, match=r"loads Half, which lacks copy, replace_parameters, shared_parameters, .*, rebuild; see"):
         load_model(ply(tmp_path / "a.ply", "mine"))
     with pytest.raises(SettingsError, match=r"this Half has gaussians\(\) as a model has, but lacks copy"):
         wrap_model(Half())
 
 
-def test_every_family_says_what_version_it_is_of():
+def test_every_family_names_its_api_version():
     assert {family.api_version for family in BUILT_IN} == {API_VERSION}
     assert len({family.name for family in BUILT_IN}) == len(BUILT_IN)
