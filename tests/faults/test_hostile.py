@@ -225,7 +225,7 @@ def test_nested_names_take_a_time_that_grows_with_the_file(tmp_path):
 
 def test_a_picture_beyond_the_memory_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.limits.memory", lambda _: 1000.0)
-    with pytest.raises(SceneError, match=r"a\.png: an image of 20 x 20 px takes .* and this machine has"):
+    with pytest.raises(SceneError, match=r"a\.png: an image of 20 x 20 px needs .* and this machine has"):
         read_image(png(tmp_path / "a.png", 20, 20, 3), (0, 0, 0))
 
 

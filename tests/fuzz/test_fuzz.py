@@ -47,7 +47,7 @@ def outcomes(tmp_path_factory):
 
 def judge(told: list[dict], count: int) -> None:
     sound, *damaged = told
-    assert sound["outcome"] == "loaded" or "which splat-transform reads, and that is not installed" in sound["outcome"]
+    assert sound["outcome"] == "loaded" or "which splat-transform reads, but splat-transform is not installed" in sound["outcome"]
     assert len(damaged) == count
     assert [each for each in damaged if each["outcome"].startswith("fault")] == []
     refused = [each["outcome"] for each in damaged if each["outcome"].startswith("refused")]
