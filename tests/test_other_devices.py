@@ -127,7 +127,7 @@ def test_arguments_of_other_rasterizers_are_on_the_device(with_covariances):
     with pretended.pretending():
         there = splats.to(pretended.DEVICE)
         arguments = gsplat.arguments(there, view, effects)
-        arguments |= inria.splats_of(inria.filtered(inria.sized(there, view, 2.0), inria.at_the_origin(view), effects))
+        arguments |= inria.splats_of(inria.filtered(inria.rescaled(there, view, 2.0), inria.at_the_origin(view), effects))
     assert {value.device.type for value in arguments.values() if isinstance(value, torch.Tensor)} == {pretended.DEVICE}
 
 

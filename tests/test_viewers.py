@@ -359,7 +359,7 @@ def test_playcanvas_does_not_sort_within_a_bucket(backend):
 
 
 def test_the_order_is_one_or_the_other():
-    with pytest.raises(SettingsError, match="give radial or bucketed"):
+    with pytest.raises(SettingsError, match="`radial` and `bucketed` are different orders"):
         RenderSettings(radial=True, bucketed=True)
 
 
