@@ -1,6 +1,7 @@
-"""Threads that pay: while something is adapted, torch keeps to one, and what is drawn side by side and the kernels of a backend share the rest.
+"""The division of the processor's threads between torch, a backend's kernels, and views that are rendered in parallel.
 
-Torch's own threads cost small images more than they gain, and wait for one another wherever other programs want a processor too.
+Torch's own threads cost small images more than they gain, and wait for one another when other programs need the processor too. So while a
+backend with threads of its own is adapted with, torch has one thread; kernels and parallel views share the others.
 """
 
 from __future__ import annotations
@@ -21,69 +22,93 @@ from mipmap_plugin.errors import SettingsError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-# How many threads kernels and views may have; None: as many as torch has.
-_count: ContextVar[int | None] = ContextVar("_count", default=None)
+# The number of threads that kernels and parallel views share; None: they are not shared, and torch has its own.
+_shared: ContextVar[int | None] = ContextVar("_shared", default=None)
 
 
-def count() -> int:
-    """How many threads there are for kernels, and for what is drawn side by side."""
-    return _count.get() or torch.get_num_threads()
+def for_kernels() -> int:
+    """The number of threads for one image."""
+    return _shared.get() or torch.get_num_threads()
+
+
+def for_views() -> int:
+    """The number of views to render in parallel."""
+    return _shared.get() or 1
 
 
 @contextmanager
-def shared(threads: int | None) -> Iterator[None]:
-    """Torch on one thread, and `threads` for kernels and views; None: as many as torch had. Raises SettingsError."""
+def limited(threads: int | None, *, shared: bool) -> Iterator[None]:
+    """Use `threads` threads inside, or as many as torch has. `shared`: by kernels and parallel views, with one for torch; else by torch.
+
+    Raises SettingsError for less than one.
+    """
     if threads is not None and threads < 1:
         raise SettingsError(f"threads must be at least 1, got {threads}")
+    count = threads or for_kernels()
+    token = _shared.set(count if shared else None)
+    try:
+        with _torch_threads(1 if shared else count):
+            yield
+    finally:
+        _shared.reset(token)
+
+
+@contextmanager
+def lent_to_torch() -> Iterator[None]:
+    """Inside `limited`, give torch all threads for a while, for a network."""
+    with _torch_threads(for_kernels()):
+        yield
+
+
+@contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    token = _count.set(threads or count())
-    torch.set_num_threads(1)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
-        _count.reset(token)
 
 
 def side_by_side(function: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
-    """The results of `function` for all items, in their order; on one thread each when it is asked for, else all at once.
+    """Yield `function(item)` for all items in their order, computed in parallel; with one thread, each when it is requested.
 
-    Whether gradients are recorded is the caller's setting in every thread.
+    Gradients are recorded in every thread if the caller records them.
     """
     if threads == 1 or len(items) < 2:
         yield from map(function, items)
         return
     results: list[Result | None] = [None] * len(items)
-    todo, records = deque(range(len(items))), torch.is_grad_enabled()
+    todo, grad_enabled = deque(range(len(items))), torch.is_grad_enabled()
 
     def work(thread: int) -> None:
-        with torch.set_grad_enabled(records):
+        with torch.set_grad_enabled(grad_enabled):
             while todo:
                 try:
-                    place = todo.popleft()
+                    index = todo.popleft()
                 except IndexError:  # another thread was quicker
                     break
-                results[place] = function(items[place])
+                results[index] = function(items[index])
 
     team(work, min(threads, len(items)))
     yield from results  # type: ignore[misc]
 
 
 def team(work: Callable[[int], None], threads: int) -> None:
-    """Run `work(thread)` for 0..threads - 1, in this thread and in those of a pool that are free.
+    """Call `work(thread)` for 0..threads - 1, in this thread and in the free threads of a pool.
 
-    `work` takes parts from a common list until none is left, so that one thread finishes it where no other is free.
+    `work` takes items from a common queue until it is empty, so that one thread completes it if no other is free.
     """
-    helpers = [_pool(max(threads, count()) - 1, os.getpid()).submit(copy_context().run, work, thread) for thread in range(1, threads)]
+    helpers = [_pool(max(threads, for_kernels()) - 1, os.getpid()).submit(copy_context().run, work, thread) for thread in range(1, threads)]
     try:
         work(0)
     finally:
         for helper in helpers:
-            if not helper.cancel():  # nothing is left for one that has not begun
+            if not helper.cancel():  # a helper that has not begun has nothing left to do
                 helper.result()
 
 
 @cache
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """Threads that wait for work. Each process has its own, for they do not survive a fork."""
+    """Waiting threads. Each process has its own, because threads do not survive a fork."""
     return ThreadPoolExecutor(threads, f"mipmap_plugin-{process}")

@@ -110,6 +110,8 @@ class Wrapped:
         `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: see `RenderOptions`. Raises
         SettingsError.
         """
+        if unknown := options.keys() - RenderOptions.__annotations__.keys():
+            raise TypeError(f"render() got unknown options: {', '.join(sorted(unknown))}; there are {', '.join(RenderOptions.__annotations__)}")
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
         check_scale(scale)
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
@@ -172,7 +174,7 @@ class Wrapped:
         in_viewer = self._read_by(viewer)
         base_in_viewer = model if in_viewer is self.model else in_viewer
         request = AdaptationRequest(model, self.effects(), targets, viewer, backend, note, has_gradients, base_in_viewer)
-        with threads.shared(self.threads):
+        with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
             return Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
@@ -245,9 +247,9 @@ def wrap_model(
 
     `cameras`: views of the scale of its training, or the scene that it was trained on; by default those beside the checkpoint.
     `background`: linear RGB; by default that of the checkpoint, or else black. `screen_filter`: the filter that it was trained with, if
-    its files do not say ("classic", "antialiased", "mip", "analytic"). `threads`: to adapt with; by default as many as torch has. The
-    result does not depend on it. Raises CheckpointError, SceneError, and SettingsError for an unknown filter or an object that is not a
-    model.
+    its files do not say ("classic", "antialiased", "mip", "analytic"). `threads`: to adapt with; by default as many as torch
+    has. With the backend cpu the result does not depend on it. Raises CheckpointError, SceneError, and SettingsError for an unknown filter
+    or an object that is not a model.
     """
     color = None if background is None else check_background(background)
     model = _loaded(model, backend) if isinstance(model, (str, Path)) else adopt(model)

@@ -15,7 +15,7 @@ from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, detect
 from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.families import BUILT_IN, find_family
-from mipmap_plugin.models.vanilla import load_vanilla
+from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 
 EXAMPLE = runpy.run_path(str(Path(__file__).parents[1] / "examples/register_family.py"))
 
@@ -159,3 +159,16 @@ def test_what_a_loaded_model_lacks_is_named(tmp_path):
 def test_every_family_names_its_api_version():
     assert {family.api_version for family in BUILT_IN} == {API_VERSION}
     assert len({family.name for family in BUILT_IN}) == len(BUILT_IN)
+
+
+@pytest.mark.parametrize(
+    ("renamed", "message"),
+    [({"means": "positions"}, "lacks the parameter 'means', a name of PARAMETERS for 'positions'"), ({"sh0": "albedo"}, "PARAMETERS for 'albedo'")],
+)
+def test_wrong_names_of_parameters_are_one_sentence(renamed, message):
+    class Renamed(VanillaModel):
+        def parameters(self):
+            return {renamed.get(name, name): tensor for name, tensor in super().parameters().items()}
+
+    with pytest.raises(SettingsError, match=message):
+        wrap_model(Renamed(tiny.model(4).parameters()))

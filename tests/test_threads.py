@@ -8,9 +8,13 @@ import time
 import pytest
 import tiny
 import torch
+from anchor_checkpoints import write
 
 from mipmap_plugin import progress, threads
+from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
+from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
 
 
@@ -24,22 +28,50 @@ def test_an_adaptation_has_the_same_bytes_on_any_number_of_threads():
     assert all(torch.equal(tensor, other[name]) for other in more for name, tensor in one.items())
 
 
+def test_a_model_whose_splats_differ_by_view_is_validated_alike_on_any_number_of_threads(tmp_path):
+    """Anchors decode other splats for each camera: in parallel, no view may see those of another."""
+    model = load_model(write(tmp_path / "anchors"))
+
+    def report(count: int) -> dict[str, float]:
+        wrapped = wrap_model(model, cameras=tiny.cameras(8), backend="cpu", threads=count)
+        return wrapped.adapt(1 / 2, steps=1, validation_views=16, extra_views=4).report.validation
+
+    assert all(report(4) == report(1) for _ in range(3))
+
+
+def test_the_truth_keeps_no_splats_that_differ_by_view(tmp_path):
+    """Else a view that is rendered in parallel might get those of another."""
+    model, view = load_model(write(tmp_path / "anchors")), tiny.cameras()[0]
+    wrapped = wrap_model(model, backend="cpu")
+    truth = PseudoTruth(model, wrapped.backend()[0], wrapped.effects(), 1 / 2, AdaptConfig())
+    truth(view)
+    assert truth._activated is None
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_torch_has_one_thread_only_beside_kernels_with_threads_of_their_own(backend):
+    before, seen = torch.get_num_threads(), []
+    wrapped = wrap_model(tiny.model(20), cameras=tiny.cameras(), backend=backend, threads=3)
+    wrapped.adapt(1 / 2, steps=1, extra_views=2, observe=lambda *_: seen.append((torch.get_num_threads(), threads.for_views())))
+    assert set(seen) == {(1, 3) if backend == "cpu" else (3, 1)} and torch.get_num_threads() == before
+
+
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_results_come_in_the_order_of_the_items(count):
-    with threads.shared(count):
+    with threads.limited(count, shared=True):
         results = list(threads.side_by_side(lambda item: (time.sleep(0.01 * (item % 2)), item)[1], range(7), count))
     assert results == list(range(7))
 
 
 def test_views_are_drawn_in_several_threads():
     barrier = threading.Barrier(2, timeout=10)  # nobody gets on alone
-    with threads.shared(2):
+    with threads.limited(2, shared=True):
         assert len(list(threads.side_by_side(lambda _: barrier.wait(), range(2), 2))) == 2
 
 
 @pytest.mark.parametrize("records", [True, False])
 def test_gradients_are_recorded_where_the_caller_records_them(records):
-    with threads.shared(3), torch.set_grad_enabled(records):
+    with threads.limited(3, shared=True), torch.set_grad_enabled(records):
         assert set(threads.side_by_side(lambda _: torch.is_grad_enabled(), range(6), 3)) == {records}
 
 
@@ -49,7 +81,7 @@ def test_what_fails_in_a_thread_fails_for_the_caller():
             raise SettingsError("no")
         return item
 
-    with threads.shared(2), pytest.raises(SettingsError, match="no"):
+    with threads.limited(2, shared=True), pytest.raises(SettingsError, match="no"):
         list(threads.side_by_side(fail, range(4), 2))
 
 
@@ -57,18 +89,22 @@ def test_torch_keeps_to_one_thread_and_gets_its_own_back():
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        with threads.shared(None):
-            assert (torch.get_num_threads(), threads.count()) == (1, 3)
-        with pytest.raises(ZeroDivisionError), threads.shared(2):
-            assert threads.count() == 2
+        with threads.limited(None, shared=True):
+            assert (torch.get_num_threads(), threads.for_kernels(), threads.for_views()) == (1, 3, 3)
+            with threads.lent_to_torch():
+                assert torch.get_num_threads() == 3
+        with pytest.raises(ZeroDivisionError), threads.limited(2, shared=True):
+            assert threads.for_kernels() == 2
             raise ZeroDivisionError
-        assert torch.get_num_threads() == threads.count() == 3
+        with threads.limited(2, shared=False):
+            assert (torch.get_num_threads(), threads.for_kernels(), threads.for_views()) == (2, 2, 1)
+        assert torch.get_num_threads() == threads.for_kernels() == 3 and threads.for_views() == 1
     finally:
         torch.set_num_threads(before)
 
 
 def test_no_threads_are_refused():
-    with pytest.raises(SettingsError, match="at least 1, got 0"), threads.shared(0):
+    with pytest.raises(SettingsError, match="at least 1, got 0"), threads.limited(0, shared=True):
         pass
 
 

@@ -573,3 +573,8 @@ def test_the_command_renders_as_in_a_viewer(tmp_path, capsys):
     words[-1] = "superspalt"
     assert cli.main([*words, "--overwrite"]) == 2
     assert "there is no 'superspalt'; choose from" in capsys.readouterr().err
+
+
+def test_an_option_that_is_not_there_is_refused():
+    with pytest.raises(TypeError, match="unknown options: filter3d; there are viewer, filter_3d, outputs, exposure"):
+        wrap_model(tiny.model(4), cameras=tiny.cameras(), backend="reference").render(tiny.cameras()[0], filter3d=True)

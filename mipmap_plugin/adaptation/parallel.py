@@ -15,4 +15,4 @@ SMALL = 1 << 19
 def max_threads(means: Tensor, camera: Camera) -> int:
     """The number of views to render in parallel, for splats with `means` [N, 3] and images of the size of `camera`'s."""
     small = means.device.type == "cpu" and len(means) + camera.width * camera.height <= SMALL
-    return threads.count() if small else 1
+    return threads.for_views() if small else 1

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.growing import growth_note
@@ -157,7 +158,7 @@ class Session:
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
         if self.detail is not None:
-            with self.phase("upsampling"):
+            with self.phase("upsampling"), threads.lent_to_torch():
                 self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])

@@ -137,7 +137,8 @@ class Backend(Protocol):
     # Rank for `auto`, which takes the highest of the backends that can serve a request. On a GPU: 40 gsplat, whose speed others have
     # measured; 30 triton; 20 inria, whose footprint and gradients differ most from the reference's; 0 reference.
     speed: int
-    # Optional: `note: str`, shown wherever the backend is listed or chosen.
+    # Optional: `note: str`, shown wherever the backend is listed or chosen. `own_threads: bool`: its kernels have threads of their own
+    # (`threads.for_kernels`), return the same bytes on any number, and may run in several threads at once; then torch has one while adapting.
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""

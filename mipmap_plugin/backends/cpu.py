@@ -30,6 +30,7 @@ class CpuBackend:
     name = "cpu"
     api_version = API_VERSION
     speed = 10
+    own_threads = True
     capabilities = Capabilities(
         devices=frozenset({"cpu"}),
         dtypes=frozenset({torch.float32}),

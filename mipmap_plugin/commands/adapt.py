@@ -61,7 +61,7 @@ def adapt(
         background: Of the scene; by default that of the checkpoint, or else black.
         screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: Name of a backend; auto chooses the fastest one that can serve the request.
-        threads: Maximum number of processor threads; by default as many as torch finds. The result does not depend on it.
+        threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of everything random.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.

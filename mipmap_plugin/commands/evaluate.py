@@ -58,7 +58,7 @@ def evaluate(
         background: Of the scene; by default that of the checkpoint, or else black.
         screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
         backend: Name of a backend; auto chooses the fastest one that can serve the request.
-        threads: Maximum number of processor threads; by default as many as torch finds. The result does not depend on it.
+        threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of everything random.
         output: Also write the rows, and notes on missing ones, as JSON to this file.
         overwrite: Replace that file if it exists.

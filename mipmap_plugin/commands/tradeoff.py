@@ -53,7 +53,7 @@ def tradeoff(
         views: Maximum number of views to evaluate on.
         background: Of the scene; by default that of the checkpoint, or else black.
         screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
-        threads: Maximum number of processor threads; by default as many as torch finds. The result does not depend on it.
+        threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of the first repeat.
         picture: Draw tradeoff.png, which needs the extra `plot`.
         overwrite: Replace results that exist.

@@ -91,8 +91,8 @@ def judged_views(base: Wrapped, scale: float) -> list[WorldView]:
     if scale > 1:
         cameras = [camera.window(round(camera.width * MIDDLE), round(camera.height * MIDDLE)) for camera in cameras]
     views = [WorldView(camera) for camera in cameras]
-    with announced(f"ray-tracing the truth x{scale:g}"), threads.shared(None):
-        list(side_by_side(lambda view: view.truth(scale, PROTOCOL), views, threads.count()))
+    with announced(f"ray-tracing the truth x{scale:g}"), threads.limited(None, shared=True):
+        list(side_by_side(lambda view: view.truth(scale, PROTOCOL), views, threads.for_views()))
     return views
 
 

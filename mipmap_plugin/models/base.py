@@ -126,12 +126,22 @@ class Filtered(SplatModel, Protocol):
 
 
 def lacking(model: Any) -> list[str]:
-    """The names of the members that an object lacks to be a SplatModel; [] if none."""
+    """What an object lacks to be a SplatModel: members, or the right names of its parameters; [] if nothing."""
     required = [*_members(SplatModel)]
     if isinstance(traits := getattr(model, "traits", None), Traits):
         required += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed + ["fused", "bare"] * traits.filtered
     missing = [name for name in required if not hasattr(model, name)]
-    return missing if "traits" in missing or isinstance(traits, Traits) else [*missing, "traits of the type Traits"]
+    if "traits" not in missing and not isinstance(traits, Traits):
+        missing.append("traits of the type Traits")
+    return missing or _wrong_parameters(model.parameters())
+
+
+def _wrong_parameters(parameters: Any) -> list[str]:
+    """What `lacking` says of parameters whose names are not those of PARAMETERS."""
+    if not isinstance(parameters, dict):
+        return ["parameters() that returns a dictionary"]
+    unknown = [name for name in parameters if name not in PARAMETERS]
+    return ["the parameter 'means'"] * ("means" not in parameters) + [f"a name of PARAMETERS for {name!r}" for name in unknown]
 
 
 def _members(protocol: type) -> list[str]:

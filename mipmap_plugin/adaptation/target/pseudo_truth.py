@@ -88,7 +88,9 @@ class PseudoTruth:
 
     def _splats(self, camera: Camera) -> Gaussians:
         """The base's splats, activated once if all cameras see the same ones: activation takes a fifth of a small image's time."""
-        if self._activated is None or not self._base.traits.same_for_all_views:
+        if not self._base.traits.same_for_all_views:
+            return self._base.gaussians(camera)  # not kept: views may be rendered in parallel
+        if self._activated is None:
             self._activated = self._base.gaussians(camera)
         return self._activated
 

@@ -60,7 +60,7 @@ def chunks(first: int, last: int, min_chunk: int) -> Iterator[tuple[int, int]]:
 
 def team(work: int) -> Team:
     """As many threads as kernels may use if `work`, splats plus pixels, is large enough; else one."""
-    count = threads.count() if work >= MIN_WORK else 1
+    count = threads.for_kernels() if work >= MIN_WORK else 1
     if count > 1 and torch.get_num_threads() > 1:
         _dismiss_idle_threads()
     return Team(count)
