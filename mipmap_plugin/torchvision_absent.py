@@ -49,7 +49,7 @@ def _works() -> bool:
 
 
 def _forget() -> None:
-    """Take torchvision out of the imported modules: a half-imported one, or ours, would mislead whoever asks next."""
+    """Remove torchvision from the imported modules: a half-imported one, or the stand-in, would mislead later imports."""
     for name in [name for name in sys.modules if name.split(".")[0] == "torchvision"]:
         del sys.modules[name]
 

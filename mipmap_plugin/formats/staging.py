@@ -48,7 +48,7 @@ class Staging:
         return made if path.parent == self.place or (self.new / self.path.name in made.parents and (self.new / self.path.name).is_dir()) else None
 
     def commit(self) -> None:
-        """Let what lies in `new` take its place. Raises OSError."""
+        """Move what was written to `new` to its place. Raises OSError."""
         made = list(self.new.iterdir())
         if len(made) == 1 and _moved_at_once(made[0], self.place / made[0].name):
             return
@@ -132,7 +132,7 @@ def _made(folder: Path) -> bool:
 
 
 def _locked(lock: int, made: bool) -> bool:
-    """Whether the folder of this descriptor is ours now; `made` by us, where the disk has no locks, or long untouched."""
+    """Whether this process owns the folder of this descriptor: it holds the lock, or, on a disk without locks, `made` it, or it is old."""
     import fcntl  # not on Windows, where no folder has a descriptor
 
     try:
