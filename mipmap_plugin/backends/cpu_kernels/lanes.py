@@ -14,7 +14,7 @@ from functools import partial
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, models, overload, register_model
+from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
 WIDTH = 16
 
@@ -72,16 +72,21 @@ def _broadcast(context, builder, value, kind, lanes):
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), ir.Constant(INTS32, [0] * WIDTH))
 
 
+def _generator(emit, lanes):
+    """A lowering that calls `emit(builder, *vectors)` on lanes or scalars."""
+
+    def generate(context, builder, signature, values):
+        return emit(builder, *(_broadcast(context, builder, v, k, lanes) for v, k in zip(values, signature.args, strict=True)))
+
+    return generate
+
+
 def lane_wise(emit, result=None):
     """An intrinsic that calls `emit(builder, *vectors)` on lanes or scalars; `result`: its type if not the arguments'."""
 
     def typed(*kinds):
         lanes = _common(kinds)
-
-        def generate(context, builder, signature, values):
-            return emit(builder, *(_broadcast(context, builder, v, k, lanes) for v, k in zip(values, signature.args, strict=True)))
-
-        return (result or lanes)(*kinds), generate
+        return (result or lanes)(*kinds), _generator(emit, lanes)
 
     return typed
 
@@ -95,18 +100,21 @@ def _call(name, builder, *vectors):
 
 
 def _operator(symbol, emit, result=None):
-    """Define the operator `symbol` for two operands of which at least one is lanes."""
-    typed = lane_wise(emit, result)
+    """Define an operator for operands of which at least one is lanes; `result`: its type if not that of lanes.
 
-    @intrinsic
-    def apply(_context, left, right):
-        return typed(left, right)
+    An `overload` would do the same, but numba compiles a function for each pair of types then: a third of all time to compile.
+    """
 
-    @overload(symbol)
-    def _apply(left, right):
-        if LANES in (left, right) or DOUBLES in (left, right):
-            return lambda left, right: apply(left, right)
-        return None
+    @type_callable(symbol)
+    def type_of(_context):
+        def typer(*kinds):
+            return (result or _common(kinds)) if LANES in kinds or DOUBLES in kinds else None
+
+        return typer
+
+    for lanes in (LANES, DOUBLES):
+        for kinds in ((lanes, lanes), (lanes, types.Number), (types.Number, lanes)):
+            lower_builtin(symbol, *kinds)(_generator(emit, lanes))
 
 
 _operator(operator.add, lambda builder, a, b: builder.fadd(a, b))
@@ -119,11 +127,13 @@ _operator(operator.ge, lambda builder, a, b: builder.fcmp_ordered(">=", a, b), M
 _operator(operator.le, lambda builder, a, b: builder.fcmp_ordered("<=", a, b), MASK)
 
 
-@overload(operator.neg)
-def _negative(lanes):
-    if lanes in (LANES, DOUBLES):
-        return lambda lanes: 0 - lanes
-    return None
+@type_callable(operator.neg)
+def _type_of_negative(_context):
+    return lambda lanes: lanes if lanes in (LANES, DOUBLES) else None
+
+
+for _lanes in (LANES, DOUBLES):
+    lower_builtin(operator.neg, _lanes)(_generator(lambda builder, lanes: builder.fsub(ir.Constant(lanes.type, None), lanes), _lanes))
 
 
 @intrinsic

@@ -53,8 +53,12 @@ class Pool:
         with self._lock:
             self._used -= len(block)
             self._spare.append(block)
-            while sum(map(len, self._spare)) > self._most_used:
+            while self.spare_bytes > self._most_used:
                 self._spare.popleft()
+
+    @property
+    def spare_bytes(self) -> int:
+        return sum(map(len, self._spare))
 
 
 def _new_block(size: int) -> np.ndarray:
