@@ -83,9 +83,10 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         target = task.truth(view)  # r(x̂): the frozen base, resized
         image = task.renderer(draw)(gaussians, camera)  # x: the student at the new scale
         difference = difference_from(target, image, config.resize)
-        loss = _loss(difference, config.loss)
+        square_error = difference.square().mean()
+        loss = _loss(difference, square_error, config.loss)
         (loss if task.detail is None else loss + task.detail(view, image)).backward()
-        return gaussians, camera, difference.detach().square().mean()
+        return gaussians, camera, square_error.detach()
 
     draws = list(enumerate(views, run.step * config.views_per_step))
     threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if splats.shares else 1
@@ -105,12 +106,11 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
 # --8<-- [end:step]
 
 
-def _loss(difference: Tensor, name: str) -> Tensor:
+def _loss(difference: Tensor, square_error: Tensor, name: str) -> Tensor:
     """The loss of one image. `psnr` is the logarithm of the mean square error, so that a view that is far off does not outweigh the others."""
     if name == "l1":
         return difference.abs().mean()
-    square = difference.square().mean()
-    return (square + INVISIBLE_ERROR).log() if name == "psnr" else square
+    return (square_error + INVISIBLE_ERROR).log() if name == "psnr" else square_error
 
 
 def _check(run: Run, task: Task, config: AdaptConfig) -> None:
