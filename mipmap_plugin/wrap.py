@@ -61,7 +61,7 @@ class Wrapped:
     ) -> None:
         self.model, self.cameras, self._backend, self.trained, self.threads = model, list(cameras), backend, trained, threads
         self.background = trained.background or (0.0, 0.0, 0.0)
-        self._images: BaseImages | None = None
+        self.images: BaseImages | None = None  # of the base, drawn so far for all scales; None: the next call draws all of its own
 
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
         """How this model is rendered at `scale`, or by the viewer of that name (`splatting.viewers`).
@@ -175,9 +175,9 @@ class Wrapped:
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
         in_viewer = self._read_by(viewer)
         base_in_viewer = model if in_viewer is self.model else in_viewer
-        if self._images is None or not self._images.are_of(model, backend, self.effects()):
-            self._images = BaseImages(model, backend, self.effects())
-        request = AdaptationRequest(self._images, targets, viewer, note, has_gradients, base_in_viewer)
+        if self.images is None or not self.images.are_of(model, backend, self.effects()):
+            self.images = BaseImages(model, backend, self.effects())
+        request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer)
         with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
             return Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
 

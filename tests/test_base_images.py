@@ -10,6 +10,7 @@ from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.wrap import wrap_model
 
 LIKE = torch.zeros(1)
@@ -76,6 +77,13 @@ def test_each_base_image_is_drawn_once_for_all_scales(drawn):
     first = list(drawn)
     wrapped.adapt(1 / 4, steps=2, extra_views=1, validation_views=2)
     assert len(set(first)) == len(first) > 0 and drawn == first
+
+
+def test_where_the_time_is_measured_all_images_are_drawn_again(drawn):
+    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3), backend="reference")
+    for _ in range(2):
+        adapt_alone(wrapped, 1 / 2, steps=1, extra_views=1, validation_views=2)
+    assert len(drawn) == 2 * len(set(drawn)) > 0
 
 
 def test_a_scale_is_adapted_alike_whether_or_not_another_came_before():
