@@ -58,7 +58,8 @@ def rows_of(model: Wrapped, judge: Evaluator, scale: float) -> list[Row]:
     base = lambda camera: model.render(camera.zoomed(scale), scale).image  # noqa: E731
     rows = [judge.row(BASE, scale, base, gaussians=_count(model)), enlarged(model, judge, scale, "bicubic")]
     for each in CRISPNESS:
-        rows.append(adapted_row(f"closed form, crispness {each:g}", adapt_alone(model, scale, recipe="instant", views="train", crispness=each), judge))
+        instant = adapt_alone(model, scale, recipe="instant", views="train", crispness=each)
+        rows.append(adapted_row(f"closed form, crispness {each:g}", instant, judge))
         rows.append(adapted_row(f"default, crispness {each:g}", adapt_alone(model, scale, crispness=each), judge))
     return rows
 

@@ -162,7 +162,6 @@ class Session:
                 self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
-        before = run.watch.seconds if run.step == 0 else self.seconds["total"]
 
         def after_step(run: Run) -> None:
             keeper.save_if_due(run)
@@ -171,7 +170,9 @@ class Session:
 
         ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
         self.state = keeper.remaining_file()
-        self.seconds["optimization"] = run.watch.seconds - before
+        self.seconds["pseudo truth"] = sum(run.costs.truths.values())
+        self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
+        self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
         return run, ended_by + growth_note(run)
 

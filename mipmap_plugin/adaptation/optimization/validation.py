@@ -142,9 +142,8 @@ class Steering:
     ceiling: float = 1.0  # upper limit of the rate factor, after larger rates did harm
 
     @classmethod
-    def begin(cls, student: SplatModel, validation: Validation) -> Steering:
-        """The steering of a run that begins with `student`."""
-        psnr = validation.steer(student)
+    def begin(cls, student: SplatModel, psnr: float) -> Steering:
+        """The steering of a run that begins with `student`, which has this PSNR (dB) on the steering views."""
         return cls(psnr, psnr, Snapshot.of(student))
 
     def rate_factor(self, progress: float, config: AdaptConfig) -> float:
