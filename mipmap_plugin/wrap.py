@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
+from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.views import choose_views
@@ -60,6 +61,7 @@ class Wrapped:
     ) -> None:
         self.model, self.cameras, self._backend, self.trained, self.threads = model, list(cameras), backend, trained, threads
         self.background = trained.background or (0.0, 0.0, 0.0)
+        self.images: BaseImages | None = None  # of the base, drawn so far for all scales; None: the next call draws all of its own
 
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
         """How this model is rendered at `scale`, or by the viewer of that name (`splatting.viewers`).
@@ -153,7 +155,7 @@ class Wrapped:
         Raises SettingsError and BackendUnavailable.
         """
         check_scale(scale)
-        model = cast(Filtered, self.model).fused() if viewer is not None and self.model.traits.filtered else self.model
+        model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         if not model.traits.same_for_all_views and settings.setdefault("merge_to", 1.0) < 1:
             raise SettingsError(f"{model.family}: its splats differ by view or time, or have a 3D filter, so none are merged; leave merge_to out")
         if images is not None and self.model.traits.exposures.changed:
@@ -173,7 +175,9 @@ class Wrapped:
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
         in_viewer = self._read_by(viewer)
         base_in_viewer = model if in_viewer is self.model else in_viewer
-        request = AdaptationRequest(model, self.effects(), targets, viewer, backend, note, has_gradients, base_in_viewer)
+        if self.images is None or not self.images.are_of(model, backend, self.effects()):
+            self.images = BaseImages(model, backend, self.effects())
+        request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer)
         with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
             return Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
 
@@ -203,6 +207,11 @@ class Wrapped:
         if viewer is not None:
             find_viewer(viewer)
         return self.targets(viewer)[viewer or ""]
+
+    @cached_property
+    def _fused(self) -> SplatModel:
+        """The base with its 3D filter baked into plain splats, for viewers."""
+        return cast(Filtered, self.model).fused()
 
     def _read_by(self, viewer: str | None) -> SplatModel:
         """The base as a viewer reads its file: without its 3D filter if the viewer does not read it."""

@@ -24,6 +24,7 @@ from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
 from mipmap_plugin.adaptation.report import PeakMemory, Report, filters, versions
 from mipmap_plugin.adaptation.start.candidates import StartProblem, StartSearch, warm_up_backend
+from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
@@ -50,11 +51,9 @@ COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}
 class AdaptationRequest:
     """What is adapted, for which viewers, and by which backend."""
 
-    model: SplatModel
-    base_effects: Effects  # how the base was rendered in training
+    images: BaseImages  # of the model, rendered as in its training, by the backend
     targets: Mapping[str, Effects]  # how the adapted file is rendered, by viewer; the file names the first of them
     viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: no particular one
-    backend: Backend
     backend_note: str  # which backend was chosen, and why
     has_gradients: bool  # whether the backend has gradients for this request
     base_in_viewer: SplatModel  # what the viewer reads of the base's own file: the base itself, where the viewer reads all of it
@@ -64,21 +63,22 @@ class Session:
     """One call of `adapt`: makes the parts, and runs them in order."""
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
-        self.base, self.backend, self.backend_note = request.model, request.backend, request.backend_note
-        self.base_effects, self.targets, self.has_gradients = request.base_effects, request.targets, request.has_gradients
+        self.base, self.backend, self.base_effects = request.images.model, request.images.backend, request.images.effects
+        self.targets, self.has_gradients, self.backend_note = request.targets, request.has_gradients, request.backend_note
         self.effects = next(iter(self.targets.values()))
         self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.seconds, self.peak = {"optimization": 0.0}, PeakMemory(self.base.parameters()["means"].device)
         self.views, validation, self.views_note = self._choose_views(cameras)
         self.views_note += f", {len(real.cameras)} of them real images" if real else ""
-        self.truth = PseudoTruth(self.base, self.backend, self.base_effects, scale, config, real)
+        request.images.keep_only([*self.views, *validation])
+        self.truth = PseudoTruth(request.images, scale, config, real)
         self.detail = DetailLoss(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
         if self.detail is not None:
             self.views = evenly(self.views, config.upsampled_views)
             self.views_note += f", {len(self.views)} of them upsampled"
         self.state: StateFile | None = None
-        truth = PseudoTruth(self.base, self.backend, self.base_effects, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
+        truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
         first, *further = [_renderer(self.backend, target) for target in self.extremes.values()]
         self.validation = Validation(validation[::2], validation[1::2], scale, truth, first, config.resize, further)
 
@@ -162,7 +162,6 @@ class Session:
                 self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
-        before = run.watch.seconds if run.step == 0 else self.seconds["total"]
 
         def after_step(run: Run) -> None:
             keeper.save_if_due(run)
@@ -171,7 +170,9 @@ class Session:
 
         ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
         self.state = keeper.remaining_file()
-        self.seconds["optimization"] = run.watch.seconds - before
+        self.seconds["pseudo truth"] = sum(run.costs.truths.values())
+        self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
+        self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
         return run, ended_by + growth_note(run)
 

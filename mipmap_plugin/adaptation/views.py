@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -28,6 +29,12 @@ class ViewSchedule:
         self._rounds, self._seed, self._steps = ShuffledRounds(views, config.seed), config.seed, config.steps
         self._max_views, self._warm_up = min(config.views_per_step, len(views)), config.warm_up_steps
         self._gathering = math.ceil(config.gathering * config.steps)  # steps during which new views are introduced
+        self._draws_in_warm_up = [0, *accumulate(self._views_in_step(step) for step in range(self._warm_up))]  # before each of its steps
+
+    @property
+    def views(self) -> int:
+        """The number of views."""
+        return len(self._rounds.views)
 
     def __call__(self, step: int, progress: float) -> list[Camera]:
         """Return the views of a step: at first its new views and some of the earlier ones, later the next ones of a round through all.
@@ -36,7 +43,7 @@ class ViewSchedule:
         """
         pace, count = max(step, int(progress * self._steps)), self._views_in_step(step)
         if pace >= self._gathering:
-            first = self._draws_before(step)
+            first = self.draws_before(step)
             return [self._rounds(first + number) for number in range(count)]
         before, after = self._introduced(pace - 1), self._introduced(pace)
         new = range(before, min(after, before + count))
@@ -48,17 +55,16 @@ class ViewSchedule:
         """The number of views of a step. It rises during the warm-up: the first gradients are alike in all views, so few views suffice."""
         return self._max_views if self._warm_up <= max(0, step) else math.ceil(self._max_views * (step + 1) / self._warm_up)
 
-    def _draws_before(self, step: int) -> int:
+    def draws_before(self, step: int) -> int:
         """The number of draws of all earlier steps; that of the warm-up is rounded up to whole steps, so that rounds align with steps."""
-        first = sum(self._views_in_step(earlier) for earlier in range(min(step, self._warm_up)))
         if step < self._warm_up:
-            return first
-        return math.ceil(first / self._max_views) * self._max_views + (step - self._warm_up) * self._max_views
+            return self._draws_in_warm_up[max(0, step)]
+        return (math.ceil(self._draws_in_warm_up[-1] / self._max_views) + step - self._warm_up) * self._max_views
 
     def _introduced(self, step: int) -> int:
         """The number of views introduced up to a step: spread evenly, at least one per step, and no more per step than it uses."""
         count = max(self._views_in_step(step), step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
-        return min(count, self._draws_before(step + 1), len(self._rounds.views))
+        return min(count, self.draws_before(step + 1), len(self._rounds.views))
 
 
 class ShuffledRounds:
