@@ -12,6 +12,7 @@ import tyro
 
 from mipmap_plugin.commands.adapt import adapt
 from mipmap_plugin.commands.backends import backends
+from mipmap_plugin.commands.common import WORDS
 from mipmap_plugin.commands.demo import demo
 from mipmap_plugin.commands.evaluate import evaluate
 from mipmap_plugin.commands.inspect import inspect
@@ -27,9 +28,11 @@ for command in (inspect, adapt, render, evaluate, tradeoff, backends, demo):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit code."""
-    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words == ["--version"]:
         print(f"mipmap-plugin {version('mipmap-plugin')}")
         return 0
+    WORDS.set(tuple(words))
     try:
         with _our_warnings_only():
             app.cli(prog="mipmap-plugin", description="Make a Gaussian-splatting checkpoint look right at another zoom.", args=arguments)

@@ -24,6 +24,7 @@ STOREYS = [
     {"adaptation"},
     {"wrap"},
     {"evaluation", "models.conformance"},
+    {"pages"},
     {"demo"},
     {"commands"},
     {"cli"},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,7 @@ import tyro
 
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.outputs import adapted_path
+from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.recipes import recipe as make_config
@@ -39,6 +40,7 @@ def adapt(
     backend: str = "auto",
     threads: int | None = None,
     seed: int = 0,
+    report: bool = False,
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
@@ -63,6 +65,7 @@ def adapt(
         backend: Name of a backend; auto chooses the fastest one that can serve the request.
         threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of everything random.
+        report: Also write a page that shows what came out: NAME.report.html beside the file, or in the folder of several files.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
@@ -74,10 +77,9 @@ def adapt(
         config = make_config(recipe, factor, seed=seed, **settings)
         wrapped.targets(name)
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
+    page = AdaptationPage(checkpoint, targets, overwrite) if report else None
     settings |= dict(recipe=recipe, seed=seed, images=images and scene(images))
-    reports = [_saved(adapted, target, overwrite, quiet=json) for adapted, target in _adapted(wrapped, requests, targets, settings)]
-    if json:
-        print_facts(reports, json)
+    _save_all(wrapped, _adapted(wrapped, requests, targets, settings), page, overwrite, json)
 
 
 def _adapted(
@@ -88,6 +90,21 @@ def _adapted(
 
     for (scale, viewer), target in zip(requests, targets, strict=True):
         yield wrapped.adapt(scale, viewer=viewer, resume=state_path(target), **settings), target
+
+
+def _save_all(base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: AdaptationPage | None, overwrite: bool, json: bool) -> None:
+    """Save each model as soon as it is adapted, then write the page; print a summary of each, or all reports as JSON."""
+    reports = []
+    for adapted, target in models:
+        reports.append(_saved(adapted, target, overwrite, quiet=json))
+        if page:
+            page.add(base, adapted)
+    if page:
+        page.write(reports)
+    if json:
+        print_facts(reports, json)
+    elif page:
+        print(look_at(page.path))
 
 
 def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +16,15 @@ if TYPE_CHECKING:
     from mipmap_plugin.camera import Camera
     from mipmap_plugin.scenes import Scene
     from mipmap_plugin.wrap import Wrapped
+
+
+# The words of this command, which its page shows.
+WORDS: ContextVar[tuple[str, ...]] = ContextVar("WORDS", default=())
+
+
+def this_command() -> str:
+    """The command as a shell takes it."""
+    return shlex.join(["mipmap-plugin", *WORDS.get()])
 
 
 def wrap(

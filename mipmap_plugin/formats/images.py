@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -109,6 +110,13 @@ def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> 
     with new_file(path, overwrite) as temporary:
         Image.fromarray(_bytes(image)).save(temporary, format="PNG")
     return path
+
+
+def png(image: Tensor) -> bytes:
+    """The PNG file of an image [H, W, 3], clamped to 0..1 and rounded to 8 bits."""
+    file = io.BytesIO()
+    Image.fromarray(_bytes(image)).save(file, format="PNG", optimize=True)
+    return file.getvalue()
 
 
 def write_array(path: str | Path, values: Tensor, *, overwrite: bool = False) -> Path:
