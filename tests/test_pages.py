@@ -13,6 +13,8 @@ from PIL import Image
 from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists
+from mipmap_plugin.evaluation.shots import Shot
+from mipmap_plugin.pages.gallery import Gallery
 from mipmap_plugin.pages.html import LARGEST, html, write_levels, write_page
 from mipmap_plugin.pages.in_viewers import made_for_viewers, viewer_pictures, why_not
 from mipmap_plugin.pages.record import Page, Picture, Zoom, data_uri, zoom_name
@@ -98,12 +100,32 @@ def test_the_page_of_evaluate_has_the_figures_of_its_json(model_folder, tmp_path
     written, record = json.loads((tmp_path / "rows.json").read_text()), record_of(tmp_path / "rows.html")
     assert record["rows"] == written["rows"] and written["report"] == str(tmp_path / "rows.html")
     [zoom] = record["zooms"]
-    assert [picture["role"] for picture in zoom["pictures"]][:4] == ["base", "adapted", "adapted", "supersampled"]
+    assert zoom["label"] == "×1/2"
+    assert [picture["role"] for picture in zoom["pictures"]][:4] == ["base", "adapted", "supersampled", "truth"]
     means = {row["name"]: {name: row[name] for name in ("psnr_db", "ssim", "lpips")} for row in written["rows"]}
     assert {picture["name"]: picture["mean"] for picture in zoom["pictures"] if picture["role"] != "truth"} == means
     assert [report["scale"] for report in record["adaptations"]] == [0.5, 0.5]
     assert record["commands"][0].startswith("mipmap-plugin evaluate ") and "--recipe instant" in record["commands"][0]
     assert zoom["no_viewers"] == "Not drawn: only the reference backend could, which takes too long here."
+
+
+def test_a_file_for_a_viewer_is_compared_with_the_base_in_that_viewer(model_folder):
+    pytest.importorskip("numba")
+    base = wrap_model(model_folder, backend="cpu")
+    camera, gallery = base.cameras[0], Gallery(base, "itself")
+    truth = base.render(camera).image
+    for row in ("base", "base in spark", "base, resized", "supersampling, 2 x 2", "instant, held out", "instant, scored"):
+        if row.startswith("instant"):
+            gallery.adapted(row, base.adapt(1 / 2, recipe="instant", viewer="spark"))
+        gallery.shot(Shot(row, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+    [zoom] = gallery.zooms([], named=True)
+    assert zoom.label == "ball ×1/2"
+    roles = {picture.name: picture.role for picture in zoom.pictures}
+    assert roles == {
+        "base in spark": "base", "instant, held out": "adapted", "supersampling, 2 x 2": "supersampled", "truth": "truth",
+        "base": "other", "base, resized": "other", "instant, scored": "other",
+    }  # fmt: skip
+    assert next(iter(roles)) == "base in spark" and [each.name for each in zoom.viewers if each.made_for] == ["spark"]
 
 
 def test_evaluate_without_an_output_takes_a_free_name_in_this_folder(model_folder, tmp_path, monkeypatch, capsys):

@@ -16,6 +16,9 @@ from mipmap_plugin.pages.in_viewers import viewer_pictures, why_not
 from mipmap_plugin.pages.record import Picture, Quality, Role, ViewerPictures, Zoom, zoom_name
 from mipmap_plugin.wrap import Wrapped
 
+# How rows of the base in a viewer begin (`measure.base_in_viewer`).
+IN_VIEWER = f"{BASE} in "
+
 
 class Gallery:
     """The first view of each row of one scene, by scale, and what viewers show of the first adapted file of each scale."""
@@ -49,25 +52,29 @@ class Gallery:
         """The effects of the base."""
         return effects_of_base(self._base)
 
-    def zooms(self, rows: Sequence[Row]) -> list[Zoom]:
-        """The pictures of each scale, with the means that `rows` have, from the farthest out to the nearest."""
-        return [self._zoom(scale, self._shots[scale], rows) for scale in sorted(self._shots)]
+    def zooms(self, rows: Sequence[Row], *, named: bool = False) -> list[Zoom]:
+        """The pictures of each scale, with the means that `rows` have, from the farthest out to the nearest; `named` after their scene."""
+        return [self._zoom(scale, self._shots[scale], rows, named) for scale in sorted(self._shots)]
 
-    def _zoom(self, scale: float, shots: Sequence[Shot], rows: Sequence[Row]) -> Zoom:
+    def _zoom(self, scale: float, shots: Sequence[Shot], rows: Sequence[Row], named: bool) -> Zoom:
         means = {row.name: _quality(row) for row in rows if row.scale == scale and row.scene == shots[0].scene}
-        pictures = [Picture(shot.row, self._role(shot), shot.image, _quality(shot), means.get(shot.row, {})) for shot in shots]
+        in_viewer = any(shot.row.startswith(IN_VIEWER) for shot in shots)
+        pictures = [Picture(shot.row, self._role(shot, in_viewer), shot.image, _quality(shot), means.get(shot.row, {})) for shot in shots]
         pictures.append(Picture("truth", "truth", shots[0].truth, note=self._truth))
-        label = f"{shots[0].scene} {zoom_name(scale)}".strip()
+        label = f"{shots[0].scene} {zoom_name(scale)}" if named else zoom_name(scale)
         reason = why_not(self._base) if any(each == scale for each in self._adapted.values()) else "Nothing was adapted: give --recipe default."
         return Zoom(
             label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", self._viewers.get(scale, ()),
             "" if scale in self._viewers else reason,
         )  # fmt: skip
 
-    def _role(self, shot: Shot) -> Role:
-        if shot.row in self._adapted:
-            return "adapted"
-        return "base" if shot.row == BASE else "supersampled" if shot.row.startswith("supersampling") else "other"
+    def _role(self, shot: Shot, in_viewer: bool) -> Role:
+        """`in_viewer`: the file was made for a viewer, and is compared with the base in that viewer."""
+        if shot.row in self._adapted:  # what was adapted to the very views that judge it is a figure for the literature
+            return "other" if shot.row.endswith("scored") else "adapted"
+        if shot.row.startswith(IN_VIEWER) if in_viewer else shot.row == BASE:
+            return "base"
+        return "supersampled" if shot.row.startswith("supersampling") else "other"
 
 
 def _quality(of: Row | Shot) -> Quality:

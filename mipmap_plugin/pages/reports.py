@@ -25,7 +25,7 @@ AS_IT_IS = "the base as it is"
 def evaluation_page(title: str, galleries: Sequence[Gallery], rows: Sequence[Row], **further: Any) -> Page:
     """The page of rows and of the galleries that watched them; `further`: commands and notes."""
     adaptations = [each for gallery in galleries for each in gallery.adaptations]
-    zooms = [zoom for gallery in galleries for zoom in gallery.zooms(rows)]
+    zooms = [zoom for gallery in galleries for zoom in gallery.zooms(rows, named=len(galleries) > 1)]
     effects = adaptations[0]["effects"] if adaptations else galleries[0].effects()
     lead = " ".join(filter(None, (_lead(zoom, rows) for zoom in zooms)))
     return Page(title, lead, zooms=zooms, rows=records(rows), adaptations=adaptations, effects=effects, provenance=versions(), **further)
@@ -82,7 +82,8 @@ def _lead(zoom: Zoom, rows: Sequence[Row]) -> str:
         return ""
     adapted = f", {means['adapted']:.1f} dB adapted{_in_seconds(zoom, rows)}" if "adapted" in means else ""
     sampled = f", {means['supersampled']:.1f} dB supersampled" if "supersampled" in means else ""
-    return f"{zoom.label}: {means['base']:.1f} dB as it is{adapted}{sampled}."
+    where = next(picture.name for picture in zoom.pictures if picture.role == "base").removeprefix(BASE)
+    return f"{zoom.label}{where}: {means['base']:.1f} dB as it is{adapted}{sampled}."
 
 
 def _in_seconds(zoom: Zoom, rows: Sequence[Row]) -> str:
