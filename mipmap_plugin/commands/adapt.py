@@ -12,11 +12,13 @@ from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
     from mipmap_plugin.adaptation.adapted import Adapted
+    from mipmap_plugin.adaptation.report import Report
     from mipmap_plugin.models.base import SplatModel
     from mipmap_plugin.wrap import Wrapped
 
@@ -104,14 +106,14 @@ def _save_all(base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: Adapt
     if json:
         print_facts(reports, json)
     elif page:
-        print(look_at(page.path))
+        say(look_at(page.path))
 
 
 def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:
     """Save an adapted model, print a summary unless `quiet`, and return its report."""
     saved = adapted.save(target, overwrite=overwrite)
     if not quiet:
-        _print(saved, adapted)
+        _say(saved, adapted)
     return {"file": str(saved), **adapted.report.model_dump()}
 
 
@@ -121,26 +123,48 @@ def _requests(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float
     return [(scale, name) for scale in unique_scales(scales) for name in names]
 
 
-def _made_for(model: SplatModel) -> str:
-    """What a file is made for if no viewer was requested."""
+def _made_for(report: Report, model: SplatModel) -> str:
+    """What a file is made for, and how to have one made for something else."""
     from mipmap_plugin.models.base import why_no_viewer
 
-    classic, advice = "made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio)", "; for others give --viewer spark, supersplat, ..."
+    if report.viewer:
+        return f"made for {report.viewer}"
     if why_no_viewer(model):
         return "made for its own project"
-    return f"made for its own project, whose filter it keeps{advice}" if model.trained.keeps_filter else f"{classic}{advice}"
+    advice = "; for others give --viewer spark, supersplat, ..."
+    if model.trained.keeps_filter:
+        return f"made for its own project, whose filter it keeps{advice}"
+    return f"made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio){advice}"
 
 
-def _print(saved: Path, adapted: Adapted) -> None:
+def _say(saved: Path, adapted: Adapted) -> None:
+    """Two lines, what and where; the rest goes to the log."""
     report = adapted.report
-    print(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {saved}")
-    db = ", ".join(f"{name} {psnr:.2f}" for name, psnr in report.validation.items())
-    print(f"  holds {report.returned}{f' (dB on views that nothing was adapted to: {db})' if db else ''}")
+    splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
+    say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {_gain(report)}, {splats}")
+    say(f"{saved}, {_made_for(report, adapted.model)}")
+    for line in _details(report):
+        detail(f"  {line}")
+
+
+def _gain(report: Report) -> str:
+    """The PSNR before and after, as far as it was measured."""
+    from mipmap_plugin.adaptation.report import AS_IT_IS
+
+    before, after = report.psnr_before(), report.psnr_after()
+    if before is None or after is None:
+        return f"holds {report.returned}"
+    if report.returned.startswith(AS_IT_IS):
+        return f"holds {report.returned}, for nothing was better ({before:.2f} dB on views that nothing was adapted to)"
+    return f"{before:.2f} -> {after:.2f} dB on views that nothing was adapted to"
+
+
+def _details(report: Report) -> Iterator[str]:
+    psnrs = ", ".join(f"{name} {psnr:.2f}" for name, psnr in report.validation.items())
+    yield f"holds {report.returned}{f' (dB on views that nothing was adapted to: {psnrs})' if psnrs else ''}; ended by {report.ended_by}"
     if report.viewers:
-        print(f"  in each viewer: {', '.join(f'{name} {psnr:.1f}' for name, psnr in report.viewers.items())} dB")
-    if report.viewer is None:
-        print(f"  {_made_for(adapted.model)}")
-    print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
+        yield f"in each viewer: {', '.join(f'{name} {psnr:.1f}' for name, psnr in report.viewers.items())} dB"
     if report.peak_memory_mib is not None:
-        print(f"  at most {report.peak_memory_mib:,.0f} MiB on the GPU")
-    print(f"  {report.views}; {report.filters}; backend {report.backend}")
+        yield f"at most {report.peak_memory_mib:,.0f} MiB on the GPU"
+    yield f"{report.views}; {report.filters}; backend {report.backend}"
+    yield f"seconds: {', '.join(f'{phase} {seconds:.2f}' for phase, seconds in report.seconds.items())}"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.types import Background, ScreenFilter
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.formats.atomic import json_text
 from mipmap_plugin.progress import announced
 
@@ -64,12 +65,12 @@ def summary(cameras: Sequence[Camera]) -> str:
 
 
 def print_facts(facts: Any, as_json: bool) -> None:
-    """Print facts by name, or as JSON."""
+    """Print facts by name, or as JSON, which is printed quiet or not."""
     if as_json:
         print(json_text(facts))
         return
     for name, value in facts.items():
         lines = value if isinstance(value, list) else [value]
         for line in lines:
-            print(f"{name + ':' if name else '':14}{line}")
+            say(f"{name + ':' if name else '':14}{line}")
             name = ""

@@ -7,6 +7,7 @@ from pathlib import Path
 import tyro
 
 from mipmap_plugin.commands.types import Scale
+from mipmap_plugin.commands.voice import say
 
 
 def demo(
@@ -27,4 +28,4 @@ def demo(
     """
     from mipmap_plugin.demo.run import run_demo
 
-    print(run_demo(output, scale or (0.25, 4.0), viewer, report=report, overwrite=overwrite))
+    say(run_demo(output, scale or (0.25, 4.0), viewer, report=report, overwrite=overwrite))

@@ -11,6 +11,7 @@ import tyro
 from mipmap_plugin.commands.common import print_facts, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
 
@@ -114,12 +115,12 @@ class _Results:
         from mipmap_plugin.evaluation.published import TITLE, published
         from mipmap_plugin.evaluation.report import published_table, table
 
-        print("\n".join([title, table(self._rows), *self._notes]))
+        say("\n".join([title, table(self._rows), *self._notes]))
         if dataset:
-            print(f"\npublished, {TITLE[dataset]}; rows of different protocols are not comparable")
-            print(published_table(published(dataset, self._scales)))
+            say(f"\npublished, {TITLE[dataset]}; rows of different protocols are not comparable")
+            say(published_table(published(dataset, self._scales)))
         if self._page:
-            print(look_at(self._page))
+            say(look_at(self._page))
 
 
 def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path | None) -> Perceptual | None:

@@ -11,6 +11,7 @@ import tyro
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 from mipmap_plugin.screen_filters import Name
@@ -71,7 +72,7 @@ def render(
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
     for camera, picture in zip(views, pictures, strict=True):
         _write(picture, wrapped.render(camera.zoomed(scale), scale, filter_name, supersampling, **options), outputs, overwrite)
-    print(f"{len(views)} pictures in {output}")
+    say(f"{len(views)} pictures in {output}")
 
 
 def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], overwrite: bool) -> None:

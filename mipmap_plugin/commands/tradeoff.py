@@ -12,6 +12,7 @@ import tyro
 from mipmap_plugin.commands.common import print_facts, scene, wrap
 from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
@@ -97,6 +98,6 @@ def _print(tradeoffs: Sequence[Tradeoff], page: Path | None, json: bool) -> None
     if json:
         print_facts(facts(tradeoffs, complete=True), json)
         return
-    print("\n\n".join(table(tradeoff) for tradeoff in tradeoffs))
+    say("\n\n".join(table(tradeoff) for tradeoff in tradeoffs))
     if page:
-        print(look_at(page))
+        say(look_at(page))

@@ -18,9 +18,6 @@ from mipmap_plugin.pages.in_viewers import viewer_pictures, why_not
 from mipmap_plugin.pages.record import Page, Picture, Quality, Role, Zoom, zoom_name
 from mipmap_plugin.wrap import Wrapped
 
-# What the report of an adaptation calls the base, and its own choice.
-AS_IT_IS = "the base as it is"
-
 
 def evaluation_page(title: str, galleries: Sequence[Gallery], rows: Sequence[Row], **further: Any) -> Page:
     """The page of rows and of the galleries that watched them; `further`: commands and notes."""
@@ -41,7 +38,7 @@ def tradeoff_page(title: str, base: Wrapped, facts: dict[str, Any], commands: Se
 
 def adaptation_page(title: str, zooms: Sequence[Zoom], adaptations: Sequence[dict[str, Any]], commands: Sequence[str]) -> Page:
     """The page of adapted files: their pictures (`adaptation_zoom`) and their reports."""
-    lead = " ".join(_gain(report) for report in adaptations)
+    lead = " ".join(_gain(zoom, report) for zoom, report in zip(zooms, adaptations, strict=True))
     return Page(title, lead, commands, zooms, adaptations=adaptations, effects=adaptations[0]["effects"], provenance=versions())
 
 
@@ -57,7 +54,7 @@ def adaptation_zoom(base: Wrapped, adapted: Adapted) -> Zoom:
     name = f"adapted, {report.settings.recipe}"
     images[name] = adapted.render(view.zoomed(scale)).image
     roles: dict[str, Role] = {base_name: "base", name: "adapted", RESIZED: "truth" if scale < 1 else "other"}
-    means = {base_name: _validation(report.validation, AS_IT_IS), name: _validation(report.validation, report.returned)}
+    means = {base_name: _psnr(report.psnr_before()), name: _psnr(report.psnr_after())}
     pictures = [
         Picture(each, roles.get(each, "supersampled" if each.startswith("supersampling") else "other"), image,
                 {"psnr_db": truth.psnr(view, image)} if each != RESIZED or scale > 1 else {}, means.get(each, {}))
@@ -70,9 +67,8 @@ def adaptation_zoom(base: Wrapped, adapted: Adapted) -> Zoom:
     return Zoom(label, scale, in_order(pictures), view.name, f"{against} (no photographs)", "the validation views", shown, reason)
 
 
-def _validation(validation: dict[str, float], state: str) -> Quality:
-    """The dB of a state; `state` may go on after the state's name (`Report.returned`)."""
-    return next(({"psnr_db": db} for name, db in validation.items() if state.startswith(name)), {})
+def _psnr(psnr_db: float | None) -> Quality:
+    return {} if psnr_db is None else {"psnr_db": psnr_db}
 
 
 def _lead(zoom: Zoom, rows: Sequence[Row]) -> str:
@@ -92,7 +88,7 @@ def _in_seconds(zoom: Zoom, rows: Sequence[Row]) -> str:
     return "" if seconds is None else f" in {seconds:.1f} s"
 
 
-def _gain(report: dict[str, Any]) -> str:
-    before, after = (_validation(report["validation"], state).get("psnr_db") for state in (AS_IT_IS, report["returned"]))
+def _gain(zoom: Zoom, report: dict[str, Any]) -> str:
+    before, after = (next(each.mean.get("psnr_db") for each in zoom.pictures if each.role == role) for role in ("base", "adapted"))
     gain = f"{before:.1f} → {after:.1f} dB on views that nothing was adapted to, " if before is not None and after is not None else ""
     return f"{report['title']}: {gain}{report['seconds']['total']:.1f} s, {report['gaussians_before']:,} → {report['gaussians_after']:,} splats."
