@@ -10,15 +10,14 @@ from importlib.metadata import version
 
 import tyro
 
+from mipmap_plugin.commands import common, voice
 from mipmap_plugin.commands.adapt import adapt
 from mipmap_plugin.commands.backends import backends
-from mipmap_plugin.commands.common import WORDS, this_command
 from mipmap_plugin.commands.demo import demo
 from mipmap_plugin.commands.evaluate import evaluate
 from mipmap_plugin.commands.inspect import inspect
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
-from mipmap_plugin.commands.voice import complain, detail, options, voice
 from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.limits import is_out_of_memory
 
@@ -39,13 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mipmap-plugin {version('mipmap-plugin')}")
         return 0
     try:
-        words, quiet, log = options(words)
-        WORDS.set(tuple(words))
-        with voice(quiet, log):
-            detail(this_command())
+        words, quiet, log = voice.options(words)
+        common.WORDS.set(tuple(words))
+        with voice.speaking(quiet, log):
+            voice.detail(common.this_command())
             return _run(words)
     except MipmapPluginError as error:  # of these two options
-        complain(f"mipmap-plugin: {error}")
+        voice.complain(f"mipmap-plugin: {error}")
         return 2
 
 
@@ -55,15 +54,15 @@ def _run(words: Sequence[str]) -> int:
         with _our_warnings_only():
             app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
     except (MipmapPluginError, OSError) as error:
-        complain(f"mipmap-plugin: {error}")
+        voice.complain(f"mipmap-plugin: {error}")
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        complain("mipmap-plugin: out of memory; use a smaller scale, fewer views or smaller cameras")
+        voice.complain("mipmap-plugin: out of memory; use a smaller scale, fewer views or smaller cameras")
         return 2
     except KeyboardInterrupt as interrupt:
-        complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
+        voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
         return 130
     return 0
 

@@ -36,7 +36,7 @@ CONFINED = {
     "gsplat": ["backends/gsplat"],
     "llvmlite": ["backends/cpu_kernels/"],
     "lpips": ["evaluation/perceptual.py"],
-    "matplotlib": ["evaluation/tradeoff/plot.py"],
+    "matplotlib": ["adaptation/plot.py", "evaluation/tradeoff/plot.py"],
     "numba": ["backends/cpu_kernels/"],
     "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/"],
     "plyfile": ["formats/ply.py"],

@@ -14,10 +14,11 @@ from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists
 from mipmap_plugin.evaluation.shots import Shot
+from mipmap_plugin.formats.images import data_uri
 from mipmap_plugin.pages.gallery import Gallery
 from mipmap_plugin.pages.html import LARGEST, html, write_levels, write_page
 from mipmap_plugin.pages.in_viewers import made_for_viewers, viewer_pictures, why_not
-from mipmap_plugin.pages.record import Page, Picture, Zoom, data_uri, zoom_name
+from mipmap_plugin.pages.record import Page, Picture, Zoom, zoom_name
 from mipmap_plugin.pages.reports import adaptation_zoom
 
 TITLES = {"base": "base", "adapted": "adapted", "supersampled": "supersampling, 4 x 4", "truth": "truth"}

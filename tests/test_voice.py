@@ -8,7 +8,7 @@ import tiny
 
 from mipmap_plugin import progress
 from mipmap_plugin.cli import main
-from mipmap_plugin.commands.voice import options, voice
+from mipmap_plugin.commands.voice import options, speaking
 from mipmap_plugin.errors import SettingsError
 
 QUICK = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference"]
@@ -38,7 +38,7 @@ def test_a_quiet_command_prints_what_is_wrong(base, capsys):
 def test_a_quiet_command_shows_no_progress(monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(progress, "_show", lambda *_: pytest.fail("progress was shown"))
-    with voice(True, None), progress.announced("work"):
+    with speaking(True, None), progress.announced("work"):
         assert not sys.stderr.isatty()
 
 

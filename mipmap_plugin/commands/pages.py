@@ -83,8 +83,10 @@ def tradeoff_page_path(folder: Path, overwrite: bool) -> Path:
     return folder / "report.html"
 
 
-def write_tradeoff_page(page: Path, checkpoint: Path, base: Wrapped, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
-    """Write the page of a tradeoff."""
+def write_tradeoff_page(page: Path | None, checkpoint: Path, base: Wrapped, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
+    """Write the page of a tradeoff, unless `page` is None."""
+    if page is None:
+        return
     from mipmap_plugin.evaluation.tradeoff.files import facts
     from mipmap_plugin.pages.html import write_page
     from mipmap_plugin.pages.reports import tradeoff_page

@@ -45,8 +45,7 @@ def tradeoff(
 ) -> None:
     """Measure accuracy against time: dB against seconds to adapt, and against milliseconds per frame.
 
-    Writes tradeoff.json, tradeoff.csv and tradeoff.png. Models are evaluated only on views that they were not adapted to, and the time of the
-    evaluation is not counted.
+    Writes tradeoff.json, tradeoff.csv and tradeoff.png. Models are evaluated on views that they were not adapted to, outside the time counted.
 
     Args:
         checkpoint: A PLY or a model folder.
@@ -80,8 +79,7 @@ def tradeoff(
     model, photographs = wrap(checkpoint, None, background, "auto", screen_filter, threads), scene(images) if images else None
     _check(model, plan, scale)
     tradeoffs = run(model, photographs, unique_scales(scale), plan, views, Folder(output, picture, overwrite))
-    if page:
-        write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite)
+    write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite)
     _print(tradeoffs, page, json)
 
 

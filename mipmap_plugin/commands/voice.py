@@ -70,7 +70,7 @@ def options(words: Sequence[str]) -> tuple[list[str], bool, Path | None]:
 
 
 @contextlib.contextmanager
-def voice(quiet: bool, log: Path | None) -> Iterator[None]:
+def speaking(quiet: bool, log: Path | None) -> Iterator[None]:
     """Speak like this inside the block. A log is appended to, line by line. Raises OutputError."""
     with contextlib.ExitStack() as stack:
         try:

@@ -182,7 +182,7 @@ def _views(config: AdaptConfig, on: str, judged: Sequence[TruthView]) -> dict[st
 
 def _unseen(judged: Sequence[TruthView], adapted: Adapted) -> str:
     """The part of a row's name that says whether the model was adapted to any of the evaluated views."""
-    seen = len(views_seen([view.camera for view in judged], adapted.views))
+    seen = len(views_seen([view.camera for view in judged], adapted.adapted_to))
     return f"{seen} of {len(judged)} judged views adapted to" if seen else "held out"
 
 

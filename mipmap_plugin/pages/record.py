@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from mipmap_plugin.formats.images import png
+from mipmap_plugin.formats.images import data_uri
 
 Role = Literal["base", "adapted", "supersampled", "truth", "other"]
 
@@ -99,10 +98,3 @@ def zoom_name(scale: float) -> str:
     """A scale as people write it: ×1/4, ×4, ×0.3."""
     fraction = Fraction(scale).limit_denominator(64)
     return f"×{fraction}" if math.isclose(float(fraction), scale, rel_tol=1e-9) and min(fraction.as_integer_ratio()) == 1 else f"×{scale:g}"
-
-
-def data_uri(image: Tensor, side: int) -> str:
-    """The middle of an image [h, w, 3], at most `side` x `side` px, as the address of a PNG."""
-    height, width = image.shape[:2]
-    top, left = max(0, (height - side) // 2), max(0, (width - side) // 2)
-    return "data:image/png;base64," + base64.b64encode(png(image[top : top + side, left : left + side])).decode("ascii")
