@@ -150,7 +150,7 @@ def rows_of(name: str, scale: float, data: Path, most: int | None) -> list[Row]:
     warm_up(base, scale, others)
     for recipe, settings in recipes(capture, scale).items():
         adapted = adapt_alone(base, scale, cameras=others, **settings)
-        assert not views_seen(judged, adapted.views), f"{name}: views that are judged were adapted to"
+        assert not views_seen(judged, adapted.adapted_to), f"{name}: views that are judged were adapted to"
         for judge, beside in zip(judged_by, rows, strict=True):
             beside.append(adapted_row(recipe, adapted, judge))
             print(table(beside[-1:]), flush=True)

@@ -10,6 +10,7 @@ from importlib.metadata import version
 
 import tyro
 
+from mipmap_plugin.commands import common, voice
 from mipmap_plugin.commands.adapt import adapt
 from mipmap_plugin.commands.backends import backends
 from mipmap_plugin.commands.demo import demo
@@ -20,6 +21,11 @@ from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.limits import is_out_of_memory
 
+DESCRIPTION = (
+    "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors and JSON only, "
+    "and --log FILE, to append all that is said, with further details, to a file."
+)
+
 app = tyro.extras.SubcommandApp()
 for command in (inspect, adapt, render, evaluate, tradeoff, backends, demo):
     app.command(command)
@@ -27,22 +33,36 @@ for command in (inspect, adapt, render, evaluate, tradeoff, backends, demo):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit code."""
-    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words == ["--version"]:
         print(f"mipmap-plugin {version('mipmap-plugin')}")
         return 0
     try:
+        words, quiet, log = voice.options(words)
+        common.WORDS.set(tuple(words))
+        with voice.speaking(quiet, log):
+            voice.detail(common.this_command())
+            return _run(words)
+    except MipmapPluginError as error:  # of these two options
+        voice.complain(f"mipmap-plugin: {error}")
+        return 2
+
+
+def _run(words: Sequence[str]) -> int:
+    """Run a command; return the exit code."""
+    try:
         with _our_warnings_only():
-            app.cli(prog="mipmap-plugin", description="Make a Gaussian-splatting checkpoint look right at another zoom.", args=arguments)
+            app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
     except (MipmapPluginError, OSError) as error:
-        print(f"mipmap-plugin: {error}", file=sys.stderr)
+        voice.complain(f"mipmap-plugin: {error}")
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        print("mipmap-plugin: out of memory; use a smaller scale, fewer views or smaller cameras", file=sys.stderr)
+        voice.complain("mipmap-plugin: out of memory; use a smaller scale, fewer views or smaller cameras")
         return 2
     except KeyboardInterrupt as interrupt:
-        print(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}", file=sys.stderr)
+        voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
         return 130
     return 0
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, cast
 import torch
 
 from mipmap_plugin import threads
+from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
@@ -62,6 +63,13 @@ class Wrapped:
         self.model, self.cameras, self._backend, self.trained, self.threads = model, list(cameras), backend, trained, threads
         self.background = trained.background or (0.0, 0.0, 0.0)
         self.images: BaseImages | None = None  # of the base, drawn so far for all scales; None: the next call draws all of its own
+
+    def __repr__(self) -> str:
+        return notebook.line("Wrapped", notebook.base_facts(self.model, self.cameras, self.trained))
+
+    def _repr_html_(self) -> str:
+        facts = notebook.base_facts(self.model, self.cameras, self.trained)
+        return notebook.table("Wrapped", facts, lambda camera: self.render(camera).image, self.views()[0])
 
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
         """How this model is rendered at `scale`, or by the viewer of that name (`splatting.viewers`).
@@ -179,7 +187,8 @@ class Wrapped:
             self.images = BaseImages(model, backend, self.effects())
         request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer)
         with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
-            return Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
+            adapted = Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
+        return replace(adapted, cameras=self.views())
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
         """Raise now the error that saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be predicted."""

@@ -21,7 +21,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import read_scale
 from mipmap_plugin.evaluation import backends as backends_module
-from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
 
@@ -30,8 +30,9 @@ NO_STEP = ["--backend", "reference", "--steps", "0"]
 
 
 @pytest.fixture
-def run(capsys):
-    """Call the command line; return (exit code, what it said on stdout, what on stderr)."""
+def run(capsys, tmp_path_factory, monkeypatch):
+    """Call the command line in a folder of its own; return (exit code, what it said on stdout, what on stderr)."""
+    monkeypatch.chdir(tmp_path_factory.mktemp("here"))
 
     def call(*words):
         capsys.readouterr()
@@ -70,7 +71,23 @@ def test_inspect_says_what_a_checkpoint_is(run, model_folder):
     code, out, err = run("inspect", model_folder)
     assert (code, err) == (0, "")
     facts = "family:       3dgs", "splats:       60", "1 in use of 1", "classic, 0.3 px²", "4, 32 x 24 px", "health:"
-    assert all(fact in out for fact in (*facts, "screen filter: on", "compensation: off"))
+    assert all(fact in out for fact in (*facts, "screen filter: on"))
+    assert out.startswith(f"verdict:      sound; next: mipmap-plugin adapt {model_folder} --scale 1/4\n")
+
+
+def test_inspect_lists_the_effects_that_are_off_if_asked(run, model_folder):
+    brief, whole = run("inspect", model_folder, "--no-viewers")[1], run("inspect", model_folder, "--no-viewers", "--all")[1]
+    off = whole.count(": off, ")
+    assert off > 10 and ": off, " not in brief and f"{off} more are off (--all)" in brief and "more are off" not in whole
+    assert brief.count(": on, ") == whole.count(": on, ") > 0
+
+
+def test_inspect_doubts_a_file_of_another_convention(run, tmp_path):
+    ply = tiny.ply(tmp_path / "a.ply", count=200)
+    columns = read_ply(ply).columns
+    columns["opacity"][:] = 0.5
+    write_ply(tmp_path / "b.ply", columns)
+    assert run("inspect", tmp_path / "b.ply")[1].startswith("verdict:      doubtful: read health before you adapt it\n")
 
 
 def test_inspect_as_json(run, tmp_path):
@@ -97,14 +114,18 @@ def test_inspect_of_an_iteration(run, model_folder):
 
 
 def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
-    code, out, _ = run("adapt", model_folder, "--scale", "1/4", "--scale", "2", "--output", tmp_path / "out", *QUICK)
+    words = ["adapt", model_folder, "--scale", "1/4", "--scale", "2", "--output", tmp_path / "out", "--log", tmp_path / "log.txt", *QUICK]
+    code, out, _ = run(*words)
     assert code == 0
+    what, where = out.splitlines()[::2], out.splitlines()[1::2]
     for scale, name in [(0.25, "base_x0.25"), (2, "base_x2")]:
         ply = tmp_path / "out" / name / "point_cloud/iteration_30000/point_cloud.ply"
         assert provenance_of(read_ply(ply).comments)["scale"] == scale
         assert json.loads(ply.with_name("point_cloud.ply.adaptation.json").read_text())["scale"] == scale
-        assert f"x{scale:g}: {ply}" in out
-    assert "ended by 2 steps" in out and "backend reference: requested" in out and "the 4 given views" in out
+        assert where.pop(0).startswith(f"{ply}, made for renderers that draw as 3DGS does")
+        assert re.fullmatch(rf"x{scale:g}: (\S+ -> \S+ dB on views|holds the base as it is, ).*, 60 -> \d+ splats, \d+\.\d s", what.pop(0))
+    log = (tmp_path / "log.txt").read_text()
+    assert "ended by 2 steps" in log and "backend reference: requested" in log and "the 4 given views" in log
     assert not list(tmp_path.rglob("*.resume"))
 
 
@@ -129,8 +150,8 @@ def test_adapt_hands_its_options_on(run, model_folder, tmp_path):
 
 def test_adapt_takes_cameras_from_elsewhere(run, tmp_path):
     views = tiny.scene(tmp_path / "scene", train=tiny.cameras(3))
-    answer = run("adapt", tiny.ply(tmp_path / "a.ply"), "--scale", "1/2", "--cameras", views, *QUICK)
-    assert answer[0] == 0 and "the 5 given views" in answer[1]
+    answer = run("adapt", tiny.ply(tmp_path / "a.ply"), "--scale", "1/2", "--cameras", views, "--json", *QUICK)
+    assert answer[0] == 0 and "the 5 given views" in json.loads(answer[1])[0]["views"]
 
 
 def test_the_same_scale_twice_is_one_scale(run, model_folder, tmp_path):
@@ -240,7 +261,7 @@ def test_evaluate_says_which_rows_are_missing_and_that_no_row_is_exposed(run, mo
     exposed = "exposure.json changes 1 of 1 images, which is not applied here: part of every difference from a photograph is exposure"
     missing = "there is no row 'window', since backend 'reference' cannot do this: it has the screen filters antialiased, classic, not window"
     code, out, _ = run(*words, "--scale", "1/2")
-    assert code == 0 and out.splitlines()[-2:] == [missing, exposed] and "| window" not in out
+    assert code == 0 and out.splitlines()[-3:-1] == [missing, exposed] and "| window" not in out
     code, out, _ = run(*words, "--scale", "1", "--json")
     assert code == 0 and json.loads(out)["notes"] == [exposed]
 

@@ -190,7 +190,7 @@ def test_there_are_commands_to_check():
 def options() -> set[str]:
     """Those of all commands."""
     names = {name.replace("_", "-") for command in COMMANDS.values() for name in inspect.signature(command).parameters}
-    return {f"--{name}" for name in names} | {f"--no-{name}" for name in names} | {"--help", "--version"}
+    return {f"--{name}" for name in names} | {f"--no-{name}" for name in names} | {"--help", "--version", "--quiet", "--log"}
 
 
 def test_options_exist():

@@ -117,7 +117,7 @@ def test_the_base_as_it_is_is_what_the_viewer_shows_of_its_file(tmp_path, viewer
     """The base is returned where it scores better than every state of the run."""
     base = wrapped(tmp_path, "gof")
     adapted = base.adapt(1, viewer=viewer, recipe="instant", validation_views=2)
-    view = adapted.views[-1]  # which alone has chosen
+    view = adapted.adapted_to[-1]  # which alone has chosen
     expected = psnr(base.render(view, viewer=viewer).image, base.render(view).image)
     assert adapted.report.validation["the base as it is"] == pytest.approx(expected, abs=1e-3)
 

@@ -189,10 +189,10 @@ def test_an_adapted_model_is_drawn_by_each_of_its_viewers(pair):
 def test_the_command_writes_a_portable_file_beside_another(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(3))
     words = ["adapt", base, "--scale", "1/4", "--viewer", "spark", "--viewer", "portable", "--recipe", "instant", "--backend", "reference"]
-    assert cli.main([str(word) for word in words]) == 0
-    out = capsys.readouterr().out
-    assert f"x0.25 in portable: {tmp_path / 'base_x0.25_portable'}" in out
-    [line] = [line for line in out.splitlines() if line.startswith("  in each viewer: classic ")]
+    assert cli.main([str(word) for word in (*words, "--log", tmp_path / "log")]) == 0
+    what, where = capsys.readouterr().out.splitlines()[2:]
+    assert what.startswith("x0.25 in portable: ") and where.startswith(str(tmp_path / "base_x0.25_portable")) and where.endswith("made for portable")
+    [line] = [line for line in (tmp_path / "log").read_text().splitlines() if "  in each viewer: classic " in line]
     assert all(f"{viewer.name} " in line for viewer in BUILT_IN)
     assert json.loads(next((tmp_path / "base_x0.25_portable").rglob("*.adaptation.json")).read_text())["viewer"] == "portable"
 

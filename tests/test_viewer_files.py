@@ -99,13 +99,13 @@ def test_a_run_for_one_viewer_is_not_resumed_for_another(tmp_path):
 def test_the_command_writes_a_file_for_each_viewer_and_says_what_it_holds(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(3))
     words = ["adapt", base, "--scale", "1/4", "--viewer", "spark", "--viewer", "playcanvas", "--steps", "2", "--views", "given"]
-    assert main([*map(str, words), "--backend", "reference"]) == 0
-    out = capsys.readouterr().out
+    assert main([*map(str, words), "--backend", "reference", "--log", str(tmp_path / "log")]) == 0
+    out, log = capsys.readouterr().out, (tmp_path / "log").read_text()
     for viewer in ("spark", "playcanvas"):
         ply = tmp_path / f"base_x0.25_{viewer}" / "point_cloud/iteration_30000/point_cloud.ply"
         assert provenance_of(read_ply(ply).comments)["viewer"] == viewer
-        assert f"x0.25 in {viewer}: {ply}" in out
-    assert out.count("  holds the ") == out.count("(dB on views that nothing was adapted to: the base as it is ") == 2
+        assert f"x0.25 in {viewer}: " in out and f"{ply}, made for {viewer}\n" in out
+    assert log.count("  holds the ") == log.count("(dB on views that nothing was adapted to: the base as it is ") == 2
     assert "give --viewer" not in out
 
 

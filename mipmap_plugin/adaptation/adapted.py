@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.backends import supersample
@@ -22,7 +24,7 @@ from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.outputs import REPORT
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Adapted:
     """A model that looks right at its scale, and the report of how it was made."""
 
@@ -32,7 +34,8 @@ class Adapted:
     effects: Effects
     viewers: Mapping[str, Effects] = field(default_factory=dict)  # how each viewer that the file is made for renders it
     state: StateFile | None = None  # the state of the run, which is needed until the model is saved
-    views: Sequence[Camera] = ()  # the cameras of the base scale that the model was adapted to or selected on
+    adapted_to: Sequence[Camera] = ()  # the cameras of the base scale that the model was adapted to or selected on
+    cameras: Sequence[Camera] = ()  # the base's, at its scale
 
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
         """Render the view of a camera of the new scale, in one of the `viewers`; `outputs` and `exposure` as in `Wrapped.render`."""
@@ -41,6 +44,23 @@ class Adapted:
             raise SettingsError(f"this model was not made for the viewer {viewer!r}, but for {available}")
         effects = self.effects if viewer is None else self.viewers[viewer]
         return render_model(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
+
+    def views(self) -> list[Camera]:
+        """The base's cameras at the scale of this model, for `render`."""
+        return [camera.zoomed(self.report.scale) for camera in self.cameras]
+
+    def plot(self) -> Any:
+        """dB over the seconds of adapting, as a matplotlib Figure. Raises SettingsError without matplotlib (extra `plot`)."""
+        from mipmap_plugin.adaptation.plot import plot
+
+        return plot(self.report)
+
+    def __repr__(self) -> str:
+        return notebook.line("Adapted", notebook.adapted_facts(self.model, self.report))
+
+    def _repr_html_(self) -> str:
+        facts = notebook.adapted_facts(self.model, self.report)
+        return notebook.table("Adapted", facts, lambda camera: self.render(camera).image, self.views()[0])
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""

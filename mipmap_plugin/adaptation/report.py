@@ -13,6 +13,9 @@ from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, enlarges
 
+# The name of the base among a run's states.
+AS_IT_IS = "the base as it is"
+
 
 class Report(BaseModel):
     """Everything needed to assess an adapted model, or to make it again."""
@@ -37,6 +40,14 @@ class Report(BaseModel):
     peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without a GPU
     curve: list[CurvePoint]
     versions: dict[str, str]
+
+    def psnr_before(self) -> float | None:
+        """PSNR (dB) of the base on views that nothing was adapted to; None if it was not measured."""
+        return self.validation.get(AS_IT_IS)
+
+    def psnr_after(self) -> float | None:
+        """PSNR (dB) of what the file holds, on the same views."""
+        return next((psnr for state, psnr in self.validation.items() if self.returned.startswith(state)), None)
 
     def provenance(self) -> dict[str, Any]:
         """Return what the file's header records: viewer, base, scale, settings, versions. Nothing in it depends on the clock."""

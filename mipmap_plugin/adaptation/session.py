@@ -22,7 +22,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
-from mipmap_plugin.adaptation.report import PeakMemory, Report, filters, versions
+from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
 from mipmap_plugin.adaptation.start.candidates import StartProblem, StartSearch, warm_up_backend
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.detail import DetailLoss
@@ -41,7 +41,6 @@ from mipmap_plugin.progress import announced
 # (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> None. Its time is not counted.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
 
-AS_IT_IS = "the base as it is"
 
 # A zoom-in is validated against the base's own image, whatever it is adapted to.
 COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}

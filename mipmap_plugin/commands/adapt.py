@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +10,15 @@ import tyro
 
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.outputs import adapted_path
+from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
     from mipmap_plugin.adaptation.adapted import Adapted
+    from mipmap_plugin.adaptation.report import Report
     from mipmap_plugin.models.base import SplatModel
     from mipmap_plugin.wrap import Wrapped
 
@@ -39,6 +42,7 @@ def adapt(
     backend: str = "auto",
     threads: int | None = None,
     seed: int = 0,
+    report: bool = False,
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
@@ -63,6 +67,7 @@ def adapt(
         backend: Name of a backend; auto chooses the fastest one that can serve the request.
         threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of everything random.
+        report: Also write a page that shows what came out: NAME.report.html beside the file, or in the folder of several files.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
@@ -74,10 +79,9 @@ def adapt(
         config = make_config(recipe, factor, seed=seed, **settings)
         wrapped.targets(name)
         wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
+    page = AdaptationPage(checkpoint, targets, overwrite) if report else None
     settings |= dict(recipe=recipe, seed=seed, images=images and scene(images))
-    reports = [_saved(adapted, target, overwrite, quiet=json) for adapted, target in _adapted(wrapped, requests, targets, settings)]
-    if json:
-        print_facts(reports, json)
+    _save_all(wrapped, _adapted(wrapped, requests, targets, settings), page, overwrite, json)
 
 
 def _adapted(
@@ -90,11 +94,26 @@ def _adapted(
         yield wrapped.adapt(scale, viewer=viewer, resume=state_path(target), **settings), target
 
 
+def _save_all(base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: AdaptationPage | None, overwrite: bool, json: bool) -> None:
+    """Save each model as soon as it is adapted, then write the page; print a summary of each, or all reports as JSON."""
+    reports = []
+    for adapted, target in models:
+        reports.append(_saved(adapted, target, overwrite, quiet=json))
+        if page:
+            page.add(base, adapted)
+    if page:
+        page.write(reports)
+    if json:
+        print_facts(reports, json)
+    elif page:
+        say(look_at(page.path))
+
+
 def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> dict[str, Any]:
     """Save an adapted model, print a summary unless `quiet`, and return its report."""
     saved = adapted.save(target, overwrite=overwrite)
     if not quiet:
-        _print(saved, adapted)
+        _say(saved, adapted)
     return {"file": str(saved), **adapted.report.model_dump()}
 
 
@@ -104,26 +123,48 @@ def _requests(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float
     return [(scale, name) for scale in unique_scales(scales) for name in names]
 
 
-def _made_for(model: SplatModel) -> str:
-    """What a file is made for if no viewer was requested."""
+def _made_for(report: Report, model: SplatModel) -> str:
+    """What a file is made for, and how to have one made for something else."""
     from mipmap_plugin.models.base import why_no_viewer
 
-    classic, advice = "made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio)", "; for others give --viewer spark, supersplat, ..."
+    if report.viewer:
+        return f"made for {report.viewer}"
     if why_no_viewer(model):
         return "made for its own project"
-    return f"made for its own project, whose filter it keeps{advice}" if model.trained.keeps_filter else f"{classic}{advice}"
+    advice = "; for others give --viewer spark, supersplat, ..."
+    if model.trained.keeps_filter:
+        return f"made for its own project, whose filter it keeps{advice}"
+    return f"made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio){advice}"
 
 
-def _print(saved: Path, adapted: Adapted) -> None:
+def _say(saved: Path, adapted: Adapted) -> None:
+    """Two lines, what and where; the rest goes to the log."""
     report = adapted.report
-    print(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {saved}")
-    db = ", ".join(f"{name} {psnr:.2f}" for name, psnr in report.validation.items())
-    print(f"  holds {report.returned}{f' (dB on views that nothing was adapted to: {db})' if db else ''}")
+    splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
+    say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {_gain(report)}, {splats}")
+    say(f"{saved}, {_made_for(report, adapted.model)}")
+    for line in _details(report):
+        detail(f"  {line}")
+
+
+def _gain(report: Report) -> str:
+    """The PSNR before and after, as far as it was measured."""
+    from mipmap_plugin.adaptation.report import AS_IT_IS
+
+    before, after = report.psnr_before(), report.psnr_after()
+    if before is None or after is None:
+        return f"holds {report.returned}"
+    if report.returned.startswith(AS_IT_IS):
+        return f"holds {report.returned}, for nothing was better ({before:.2f} dB on views that nothing was adapted to)"
+    return f"{before:.2f} -> {after:.2f} dB on views that nothing was adapted to"
+
+
+def _details(report: Report) -> Iterator[str]:
+    psnrs = ", ".join(f"{name} {psnr:.2f}" for name, psnr in report.validation.items())
+    yield f"holds {report.returned}{f' (dB on views that nothing was adapted to: {psnrs})' if psnrs else ''}; ended by {report.ended_by}"
     if report.viewers:
-        print(f"  in each viewer: {', '.join(f'{name} {psnr:.1f}' for name, psnr in report.viewers.items())} dB")
-    if report.viewer is None:
-        print(f"  {_made_for(adapted.model)}")
-    print(f"  {report.seconds['total']:.1f} s, {report.gaussians_before:,} -> {report.gaussians_after:,} splats, ended by {report.ended_by}")
+        yield f"in each viewer: {', '.join(f'{name} {psnr:.1f}' for name, psnr in report.viewers.items())} dB"
     if report.peak_memory_mib is not None:
-        print(f"  at most {report.peak_memory_mib:,.0f} MiB on the GPU")
-    print(f"  {report.views}; {report.filters}; backend {report.backend}")
+        yield f"at most {report.peak_memory_mib:,.0f} MiB on the GPU"
+    yield f"{report.views}; {report.filters}; backend {report.backend}"
+    yield f"seconds: {', '.join(f'{phase} {seconds:.2f}' for phase, seconds in report.seconds.items())}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 
 
@@ -22,10 +23,10 @@ def backends(check: str | None = None, full: bool = False, json: bool = False) -
         raise SettingsError("--full needs a backend to check; give --check NAME")
     if check is None:
         rows = tables.listing()
-        print(tables.listing_table(rows)) if not json else print_facts([asdict(row) for row in rows], json)
+        say(tables.listing_table(rows)) if not json else print_facts([asdict(row) for row in rows], json)
         return
     outcomes = tables.check(check, full=full)
-    print(tables.check_table(outcomes)) if not json else print_facts([asdict(row) for row in outcomes], json)
+    say(tables.check_table(outcomes)) if not json else print_facts([asdict(row) for row in outcomes], json)
     failed = [row.case for row in outcomes if not row.passed]
     if failed:
         raise SettingsError(f"backend {check!r} fails {len(failed)} of {len(outcomes)} cases: {', '.join(failed[:5])}")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.types import Background, ScreenFilter
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.formats.atomic import json_text
 from mipmap_plugin.progress import announced
 
@@ -14,6 +17,15 @@ if TYPE_CHECKING:
     from mipmap_plugin.camera import Camera
     from mipmap_plugin.scenes import Scene
     from mipmap_plugin.wrap import Wrapped
+
+
+# The words of this command, which its page shows.
+WORDS: ContextVar[tuple[str, ...]] = ContextVar("WORDS", default=())
+
+
+def this_command() -> str:
+    """The command as a shell takes it."""
+    return shlex.join(["mipmap-plugin", *WORDS.get()])
 
 
 def wrap(
@@ -53,12 +65,12 @@ def summary(cameras: Sequence[Camera]) -> str:
 
 
 def print_facts(facts: Any, as_json: bool) -> None:
-    """Print facts by name, or as JSON."""
+    """Print facts by name, or as JSON, which is printed quiet or not."""
     if as_json:
         print(json_text(facts))
         return
     for name, value in facts.items():
         lines = value if isinstance(value, list) else [value]
         for line in lines:
-            print(f"{name + ':' if name else '':14}{line}")
+            say(f"{name + ':' if name else '':14}{line}")
             name = ""

@@ -7,22 +7,25 @@ from pathlib import Path
 import tyro
 
 from mipmap_plugin.commands.types import Scale
+from mipmap_plugin.commands.voice import say
 
 
 def demo(
     output: Path = Path("mipmap-demo"),
     scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (),
     viewer: str | None = None,
+    report: bool = True,
     overwrite: bool = False,
 ) -> None:
-    """Adapt the embedded scene at x1/4 and x4, write before/after pictures and print a table.
+    """Adapt the embedded scene at x1/4 and x4, write before/after pictures and a page, and print a table.
 
     Args:
         scale: Scales, instead of 1/4 and 4; may be given several times.
         viewer: The viewer that the files are made for: spark, playcanvas (or supersplat), ...
         output: The folder for the pictures.
+        report: Also write report.html, a page that shows the zooms, the viewers and the curves.
         overwrite: Replace files that exist there.
     """
     from mipmap_plugin.demo.run import run_demo
 
-    print(run_demo(output, scale or (0.25, 4.0), viewer, overwrite=overwrite))
+    say(run_demo(output, scale or (0.25, 4.0), viewer, report=report, overwrite=overwrite))

@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from mipmap_plugin.commands.common import print_facts, without_none, wrap
+from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
 
 if TYPE_CHECKING:
     from mipmap_plugin.evaluation.perceptual import Perceptual
     from mipmap_plugin.scenes import Scene
+    from mipmap_plugin.wrap import Wrapped
 
 
 def evaluate(
@@ -37,6 +40,7 @@ def evaluate(
     threads: int | None = None,
     seed: int = 0,
     output: Path | None = None,
+    report: bool = True,
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
@@ -61,35 +65,68 @@ def evaluate(
         threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of everything random.
         output: Also write the rows, and notes on missing ones, as JSON to this file.
-        overwrite: Replace that file if it exists.
+        report: Write a page that shows it all: beside `output`, or else NAME.evaluation.html in this folder, numbered if there is one already.
+        overwrite: Replace files that exist.
         json: Print JSON instead of a table.
     """
-    from mipmap_plugin.evaluation import evaluate as evaluation
-
-    _refuse(checkpoint, images, output, overwrite)
-    perceptual, settings = _perceptual(lpips, lpips_weights), without_none(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
-    rows, notes = list[Any](), dict[str, None]()  # notes each once, in their order
+    page = evaluation_page_path(checkpoint[0], output) if report else None
+    _refuse(checkpoint, images, [path for path in (output, page) if path], overwrite)
+    settings = without_none(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
+    results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page)
     for path, folder in zip(checkpoint, images, strict=True):
         wrapped, scene = wrap(path, None, background, backend, screen_filter, threads), _scene(folder, appearance)
-        rows += evaluation.evaluate(wrapped, scene, unique_scales(scale), recipe, protocol, perceptual, **settings)
-        notes |= dict.fromkeys(evaluation.notes(wrapped, scale, appearance))
-    rows += evaluation.means(rows) if len(checkpoint) > 1 else []
-    facts, title = _facts(rows, [*notes]), _title(checkpoint, images, protocol)
-    if output:
-        write_json(output, facts, overwrite)
-    print_facts(facts, json) if json else _print_tables(title, rows, [*notes], published, unique_scales(scale))
+        results.measure(wrapped, scene, appearance, recipe, settings)
+    facts = results.write(checkpoint, output, overwrite)
+    print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol), published)
+
+
+class _Results:
+    """What was measured of all checkpoints."""
+
+    def __init__(self, protocol: str, perceptual: Perceptual | None, scales: list[float], page: Path | None) -> None:
+        self._protocol, self._perceptual, self._scales, self._page = protocol, perceptual, scales, page
+        self._rows, self._notes, self._galleries = list[Any](), dict[str, None](), list[Any]()  # notes each once, in their order
+
+    def measure(self, wrapped: Wrapped, scene: Scene, appearance: str, recipes: Sequence[str], settings: dict[str, Any]) -> None:
+        """Add the rows and notes of one checkpoint."""
+        from mipmap_plugin.evaluation import evaluate as evaluation
+
+        gallery = evaluation_gallery(wrapped, self._protocol) if self._page else None
+        judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, gallery)
+        self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
+        self._notes |= dict.fromkeys(evaluation.notes(wrapped, self._scales, appearance))
+        self._galleries.append(gallery)
+
+    def write(self, checkpoints: Sequence[Path], output: Path | None, overwrite: bool) -> dict[str, Any]:
+        """Add the means over several checkpoints, write the page and the JSON as far as requested, and return what the JSON holds."""
+        from mipmap_plugin.evaluation.evaluate import means
+        from mipmap_plugin.evaluation.report import records
+
+        self._rows += means(self._rows) if len(checkpoints) > 1 else []
+        facts = {"rows": records(self._rows), "notes": [*self._notes], "report": self._page and str(self._page)}
+        if self._page:
+            write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
+        if output:
+            write_json(output, facts, overwrite)
+        return facts
+
+    def print_tables(self, title: str, dataset: Any) -> None:
+        """Print the rows, the published ones of a data set if one is given, the notes, and where the page is."""
+        from mipmap_plugin.evaluation.published import TITLE, published
+        from mipmap_plugin.evaluation.report import published_table, table
+
+        say("\n".join([title, table(self._rows), *self._notes]))
+        if dataset:
+            say(f"\npublished, {TITLE[dataset]}; rows of different protocols are not comparable")
+            say(published_table(published(dataset, self._scales)))
+        if self._page:
+            say(look_at(self._page))
 
 
 def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path | None) -> Perceptual | None:
     from mipmap_plugin.evaluation.perceptual import Perceptual
 
     return Perceptual(network, weights) if network else None
-
-
-def _facts(rows: Sequence[Any], notes: Sequence[str]) -> dict[str, Any]:
-    from mipmap_plugin.evaluation.report import records
-
-    return {"rows": records(rows), "notes": list(notes)}
 
 
 def _scene(folder: Path, appearance: str) -> Scene:
@@ -99,8 +136,8 @@ def _scene(folder: Path, appearance: str) -> Scene:
     return scene.numbered_as_upstream() if appearance == "upstream" else scene
 
 
-def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], output: Path | None, overwrite: bool) -> None:
-    if output:
+def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
+    for output in outputs:
         refuse_output(output, overwrite, [part for path in checkpoint for part in _parts(path)], is_file=True)
         refuse_unwritable(output)
     if len(checkpoint) != len(images):
@@ -119,13 +156,3 @@ def _parts(checkpoint: Path) -> list[Path]:
 
 def _listed(paths: Sequence[Path]) -> str:
     return ", ".join(map(str, paths))
-
-
-def _print_tables(title: str, rows: Sequence[Any], notes: Sequence[str], dataset: Any, scales: list[float]) -> None:
-    from mipmap_plugin.evaluation.published import TITLE, published
-    from mipmap_plugin.evaluation.report import published_table, table
-
-    print("\n".join([title, table(rows), *notes]))
-    if dataset:
-        print(f"\npublished, {TITLE[dataset]}; rows of different protocols are not comparable")
-        print(published_table(published(dataset, scales)))

@@ -11,6 +11,7 @@ import tyro
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 from mipmap_plugin.screen_filters import Name
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 def render(
     checkpoint: Checkpoint,
     output: Path,
-    scale: Scale = 1.0,
+    scale: Scale | None = None,
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     screen_filter: Literal["trained", "scaled"] | Name = "trained",
     viewer: str | None = None,
@@ -43,7 +44,7 @@ def render(
     Args:
         checkpoint: A PLY or a model folder.
         output: The folder for the pictures.
-        scale: Zoom, relative to the cameras.
+        scale: Zoom, relative to the cameras; by default the scale that the file was adapted to, or else 1.
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
         screen_filter: trained: the filter of the checkpoint's training; scaled: the training-free filter for this scale.
         viewer: Render as this viewer does: classic, spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown name lists all viewers.
@@ -58,10 +59,10 @@ def render(
         overwrite: Replace pictures that exist.
     """
     wrapped = wrap(checkpoint, cameras, background, backend)
-    views = _named(wrapped, view)
+    zoom, views = _zoom(wrapped, scale), _named(wrapped, view)
     filter_name = None if screen_filter == "trained" else screen_filter
     if viewer is not None:
-        wrapped.effects(scale, filter_name, supersampling, viewer)  # check the options before any work
+        wrapped.effects(zoom, filter_name, supersampling, viewer)  # check the options before any work
     outputs = [name for name, requested in {"depth": depth, "normals": normals}.items() if requested]
     pictures = [output / name for name in picture_names(views)]
     _refuse(wrapped, pictures, outputs, overwrite)
@@ -70,8 +71,15 @@ def render(
             wrapped.model.traits.exposures.of(camera)  # raises before anything is written
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
     for camera, picture in zip(views, pictures, strict=True):
-        _write(picture, wrapped.render(camera.zoomed(scale), scale, filter_name, supersampling, **options), outputs, overwrite)
-    print(f"{len(views)} pictures in {output}")
+        _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
+    say(f"{len(views)} pictures in {output}{f', at x{zoom:g}, which the file was adapted to' if scale is None and zoom != 1 else ''}")
+
+
+def _zoom(wrapped: Wrapped, scale: float | None) -> float:
+    """The scale asked for, or else the one that the file was adapted to, or else 1."""
+    from mipmap_plugin.models.adapted_scale import adapted_scale
+
+    return scale or adapted_scale(wrapped.model.source) or 1.0
 
 
 def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], overwrite: bool) -> None:

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts, wrap
+from mipmap_plugin.commands.common import print_facts, scene, wrap
+from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.recipes import recipe as make_config
+
+if TYPE_CHECKING:
+    from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
+    from mipmap_plugin.evaluation.tradeoff.points import Plan
+    from mipmap_plugin.wrap import Wrapped
 
 
 def tradeoff(
@@ -30,13 +39,13 @@ def tradeoff(
     threads: int | None = None,
     seed: int = 0,
     picture: bool = True,
+    report: bool = False,
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
     """Measure accuracy against time: dB against seconds to adapt, and against milliseconds per frame.
 
-    Writes tradeoff.json, tradeoff.csv and tradeoff.png. Models are evaluated only on views that they were not adapted to, and the time of the
-    evaluation is not counted.
+    Writes tradeoff.json, tradeoff.csv and tradeoff.png. Models are evaluated on views that they were not adapted to, outside the time counted.
 
     Args:
         checkpoint: A PLY or a model folder.
@@ -56,19 +65,37 @@ def tradeoff(
         threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of the first repeat.
         picture: Draw tradeoff.png, which needs the extra `plot`.
+        report: Also write report.html, a page whose fronts tell each point under the pointer.
         overwrite: Replace results that exist.
         json: Print JSON instead of tables.
     """
-    from mipmap_plugin.evaluation.tradeoff.files import Folder, facts, refuse, table
+    from mipmap_plugin.evaluation.tradeoff.files import Folder, refuse
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.evaluation.tradeoff.run import run
-    from mipmap_plugin.scenes import load_scene
 
     refuse(output, picture, overwrite)
+    page = tradeoff_page_path(output, overwrite) if report else None
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
-    model, scene = wrap(checkpoint, None, background, "auto", screen_filter, threads), None if images is None else load_scene(images)
-    model.target(viewer)
-    for name, factor in product(plan.recipes, scale):
+    model, photographs = wrap(checkpoint, None, background, "auto", screen_filter, threads), scene(images) if images else None
+    _check(model, plan, scale)
+    tradeoffs = run(model, photographs, unique_scales(scale), plan, views, Folder(output, picture, overwrite))
+    write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite)
+    _print(tradeoffs, page, json)
+
+
+def _check(model: Wrapped, plan: Plan, scales: Sequence[float]) -> None:
+    """Raise the errors of a viewer and of recipes before any work."""
+    model.target(plan.viewer)
+    for name, factor in product(plan.recipes, scales):
         make_config(name, factor)
-    tradeoffs = run(model, scene, unique_scales(scale), plan, views, Folder(output, picture, overwrite))
-    print_facts(facts(tradeoffs, complete=True), json) if json else print("\n\n".join(table(tradeoff) for tradeoff in tradeoffs))
+
+
+def _print(tradeoffs: Sequence[Tradeoff], page: Path | None, json: bool) -> None:
+    from mipmap_plugin.evaluation.tradeoff.files import facts, table
+
+    if json:
+        print_facts(facts(tradeoffs, complete=True), json)
+        return
+    say("\n\n".join(table(tradeoff) for tradeoff in tradeoffs))
+    if page:
+        say(look_at(page))

@@ -20,6 +20,9 @@ from mipmap_plugin.evaluation.protocols import Protocol
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 from mipmap_plugin.formats.images import write_image
+from mipmap_plugin.pages.gallery import Gallery
+from mipmap_plugin.pages.html import write_page
+from mipmap_plugin.pages.reports import evaluation_page
 from mipmap_plugin.progress import announced
 from mipmap_plugin.scenes import read_cameras
 from mipmap_plugin.threads import side_by_side
@@ -29,6 +32,9 @@ PROTOCOL = Protocol("demo", "box", truncate=False)
 
 # Number of views to evaluate on, and the fraction of each side that is evaluated at zoom-in, since the truth has to be ray-traced.
 JUDGED, MIDDLE = 3, 1 / 2
+
+# What the images are compared with, and the page that shows them.
+TRUTH, PAGE = "the ray-traced world", "report.html"
 
 # Samples per pixel of the truth: more where pixels are larger and fewer.
 SAMPLES = {True: 64, False: 4}  # zoomed out, zoomed in
@@ -60,16 +66,16 @@ def embedded() -> Wrapped:
     return wrap_model(home / "base.ply", cameras=read_cameras(home / "cameras.json", {"eval": True}), background=(1.0, 1.0, 1.0))
 
 
-def run_demo(output: Path, scales: Sequence[float], viewer: str | None = None, *, overwrite: bool = False) -> str:
-    """Adapt to each scale, write checkpoints and pictures into `output`, and return the table. Raises OutputExists."""
+def run_demo(output: Path, scales: Sequence[float], viewer: str | None = None, *, report: bool = False, overwrite: bool = False) -> str:
+    """Adapt to each scale, write checkpoints, pictures and (`report`) a page into `output`, and return the table. Raises OutputExists."""
     base = embedded()
     base.target(viewer)
+    for name in (*(f"x{scale:g}.ply" for scale in scales), *([PAGE] if report else ())):
+        refuse_output(output / name, overwrite, is_file=True)
+        refuse_unwritable(output / name)
+    rows, gallery = list[Row](), Gallery(base, TRUTH) if report else None
     for scale in scales:
-        refuse_output(output / f"x{scale:g}.ply", overwrite, is_file=True)
-        refuse_unwritable(output / f"x{scale:g}.ply")
-    rows: list[Row] = []
-    for scale in scales:
-        judge = Evaluator(judged_views(base, scale), PROTOCOL)
+        judge = Evaluator(judged_views(base, scale), PROTOCOL, watcher=gallery)
         rows += training_free_rows(base, judge, scale, without=("window",), viewer=viewer)  # most of a minute a view on the reference
         adapted = base.adapt(scale, viewer=viewer, resize="box", **settings_for(base))
         rows.append(adapted_row("adapted", adapted, judge))
@@ -78,10 +84,20 @@ def run_demo(output: Path, scales: Sequence[float], viewer: str | None = None, *
         camera = view.camera.zoomed(scale)
         pictures = [base.render(camera, viewer=viewer).image, adapted.render(camera).image, view.truth(scale, PROTOCOL)]
         write_image(output / f"x{scale:g}_base_adapted_truth.png", beside_each_other(pictures), overwrite=overwrite)
+    page = f"\npage: {_page(output, gallery, rows, viewer, overwrite)}" if gallery else ""
     return (
         f"{table(rows)}\n\nReal dB, against the ray-traced world, over {JUDGED} views that nothing was trained or adapted on.\n"
-        f"Pictures (base | adapted | truth) and checkpoints for {viewer or 'what draws as 3DGS does'}: {output.resolve()}"
+        f"Pictures (base | adapted | truth) and checkpoints for {viewer or 'what draws as 3DGS does'}: {output.resolve()}{page}"
     )
+
+
+def _page(output: Path, gallery: Gallery, rows: Sequence[Row], viewer: str | None, overwrite: bool) -> Path:
+    """Write the page of a demo; return its path."""
+    scales = dict.fromkeys(row.scale for row in rows)
+    options = [*(f"--scale {scale:g}" for scale in scales), *([f"--viewer {viewer}"] if viewer else [])]
+    commands = [f"mipmap-plugin {' '.join([command, *options])}" for command in ("demo", "adapt YOUR_CHECKPOINT")]
+    page = evaluation_page("The embedded scene, at other zooms", [gallery], rows, commands=commands)
+    return write_page(output.resolve() / PAGE, page, overwrite)
 
 
 def judged_views(base: Wrapped, scale: float) -> list[WorldView]:

@@ -17,7 +17,8 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.measure import FILTERS, RenderView, adapt_alone, base_in_viewer, baselines, views_seen, warm_stopwatch, warm_up
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
-from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView, TruthView, not_exposed, test_views
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_exposed, test_views
+from mipmap_plugin.evaluation.shots import Shot, Watcher
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
@@ -52,6 +53,7 @@ class Evaluator:
     protocol: Protocol
     perceptual: Perceptual | None = None
     scene: str = ""
+    watcher: Watcher | None = None  # is shown the first view of each row
 
     def row(self, name: str, scale: float, show: RenderView, **facts: Any) -> Row:
         """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
@@ -64,6 +66,8 @@ class Evaluator:
             psnrs.append(psnr(image, truth))
             similarities.append(ssim(image, truth))
             distances.append(self.perceptual(image, truth) if self.perceptual else None)
+            if self.watcher and view is self.views[0]:
+                self.watcher.shot(Shot(name, self.scene, scale, view.camera, image, truth, psnrs[0], similarities[0], distances[0]))
         label = self.perceptual.label if self.perceptual else ""
         quality = dict(psnr_db=fmean(psnrs), ssim=_mean(similarities), lpips=_mean(distances), lpips_label=label)
         facts = {"adapt_seconds": 0.0, "ms_per_view": 1000 * watch.seconds / len(self.views), **facts}
@@ -120,9 +124,20 @@ def adapted_row(name: str, adapted: Adapted, judge: Evaluator) -> Row:
 
     def row(viewer: str) -> Row:
         title = f"{name} in {viewer}" if len(adapted.viewers) > 1 else name
+        if judge.watcher:
+            judge.watcher.adapted(title, adapted)
         return judge.row(title, report.scale, lambda camera: adapted.render(camera.zoomed(report.scale), viewer=viewer).image, **facts)
 
     return worst([row(viewer) for viewer in adapted.viewers])[0]
+
+
+def evaluator_of(model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, watcher: Watcher | None = None) -> Evaluator:
+    """What compares a model with the photographs of its scene. Raises SettingsError."""
+    scene = model.place(scene)
+    if not model.cameras:
+        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
+    views = test_views(scene, model.cameras[0], model.background)
+    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, watcher)
 
 
 def evaluate(
@@ -134,17 +149,17 @@ def evaluate(
     perceptual: Perceptual | None = None,
     **settings: Any,
 ) -> list[Row]:
+    """Return all rows, as `all_rows` does, of a model beside the photographs of its scene. Raises SettingsError."""
+    return all_rows(model, evaluator_of(model, scene, protocol, perceptual), scales, recipes, **settings)
+
+
+def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes: Sequence[str], **settings: Any) -> list[Row]:
     """Return all rows: for each scale the training-free ones, then each recipe twice. Raises SettingsError.
 
     First adapted to the checkpoint's training poses (and around them, if the recipe says so). This row shows what a user gets, who looks at other
     views. It is called "held out" only if none of the evaluated poses was adapted to; otherwise it says how many were. Then "scored": adapted
     to the evaluated views themselves, as the paper does. `settings` are those of `Wrapped.adapt`; a `viewer` adds a row of the base in it.
     """
-    scene = model.place(scene)
-    if not model.cameras:
-        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
-    judged = test_views(scene, model.cameras[0], model.background)
-    judge = Evaluator(judged, PROTOCOLS[protocol], perceptual, scene.source.name)
     viewer, rows = settings.get("viewer"), []
     model.targets(viewer)  # raise errors of the viewer and the recipes before any work
     for name, scale in product(recipes, scales):
@@ -154,20 +169,20 @@ def evaluate(
         if recipes and (scale != 1 or viewer):
             warm_up(model, scale, model.cameras)
         for name, on in product(recipes if scale != 1 or viewer else [], ("train", "scored")):
-            adapted = adapt_alone(model, scale, recipe=name, **(settings | _views(make_config(name, scale), on, judged)))
-            rows.append(adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judged, adapted)}", adapted, judge))
+            adapted = adapt_alone(model, scale, recipe=name, **(settings | _views(make_config(name, scale), on, judge.views)))
+            rows.append(adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge))
     return rows
 
 
-def _views(config: AdaptConfig, on: str, judged: Sequence[TestView]) -> dict[str, Any]:
+def _views(config: AdaptConfig, on: str, judged: Sequence[TruthView]) -> dict[str, Any]:
     if on == "scored":  # as the paper does: the last step, without validation
         return {"views": "given", "cameras": [view.camera for view in judged], "returns": "last"}
     return {} if config.steps and config.views != "given" else {"views": "train"}  # without steps, further views have no effect
 
 
-def _unseen(judged: Sequence[TestView], adapted: Adapted) -> str:
+def _unseen(judged: Sequence[TruthView], adapted: Adapted) -> str:
     """The part of a row's name that says whether the model was adapted to any of the evaluated views."""
-    seen = len(views_seen([view.camera for view in judged], adapted.views))
+    seen = len(views_seen([view.camera for view in judged], adapted.adapted_to))
     return f"{seen} of {len(judged)} judged views adapted to" if seen else "held out"
 
 

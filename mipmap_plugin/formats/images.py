@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -109,6 +111,20 @@ def write_image(path: str | Path, image: Tensor, *, overwrite: bool = False) -> 
     with new_file(path, overwrite) as temporary:
         Image.fromarray(_bytes(image)).save(temporary, format="PNG")
     return path
+
+
+def png(image: Tensor) -> bytes:
+    """The PNG file of an image [H, W, 3], clamped to 0..1 and rounded to 8 bits."""
+    file = io.BytesIO()
+    Image.fromarray(_bytes(image)).save(file, format="PNG", optimize=True)
+    return file.getvalue()
+
+
+def data_uri(image: Tensor, side: int) -> str:
+    """The middle of an image [h, w, 3], at most `side` x `side` px, as the address of a PNG."""
+    height, width = image.shape[:2]
+    top, left = max(0, (height - side) // 2), max(0, (width - side) // 2)
+    return "data:image/png;base64," + base64.b64encode(png(image[top : top + side, left : left + side])).decode("ascii")
 
 
 def write_array(path: str | Path, values: Tensor, *, overwrite: bool = False) -> Path:

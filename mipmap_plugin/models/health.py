@@ -69,6 +69,10 @@ class Health:
             remarks.append("the opacities look like 0..1, not like logits; if the image is too transparent, export the file again with logits")
         return remarks
 
+    def spoilt(self) -> bool:
+        """Whether some splats spoil images, or stored values look like those of another convention."""
+        return bool(self.invalid.any()) or self.scales_look_linear or self.opacities_look_activated
+
     def non_finite(self) -> list[str]:
         """The sentences on NaN and infinity."""
         counts = [("a NaN", name, n) for name, n in self.nan.items()] + [("an infinity", name, n) for name, n in self.infinite.items()]

@@ -53,12 +53,19 @@ class BrowserError(RuntimeError):
     """A viewer that did not draw, and why, in a sentence."""
 
 
-def missing() -> str:
-    """What the browser tests lack here, in a sentence; empty where nothing is missing."""
+def missing_browser() -> str:
+    """What driving a browser lacks here, in a sentence; empty where nothing is missing."""
     if shutil.which("chromium") is None:
         return "there is no chromium here; `apt-get install chromium` brings it"
     if find_spec("playwright") is None:
         return "Python's playwright is not installed; `pip install playwright` brings it"
+    return ""
+
+
+def missing() -> str:
+    """What the tests of viewers lack here, in a sentence; empty where nothing is missing."""
+    if lacking := missing_browser():
+        return lacking
     if not (HERE / "node_modules" / "playcanvas").is_dir():
         return "the viewers are not installed; `npm ci` in tests/browser brings them"
     return ""

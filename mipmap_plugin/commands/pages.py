@@ -1,0 +1,95 @@
+"""The report pages that the commands write: where they go, and what is on them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mipmap_plugin.commands.common import this_command
+from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+
+if TYPE_CHECKING:
+    from mipmap_plugin.adaptation.adapted import Adapted
+    from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
+    from mipmap_plugin.pages.gallery import Gallery
+    from mipmap_plugin.wrap import Wrapped
+
+
+def look_at(page: Path) -> str:
+    """The line that says where a page is."""
+    return f"page: {page}"
+
+
+def evaluation_page_path(checkpoint: Path, output: Path | None) -> Path:
+    """The page beside `output`, or else in this folder under a name that is free."""
+    if output:
+        return output.with_suffix(".html")
+    name = checkpoint.resolve().name
+    free = (Path(f"{name}.evaluation{f'-{number}' if number > 1 else ''}.html") for number in count(1))
+    return next(path for path in free if not os.path.lexists(path))
+
+
+def evaluation_gallery(base: Wrapped, protocol: str) -> Gallery:
+    """What keeps the pictures of an evaluation by photographs."""
+    from mipmap_plugin.pages.gallery import Gallery
+
+    return Gallery(base, f"photographs, protocol {protocol}")
+
+
+def write_evaluation_page(
+    page: Path, checkpoints: Sequence[Path], galleries: Sequence[Gallery], rows: Sequence[Any], notes: Sequence[str], overwrite: bool
+) -> None:
+    """Write the page of an evaluation."""
+    from mipmap_plugin.pages.html import write_page
+    from mipmap_plugin.pages.reports import evaluation_page
+
+    title = ", ".join(each.resolve().name for each in checkpoints)
+    write_page(page, evaluation_page(title, galleries, rows, commands=(this_command(),), notes=notes), overwrite)
+
+
+class AdaptationPage:
+    """The page of `adapt`: beside the one file, or in the folder of several."""
+
+    def __init__(self, checkpoint: Path, targets: Sequence[Path], overwrite: bool) -> None:
+        """Raises now the errors that writing the page would raise: OutputExists and OutputError."""
+        name = checkpoint.resolve().name
+        folder = targets[0].resolve().parent
+        self.path = folder / f"{targets[0].resolve().name if len(targets) == 1 else f'{name}_adapted'}.report.html"
+        self._title, self._overwrite, self._zooms = name, overwrite, list[Any]()
+        refuse_output(self.path, overwrite, is_file=True)
+        refuse_unwritable(self.path)
+
+    def add(self, base: Wrapped, adapted: Adapted) -> None:
+        """Draw the pictures of an adapted file."""
+        from mipmap_plugin.pages.reports import adaptation_zoom
+
+        self._zooms.append(adaptation_zoom(base, adapted))
+
+    def write(self, reports: Sequence[dict[str, Any]]) -> None:
+        """Write the page, with a report for each file."""
+        from mipmap_plugin.pages.html import write_page
+        from mipmap_plugin.pages.reports import adaptation_page
+
+        titled = [{"title": zoom.label, **report} for zoom, report in zip(self._zooms, reports, strict=True)]
+        write_page(self.path, adaptation_page(self._title, self._zooms, titled, (this_command(),)), self._overwrite)
+
+
+def tradeoff_page_path(folder: Path, overwrite: bool) -> Path:
+    """The page in the folder of a tradeoff. Raises OutputExists."""
+    refuse_output(folder / "report.html", overwrite, is_file=True)
+    return folder / "report.html"
+
+
+def write_tradeoff_page(page: Path | None, checkpoint: Path, base: Wrapped, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
+    """Write the page of a tradeoff, unless `page` is None."""
+    if page is None:
+        return
+    from mipmap_plugin.evaluation.tradeoff.files import facts
+    from mipmap_plugin.pages.html import write_page
+    from mipmap_plugin.pages.reports import tradeoff_page
+
+    title = f"{checkpoint.resolve().name}: accuracy and time"
+    write_page(page, tradeoff_page(title, base, facts(tradeoffs, complete=True), (this_command(),)), overwrite)

@@ -1,0 +1,99 @@
+"""What a command says: on the terminal unless it is to be quiet, and in a log with every detail."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, TextIO, cast
+
+from mipmap_plugin.errors import OutputError, SettingsError
+
+
+@dataclass(frozen=True)
+class Voice:
+    """Where words go."""
+
+    quiet: bool = False
+    log: TextIO | None = None
+
+    def write(self, text: str) -> None:
+        """Write lines to the log, each with the time of day; nothing without a log."""
+        if self.log is None:
+            return
+        now = datetime.now().isoformat(sep=" ", timespec="seconds")
+        self.log.writelines(f"{now} {line}\n" for line in text.splitlines())
+        self.log.flush()  # a killed run leaves all that it said
+
+
+VOICE: ContextVar[Voice] = ContextVar("VOICE", default=Voice())  # noqa: B039  a voice never changes
+
+
+def say(text: str) -> None:
+    """Print `text` unless the command is quiet; also write it to the log."""
+    voice = VOICE.get()
+    voice.write(text)
+    if not voice.quiet:
+        print(text)
+
+
+def detail(text: str) -> None:
+    """Write what few people read to the log alone."""
+    VOICE.get().write(text)
+
+
+def complain(text: str) -> None:
+    """Print what went wrong on standard error, quiet or not; also write it to the log."""
+    VOICE.get().write(text.strip())
+    print(text, file=sys.stderr)
+
+
+def options(words: Sequence[str]) -> tuple[list[str], bool, Path | None]:
+    """The words of a command without --quiet and --log FILE, which go with every command, and both. Raises SettingsError."""
+    rest, quiet, log = list[str](), False, None
+    remaining = iter(words)
+    for word in remaining:
+        if word == "--quiet":
+            quiet = True
+        elif word == "--log" or word.startswith("--log="):
+            name = word.removeprefix("--log=") if "=" in word else next(remaining, "")
+            if not name or name.startswith("--"):
+                raise SettingsError("--log needs a file; give --log FILE")
+            log = Path(name)
+        else:
+            rest.append(word)
+    return rest, quiet, log
+
+
+@contextlib.contextmanager
+def speaking(quiet: bool, log: Path | None) -> Iterator[None]:
+    """Speak like this inside the block. A log is appended to, line by line. Raises OutputError."""
+    with contextlib.ExitStack() as stack:
+        try:
+            file = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise OutputError(f"{log} cannot be written ({error}); give --log another file") from error
+        if quiet:
+            stack.enter_context(contextlib.redirect_stderr(cast(TextIO, _NoTerminal(sys.stderr))))
+        token = VOICE.set(Voice(quiet, file))
+        try:
+            yield
+        finally:
+            VOICE.reset(token)
+
+
+class _NoTerminal:
+    """A stream that is no terminal, so that no progress is shown on it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def isatty(self) -> bool:
+        return False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)

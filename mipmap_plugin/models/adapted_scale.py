@@ -1,0 +1,23 @@
+"""The scale that a checkpoint was adapted to, by what this package wrote into its header or beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mipmap_plugin.formats.json_file import read_json
+from mipmap_plugin.formats.magic import kind_of
+from mipmap_plugin.formats.ply import read_header
+from mipmap_plugin.formats.tags import provenance_of
+from mipmap_plugin.models.outputs import REPORT
+
+
+def adapted_scale(source: Path | None) -> float | None:
+    """The scale that the file `source` was adapted to; None if it is a base. Raises CheckpointError for a damaged report beside it."""
+    if source is None:
+        return None
+    report = source.with_name(source.name + REPORT)
+    record = (provenance_of(read_header(source).comments) or {}) if kind_of(source) == "ply" else {}
+    if "scale" not in record and report.is_file():
+        record = read_json(report)
+    scale = record.get("scale") if isinstance(record, dict) else None
+    return float(scale) if isinstance(scale, (int, float)) else None

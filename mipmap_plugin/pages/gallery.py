@@ -1,0 +1,93 @@
+"""Collects the pictures of a page while models are evaluated (`evaluation.shots.Watcher`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.effects import explain
+from mipmap_plugin.evaluation.evaluate import Row
+from mipmap_plugin.evaluation.measure import BASE
+from mipmap_plugin.evaluation.shots import Shot
+from mipmap_plugin.models.base import effects_of
+from mipmap_plugin.pages.in_viewers import viewer_pictures, why_not
+from mipmap_plugin.pages.record import Picture, Quality, Role, ViewerPictures, Zoom, zoom_name
+from mipmap_plugin.wrap import Wrapped
+
+# How rows of the base in a viewer begin (`measure.base_in_viewer`).
+IN_VIEWER = f"{BASE} in "
+
+
+class Gallery:
+    """The first view of each row of one scene, by scale, and what viewers show of the first adapted file of each scale."""
+
+    def __init__(self, base: Wrapped, truth: str) -> None:
+        """`truth`: what the images are compared with, in a few words."""
+        self._base, self._truth = base, truth
+        self._shots: dict[float, list[Shot]] = {}
+        self._adapted: dict[str, float] = {}
+        self._viewers: dict[float, list[ViewerPictures]] = {}
+        self._last: Adapted | None = None
+        self.adaptations: list[dict[str, Any]] = []
+
+    def shot(self, shot: Shot) -> None:
+        """Keep a row's first view."""
+        self._shots.setdefault(shot.scale, []).append(shot)
+
+    def adapted(self, row: str, adapted: Adapted) -> None:
+        """Keep an adaptation's report, and draw the first of each scale as viewers do."""
+        scale = adapted.report.scale
+        self._adapted[row] = scale
+        if adapted is self._last:  # the same file in another viewer
+            return
+        self._last = adapted
+        self.adaptations.append({"title": f"{zoom_name(scale)}, {row}", **adapted.report.model_dump()})
+        if scale not in self._viewers and scale in self._shots and not why_not(self._base):
+            seen = self._shots[scale][0]
+            self._viewers[scale] = viewer_pictures(self._base, adapted, seen.camera.zoomed(scale), seen.truth)
+
+    def effects(self) -> list[dict[str, Any]]:
+        """The effects of the base."""
+        return effects_of_base(self._base)
+
+    def zooms(self, rows: Sequence[Row], *, named: bool = False) -> list[Zoom]:
+        """The pictures of each scale, with the means that `rows` have, from the farthest out to the nearest; `named` after their scene."""
+        return [self._zoom(scale, self._shots[scale], rows, named) for scale in sorted(self._shots)]
+
+    def _zoom(self, scale: float, shots: Sequence[Shot], rows: Sequence[Row], named: bool) -> Zoom:
+        means = {row.name: _quality(row) for row in rows if row.scale == scale and row.scene == shots[0].scene}
+        in_viewer = any(shot.row.startswith(IN_VIEWER) for shot in shots)
+        pictures = [Picture(shot.row, self._role(shot, in_viewer), shot.image, _quality(shot), means.get(shot.row, {})) for shot in shots]
+        pictures.append(Picture("truth", "truth", shots[0].truth, note=self._truth))
+        label = f"{shots[0].scene} {zoom_name(scale)}" if named else zoom_name(scale)
+        reason = why_not(self._base) if any(each == scale for each in self._adapted.values()) else "Nothing was adapted: give --recipe default."
+        return Zoom(
+            label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", self._viewers.get(scale, ()),
+            "" if scale in self._viewers else reason,
+        )  # fmt: skip
+
+    def _role(self, shot: Shot, in_viewer: bool) -> Role:
+        """`in_viewer`: the file was made for a viewer, and is compared with the base in that viewer."""
+        if shot.row in self._adapted:  # what was adapted to the very views that judge it is a figure for the literature
+            return "other" if shot.row.endswith("scored") else "adapted"
+        if shot.row.startswith(IN_VIEWER) if in_viewer else shot.row == BASE:
+            return "base"
+        return "supersampled" if shot.row.startswith("supersampling") else "other"
+
+
+def _quality(of: Row | Shot) -> Quality:
+    return {"psnr_db": of.psnr_db, "ssim": of.ssim, "lpips": of.lpips}
+
+
+def effects_of_base(base: Wrapped) -> list[dict[str, Any]]:
+    """What drawing the base simulates, and what it does not, with reasons."""
+    gaussians = base.model.gaussians(base.any_camera())
+    return [asdict(effect) for effect in explain(base.effects(), gaussians, effects_of(base.model))]
+
+
+def in_order(pictures: Sequence[Picture]) -> list[Picture]:
+    """Base, adapted, supersampled and truth first, then the rest."""
+    order: tuple[Role, ...] = ("base", "adapted", "supersampled", "truth", "other")
+    return sorted(pictures, key=lambda picture: order.index(picture.role))

@@ -1,0 +1,201 @@
+"""The report page in a real browser: what the pointer, a finger and the keyboard do, narrow and dark screens, and the figures that it shows."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny
+from browser import missing_browser
+
+from mipmap_plugin.cli import main
+from mipmap_plugin.demo.run import run_demo
+
+pytestmark = pytest.mark.browser
+
+WIDE, PHONE = {"width": 1200, "height": 900}, {"width": 360, "height": 740}
+
+Open = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    if lacking := missing_browser():
+        pytest.skip(lacking)
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The JSON of an evaluation at two zooms; its page lies beside it."""
+    here = tmp_path_factory.mktemp("evaluation")
+    base = tiny.folder(here / "base", tiny.cameras(3) + tiny.cameras(1, seed=9, split="test"))
+    words = ["--images", tiny.scene(here / "scene"), "--scale", "1/2", "--scale", "1", "--recipe", "instant", "--output", here / "rows.json"]
+    assert main([str(word) for word in ("evaluate", base, *words)]) == 0
+    return here / "rows.json"
+
+
+@pytest.fixture(scope="module")
+def tradeoff(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The JSON of a tradeoff; its page lies beside it."""
+    here = tmp_path_factory.mktemp("tradeoff")
+    words = ["tradeoff", tiny.folder(here / "base"), "--scale", "1/2", "--output", here / "out", "--recipe", "default", "--steps", "5"]
+    assert main([str(word) for word in (*words, "--repeats", "1", "--no-renderers", "--no-picture", "--views", "1", "--report")]) == 0
+    return here / "out" / "tradeoff.json"
+
+
+@pytest.fixture
+def open_page(chromium: Any) -> Iterator[Open]:
+    """Opens a page; fails at the end if it had an error or asked for anything but itself."""
+    complaints, contexts = [], []
+
+    def opened(path: Path, **settings: Any) -> Any:
+        context = chromium.new_context(**{"viewport": WIDE, **settings})
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda message: complaints.append(message.text) if message.type in ("error", "warning") else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda asked: complaints.append(asked.url) if not asked.url.startswith(("file:", "data:")) else None)
+        page.goto(path.as_uri())
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert complaints == []
+
+
+def divider(page: Any) -> int:
+    return int(page.get_attribute("#stage", "aria-valuenow"))
+
+
+def test_the_figures_are_those_of_the_json(open_page: Open, evaluation: Path) -> None:
+    page, rows = open_page(evaluation.with_suffix(".html")), json.loads(evaluation.read_text())["rows"]
+    shown = page.eval_on_selector_all("#rows tbody tr", "rows => rows.map(row => [...row.cells].map(cell => cell.textContent))")
+    zooms = {0.5: "×1/2", 1.0: "×1"}
+    assert [line[:4] for line in shown] == [[zooms[row["scale"]], row["name"], f"{row['psnr_db']:.2f}", f"{row['ssim']:.4f}"] for row in rows]
+    cards = page.eval_on_selector_all(".card", "cards => cards.map(card => [...card.querySelectorAll('.name, .mean')].map(part => part.textContent))")
+    means = {row["name"]: f"{row['psnr_db']:.2f} dB" for row in rows if row["scale"] == 0.5}
+    assert {name: mean for name, mean, *_ in (card for card in cards if card[0] != "truth")} == means
+
+
+def test_the_slider_changes_the_zoom(open_page: Open, evaluation: Path) -> None:
+    page = open_page(evaluation.with_suffix(".html"))
+    before = page.get_attribute(".canvas img", "src")
+    page.focus("#zoom")
+    page.keyboard.press("ArrowRight")
+    assert page.text_content(".zoom output").endswith("×1") and page.get_attribute(".canvas img", "src") != before
+    assert page.text_content("#view").startswith("View view_0 · 32 × 24 px")
+    page.keyboard.press("ArrowLeft")
+    assert page.text_content(".zoom output").endswith("×1/2") and page.get_attribute(".canvas img", "src") == before
+
+
+def test_the_divider_follows_the_pointer(open_page: Open, evaluation: Path) -> None:
+    page = open_page(evaluation.with_suffix(".html"))
+    box = page.locator(".canvas").bounding_box()
+    for part in (0.25, 0.9):
+        page.mouse.move(box["x"] + part * box["width"], box["y"] + box["height"] / 2)
+        assert divider(page) == pytest.approx(100 * part, abs=1)
+        assert f"{part * 100:.0f}" in page.evaluate("document.querySelector('.after').style.clipPath")
+
+
+def test_the_divider_follows_a_finger(open_page: Open, evaluation: Path) -> None:
+    page = open_page(evaluation.with_suffix(".html"), viewport=PHONE, has_touch=True, is_mobile=True)
+    box = page.locator(".canvas").bounding_box()
+    page.touchscreen.tap(box["x"] + 0.8 * box["width"], box["y"] + box["height"] / 2)
+    assert divider(page) == pytest.approx(80, abs=1)
+
+
+def test_the_divider_is_moved_by_keys(open_page: Open, evaluation: Path) -> None:
+    page = open_page(evaluation.with_suffix(".html"))
+    page.focus("#stage")
+    found = []
+    for key in ("ArrowRight", "ArrowLeft", "Shift+ArrowLeft", "Home", "ArrowLeft", "End", " "):
+        page.keyboard.press(key)
+        found.append(divider(page))
+    assert found == [52, 50, 40, 0, 0, 100, 0]
+    assert page.evaluate("scrollY") == 0
+
+
+def test_everything_is_reached_by_the_tab_key(open_page: Open, evaluation: Path) -> None:
+    page, seen = open_page(evaluation.with_suffix(".html")), []
+    for _ in range(8):
+        page.keyboard.press("Tab")
+        seen.append(page.evaluate("document.activeElement.id || document.activeElement.className"))
+    assert seen[:6] == ["skip", "zoom", "before", "after", "pixel", "stage"] and seen[6].startswith("card")
+
+
+def test_a_card_is_shown_on_the_right(open_page: Open, evaluation: Path) -> None:
+    page = open_page(evaluation.with_suffix(".html"))
+    page.click(".card.truth")
+    assert page.text_content(".names .right").startswith("truth")
+    assert page.get_attribute(".card.truth", "aria-pressed") == "true"
+    assert page.get_attribute(".canvas .after", "src") == page.get_attribute(".card.truth img", "src")
+
+
+def test_pixels_stay_whole(open_page: Open, evaluation: Path) -> None:
+    page = open_page(evaluation.with_suffix(".html"))
+    assert page.eval_on_selector_all("img", "images => [...new Set(images.map(each => getComputedStyle(each).imageRendering))]") == ["pixelated"]
+    page.select_option("#pixel", "8")
+    box = page.locator(".canvas").bounding_box()
+    assert (box["width"], box["height"]) == (16 * 8, 12 * 8)
+
+
+@pytest.mark.parametrize("viewport", [PHONE, WIDE], ids=["phone", "wide"])
+def test_nothing_is_wider_than_the_screen(open_page: Open, evaluation: Path, tradeoff: Path, viewport: dict[str, int]) -> None:
+    for path in (evaluation.with_suffix(".html"), tradeoff.with_name("report.html")):
+        page = open_page(path, viewport=viewport)
+        assert page.evaluate("document.documentElement.scrollWidth") <= viewport["width"]
+
+
+def test_light_and_dark(open_page: Open, evaluation: Path) -> None:
+    script = "['background-color', 'color'].map(name => getComputedStyle(document.body).getPropertyValue(name).match(/\\d+/g).map(Number)[0])"
+    light, dark = (open_page(evaluation.with_suffix(".html"), color_scheme=scheme).evaluate(script) for scheme in ("light", "dark"))
+    assert light[0] > 200 > 100 > light[1] and dark[0] < 60 < 200 < dark[1]
+
+
+def test_viewers_show_the_base_and_the_file(open_page: Open, evaluation: Path) -> None:
+    page = open_page(evaluation.with_suffix(".html"))
+    titles = page.eval_on_selector_all(".viewer figcaption", "all => all.map(each => each.textContent)")
+    assert any("Spark" in title for title in titles) and any("SuperSplat" in title for title in titles) and any("gsplat" in title for title in titles)
+    record = json.loads(page.text_content("#record"))["zooms"][0]["viewers"]
+    figures = page.eval_on_selector_all(".viewer strong", "all => all.map(each => each.textContent)")
+    assert figures == [f"{each[role]['view']['psnr_db']:.2f} dB" for each in record for role in ("base", "adapted")]
+
+
+def test_a_point_of_the_front_tells_its_figures(open_page: Open, tradeoff: Path) -> None:
+    page, points = open_page(tradeoff.with_name("report.html")), json.loads(tradeoff.read_text())["scales"][0]["points"]
+    [best] = [point for point in points if point["name"] == "default, 5 steps at most" and point["step"] is None]
+    assert page.locator(".chart .front").count() >= 1
+    mark = page.locator(f".chart .mark[aria-label^='{best['name']}, {best['backend']}']").first
+    for reach in (mark.hover, mark.focus):
+        page.locator(".chart .mark").first.focus()
+        reach()
+        assert page.text_content(".readout >> nth=0").startswith(f"{best['name']}, {best['backend']}: {best['psnr_db']['median']:.2f} dB")
+
+
+def test_the_curve_has_a_mark_for_every_check_and_the_start(open_page: Open, tmp_path: Path) -> None:
+    base = tiny.folder(tmp_path / "base")
+    assert main(["adapt", str(base), "--scale", "1/2", "--steps", "20", "--output", str(tmp_path / "a.ply"), "--report"]) == 0
+    report = json.loads((tmp_path / "a.ply.adaptation.json").read_text())
+    page = open_page(tmp_path / "a.ply.report.html")
+    assert page.locator("#curve .mark").count() == len(report["curve"])
+    page.locator("#curve .mark.start").focus()
+    assert "closed form" in page.text_content("#curve .readout")
+    assert f"{report['curve'][0]['validation_db']:.2f} dB" in page.text_content("#curve .readout")
+
+
+@pytest.mark.slow
+def test_the_page_of_the_demo_works(open_page: Open, tmp_path: Path) -> None:
+    run_demo(tmp_path, (0.125, 0.25), report=True)
+    page = open_page(tmp_path / "report.html")
+    assert page.locator(".card").count() >= 6 and (tmp_path / "report.html").stat().st_size < 10_000_000

@@ -1,0 +1,218 @@
+"""Report pages: one file, small, closed to the network, with the figures of the command's JSON."""
+
+import base64
+import io
+import json
+import re
+
+import pytest
+import tiny
+import torch
+from PIL import Image
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import OutputExists
+from mipmap_plugin.evaluation.shots import Shot
+from mipmap_plugin.formats.images import data_uri
+from mipmap_plugin.pages.gallery import Gallery
+from mipmap_plugin.pages.html import LARGEST, html, write_levels, write_page
+from mipmap_plugin.pages.in_viewers import made_for_viewers, viewer_pictures, why_not
+from mipmap_plugin.pages.record import Page, Picture, Zoom, zoom_name
+from mipmap_plugin.pages.reports import adaptation_zoom
+
+TITLES = {"base": "base", "adapted": "adapted", "supersampled": "supersampling, 4 x 4", "truth": "truth"}
+BRIEF = ["--backend", "reference", "--views", "given", "--steps", "2"]
+
+
+def pictures(size: int = 8) -> list[Picture]:
+    noise = torch.rand(size, size, 3, generator=torch.Generator().manual_seed(0))
+    return [Picture(title, role, noise, {"psnr_db": 20.0}, {"psnr_db": 21.0}) for role, title in TITLES.items()]
+
+
+def record_of(page) -> dict:
+    """The JSON within a page."""
+    return json.loads(re.search(r'<script type="application/json" id="record">(.*?)</script>', page.read_text(), re.DOTALL)[1])
+
+
+def pixels(uri: str) -> Image.Image:
+    head, data = uri.split(",")
+    assert head == "data:image/png;base64"
+    return Image.open(io.BytesIO(base64.b64decode(data)))
+
+
+@pytest.fixture
+def model_folder(tmp_path):
+    return tiny.folder(tmp_path / "base", tiny.cameras(3) + tiny.cameras(1, seed=9, split="test"))
+
+
+def test_a_page_asks_the_network_for_nothing(tmp_path):
+    text = write_levels(tmp_path / "page.html", "levels", [Zoom("×1/4", 0.25, pictures())], False).read_text()
+    assert "default-src 'none'" in text
+    assert all(link.startswith(("data:", "#")) for link in re.findall(r"(?:src|href)=\"([^\"]*)\"", text))
+    assert not re.findall(r"url\(|@import|fetch\(|XMLHttpRequest|import\(", text)
+    assert [address for address in re.findall(r"https?://[^\s\"']+", text) if address != "http://www.w3.org/2000/svg"] == []
+
+
+def test_no_name_becomes_markup(tmp_path):
+    name = "</script><script>alert(1)</script><!--"
+    path = write_page(tmp_path / "page.html", Page(name, name, [name]), False)
+    assert record_of(path)["title"] == name
+    assert path.read_text().count("<script>alert") == 0
+
+
+def test_a_page_of_many_large_pictures_stays_below_ten_megabytes(tmp_path):
+    zooms = [Zoom(f"×{number}", number, pictures(700)) for number in range(1, 4)]
+    path = write_levels(tmp_path / "page.html", "large", zooms, False)
+    assert path.stat().st_size <= LARGEST + 4096
+    [zoom, *_] = record_of(path)["zooms"]
+    assert zoom["size"] == [700, 700] and zoom["shown"][0] < 700
+    assert list(pixels(zoom["pictures"][0]["src"]).size) == zoom["shown"]
+
+
+def test_a_picture_shows_the_middle_of_an_image_pixel_by_pixel():
+    image = torch.zeros(5, 7, 3)
+    image[2, 3] = 1
+    shown = pixels(data_uri(image, 3))
+    assert shown.size == (3, 3) and shown.getpixel((1, 1)) == (255, 255, 255) and shown.getpixel((0, 0)) == (0, 0, 0)
+
+
+def test_infinite_figures_are_none_in_the_record():
+    picture = Picture("a", "base", torch.zeros(1, 1, 3), {"psnr_db": float("inf")})
+    assert '"psnr_db": null' in html(Page("a", "", (), [Zoom("×1", 1, [picture])]).facts(4))
+
+
+@pytest.mark.parametrize(("scale", "name"), [(0.25, "×1/4"), (1 / 3, "×1/3"), (4.0, "×4"), (0.3, "×0.3"), (1.0, "×1"), (1.5, "×1.5")])
+def test_scales_are_written_as_people_write_them(scale, name):
+    assert zoom_name(scale) == name
+
+
+def test_a_page_is_not_overwritten(tmp_path):
+    (tmp_path / "page.html").write_text("mine")
+    with pytest.raises(OutputExists, match="--overwrite"):
+        write_page(tmp_path / "page.html", Page("a", "", ()), False)
+    assert (tmp_path / "page.html").read_text() == "mine"
+
+
+def test_the_page_of_evaluate_has_the_figures_of_its_json(model_folder, tmp_path, capsys):
+    words = ["evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1/2", "--recipe", "instant", "--backend", "reference"]
+    assert main([str(word) for word in (*words, "--output", tmp_path / "rows.json")]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"page: {tmp_path / 'rows.html'}"
+    written, record = json.loads((tmp_path / "rows.json").read_text()), record_of(tmp_path / "rows.html")
+    assert record["rows"] == written["rows"] and written["report"] == str(tmp_path / "rows.html")
+    [zoom] = record["zooms"]
+    assert zoom["label"] == "×1/2"
+    assert [picture["role"] for picture in zoom["pictures"]][:4] == ["base", "adapted", "supersampled", "truth"]
+    means = {row["name"]: {name: row[name] for name in ("psnr_db", "ssim", "lpips")} for row in written["rows"]}
+    assert {picture["name"]: picture["mean"] for picture in zoom["pictures"] if picture["role"] != "truth"} == means
+    assert [report["scale"] for report in record["adaptations"]] == [0.5, 0.5]
+    assert record["commands"][0].startswith("mipmap-plugin evaluate ") and "--recipe instant" in record["commands"][0]
+    assert zoom["no_viewers"] == "Not drawn: only the reference backend could, which takes too long here."
+
+
+def test_a_file_for_a_viewer_is_compared_with_the_base_in_that_viewer(model_folder):
+    pytest.importorskip("numba")
+    base = wrap_model(model_folder, backend="cpu")
+    camera, gallery = base.cameras[0], Gallery(base, "itself")
+    truth = base.render(camera).image
+    for row in ("base", "base in spark", "base, resized", "supersampling, 2 x 2", "instant, held out", "instant, scored"):
+        if row.startswith("instant"):
+            gallery.adapted(row, base.adapt(1 / 2, recipe="instant", viewer="spark"))
+        gallery.shot(Shot(row, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+    [zoom] = gallery.zooms([], named=True)
+    assert zoom.label == "ball ×1/2"
+    roles = {picture.name: picture.role for picture in zoom.pictures}
+    assert roles == {
+        "base in spark": "base", "instant, held out": "adapted", "supersampling, 2 x 2": "supersampled", "truth": "truth",
+        "base": "other", "base, resized": "other", "instant, scored": "other",
+    }  # fmt: skip
+    assert next(iter(roles)) == "base in spark" and [each.name for each in zoom.viewers if each.made_for] == ["spark"]
+
+
+def test_evaluate_without_an_output_takes_a_free_name_in_this_folder(model_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["evaluate", "base", "--images", str(tiny.scene(tmp_path / "scene")), "--scale", "1", "--backend", "reference"]
+    assert [main([*words]), main([*words]), main([*words, "--no-report"])] == [0, 0, 0]
+    assert sorted(path.name for path in tmp_path.glob("*.html")) == ["base.evaluation-2.html", "base.evaluation.html"]
+    assert capsys.readouterr().out.count("page: base.evaluation") == 2
+
+
+def test_the_page_of_adapt_has_the_figures_of_its_report(model_folder, tmp_path, capsys):
+    words = ["adapt", str(model_folder), "--scale", "1/2", "--scale", "2", "--output", str(tmp_path / "out"), "--report", *BRIEF]
+    assert main(words) == 0
+    page = tmp_path / "out" / "base_adapted.report.html"
+    assert capsys.readouterr().out.splitlines()[-1] == f"page: {page}"
+    record = record_of(page)
+    assert [zoom["label"] for zoom in record["zooms"]] == ["×1/2", "×2"]
+    for zoom, report in zip(record["zooms"], record["adaptations"], strict=True):
+        saved = json.loads((tmp_path / "out" / f"base_x{zoom['scale']:g}/point_cloud/iteration_30000/point_cloud.ply.adaptation.json").read_text())
+        assert {name: report[name] for name in saved} == saved
+        base, adapted = zoom["pictures"][:2]
+        assert base["mean"] == {"psnr_db": saved["validation"]["the base as it is"]}
+        assert adapted["mean"]["psnr_db"] in saved["validation"].values() and adapted["view"]["psnr_db"] > 0
+    assert main(words) == 2
+    assert main([*words, "--overwrite"]) == 0
+
+
+def test_adapt_writes_no_page_unless_asked(model_folder, tmp_path):
+    assert main(["adapt", str(model_folder), "--scale", "1/2", "--output", str(tmp_path / "out.ply"), *BRIEF]) == 0
+    assert not list(tmp_path.rglob("*.html"))
+
+
+def test_the_page_of_a_tradeoff_has_the_points_of_its_json(model_folder, tmp_path, capsys):
+    folder = tmp_path / "results"
+    words = [
+        "tradeoff",
+        model_folder,
+        "--scale",
+        "1/2",
+        "--output",
+        folder,
+        "--recipe",
+        "instant",
+        "--repeats",
+        "1",
+        "--no-renderers",
+        "--no-picture",
+    ]
+    assert main([str(word) for word in (*words, "--backend", "reference", "--views", "1", "--no-picture", "--report")]) == 0
+    record, written = record_of(folder / "report.html"), json.loads((folder / "tradeoff.json").read_text())
+    assert record["tradeoffs"] == written["scales"] and record["provenance"] == written["machine"]
+    assert capsys.readouterr().out.splitlines()[-1] == f"page: {folder / 'report.html'}"
+    assert main([str(word) for word in (*words, "--no-picture", "--report")]) == 2
+
+
+def test_viewers_show_the_base_and_the_file_beside_the_truth(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setattr("mipmap_plugin.pages.in_viewers.VIEWERS", ("classic", "spark"))
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="cpu")
+    adapted = base.adapt(1 / 2, recipe="instant", viewer="spark")
+    camera = base.cameras[0].zoomed(1 / 2)
+    truth = base.render(camera, supersampling=2).image
+    shown = viewer_pictures(base, adapted, camera, truth)
+    assert why_not(base) == "" and made_for_viewers(adapted) == ["spark"]
+    assert [each.name for each in shown] == ["spark", "classic"]
+    assert [each.made_for for each in shown] == [True, False]
+    assert torch.equal(shown[0].base.image, base.render(camera, viewer="spark").image)
+    assert torch.equal(shown[0].adapted.image, adapted.render(camera).image)
+    assert shown[0].adapted.view["psnr_db"] > shown[0].base.view["psnr_db"]
+
+
+def test_a_large_image_is_drawn_in_viewers_as_the_window_around_its_middle(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setattr("mipmap_plugin.pages.in_viewers.PIXELS", 64)
+    monkeypatch.setattr("mipmap_plugin.pages.in_viewers.VIEWERS", ("spark", "classic"))
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="cpu")
+    camera = base.cameras[0]
+    shown = viewer_pictures(base, base.adapt(1 / 2, recipe="instant"), camera, base.render(camera).image)
+    classic = next(each for each in shown if each.name == "classic")
+    assert classic.base.image.shape == (8, 8, 3) and classic.base.view["psnr_db"] > 50
+    assert classic.made_for and shown[0] is classic
+
+
+def test_zooming_in_is_compared_with_the_base_after_shrinking(model_folder):
+    base = wrap_model(model_folder, backend="reference")
+    zoom = adaptation_zoom(base, base.adapt(2, recipe="instant"))
+    assert [picture.role for picture in zoom.pictures] == ["base", "adapted", "other"]
+    assert zoom.truth.startswith("the base, with which the image is compared after shrinking")
+    assert zoom.view == "view_0" and all(picture.view["psnr_db"] > 10 for picture in zoom.pictures)

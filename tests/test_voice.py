@@ -1,0 +1,69 @@
+"""What commands say: quiet or not, and in a log."""
+
+import re
+import sys
+
+import pytest
+import tiny
+
+from mipmap_plugin import progress
+from mipmap_plugin.cli import main
+from mipmap_plugin.commands.voice import options, speaking
+from mipmap_plugin.errors import SettingsError
+
+QUICK = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference"]
+
+
+@pytest.fixture
+def base(tmp_path):
+    return str(tiny.folder(tmp_path / "base", tiny.cameras(3)))
+
+
+def test_a_quiet_command_prints_nothing(base, capsys):
+    assert main(["adapt", base, "--quiet", *QUICK]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_quiet_command_prints_json(base, capsys):
+    assert main(["--quiet", "inspect", base, "--json"]) == 0
+    assert capsys.readouterr().out.startswith("{")
+
+
+def test_a_quiet_command_prints_what_is_wrong(base, capsys):
+    assert main(["adapt", base, "--quiet", "--scale", "1/2", "--viewer", "nobody"]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and "there is no 'nobody'" in said.err
+
+
+def test_a_quiet_command_shows_no_progress(monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(progress, "_show", lambda *_: pytest.fail("progress was shown"))
+    with speaking(True, None), progress.announced("work"):
+        assert not sys.stderr.isatty()
+
+
+def test_a_log_has_the_command_what_was_said_the_details_and_what_went_wrong(base, tmp_path, capsys):
+    log = tmp_path / "log.txt"
+    assert main(["adapt", base, *QUICK, "--quiet", f"--log={log}"]) == 0
+    assert main(["adapt", base, *QUICK, "--log", str(log)]) == 2  # the file exists already
+    text = log.read_text()
+    assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d mipmap-plugin adapt ", text)
+    for part in ("x0.5: ", "made for renderers that draw as 3DGS does", "seconds: ", "; backend reference", "exists already; pass --overwrite"):
+        assert part in text
+    assert text.count("mipmap-plugin adapt ") == 2
+
+
+def test_a_log_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
+    assert main(["backends", "--log", str(tmp_path / "nowhere" / "log")]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and "cannot be written" in said.err and "give --log another file" in said.err
+
+
+@pytest.mark.parametrize("words", [["backends", "--log"], ["backends", "--log", "--json"], ["backends", "--log="]])
+def test_a_log_needs_a_file(words):
+    with pytest.raises(SettingsError, match="--log needs a file"):
+        options(words)
+
+
+def test_the_two_options_are_taken_from_anywhere():
+    assert options(["--log", "a", "adapt", "x", "--quiet", "--seed", "1"])[0] == ["adapt", "x", "--seed", "1"]
