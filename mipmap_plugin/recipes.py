@@ -24,6 +24,9 @@ MERGE_TO = 0.8
 # The scale up to which a zoom-out uses its full learning rates. Above it there is less to learn, and rates fall as 1 / scale.
 FULL_RATES_SCALE = 0.25
 
+# A band ends at the base's scale, up to rounding.
+HIGHEST = 1 + 1e-6
+
 # The published code of Mipmap-GS (renaissanceee/Mipmap-GS), with a named setting for each of its quirks. Its means never move, because its
 # loader leaves the factor of their learning rate at 0.
 PAPER = dict(
@@ -97,9 +100,12 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     except Exception as error:  # third-party code may fail in any way
         raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
     try:
-        return AdaptConfig(**{"recipe": name, **settings, **overrides})
+        config = AdaptConfig(**{"recipe": name, **settings, **overrides})
     except ValidationError as error:
         raise SettingsError("; ".join(f"setting {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())) from None
+    if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
+        raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
+    return config
 
 
 def _zoom_out_settings(scale: float) -> dict[str, Any]:

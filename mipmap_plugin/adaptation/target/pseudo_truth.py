@@ -68,13 +68,13 @@ class PseudoTruth:
             photograph = self._photographs(view) if self._photographs else None
             target = self._render(view, 1.0) if photograph is None else photograph
         else:
-            target = resize(self._render(view, self._resolution()), size, self._config.resize)
+            target = resize(self._render(view, self._resolution(view)), size, self._config.resize)
         return target.clamp(0, 1).mul(255).round().div(255) if self._config.quantize_truth else target
 
-    def _resolution(self) -> float:
+    def _resolution(self, view: Camera) -> float:
         """The fraction of the base scale at which the base is rendered: more than `truth_oversampling` samples a pixel gain nothing."""
         oversampling = self._config.truth_oversampling
-        return 1.0 if oversampling is None else min(1.0, oversampling * self._scale)
+        return 1.0 if oversampling is None else min(1.0, oversampling * self._scale * view.zoom)
 
     def _render(self, view: Camera, fraction: float) -> Tensor:
         """Render the base at a fraction of its own scale; its dilation keeps its size in the world.
@@ -82,7 +82,8 @@ class PseudoTruth:
         The image is clamped before any resizing, as a display does: unclamped highlights would bleed into their neighbors (-3 dB at x1/8).
         """
         # Resized, not zoomed: the model sees the `zoom` of its training, so that it shows the same splats, only with fewer pixels.
-        camera = view if fraction == 1 else view.resized(max(1, round(view.width * fraction)), max(1, round(view.height * fraction)))
+        factor = fraction / view.zoom  # a view of a band (`over_band`) samples `zoom` times as finely as the base
+        camera = view if factor == 1 else replace(view.resized(max(1, round(view.width * factor)), max(1, round(view.height * factor))), zoom=1.0)
         effects = replace(self._effects, eps2d=self._effects.eps2d * fraction**2)
         return self._backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
 
