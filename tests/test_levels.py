@@ -35,7 +35,7 @@ def wrapped(count=12):
 
 
 def request(viewer="antialiased", **options):
-    return LadderRequest.of(viewer, **{"coarsest": 1 / 4, **BRIEF, **options})
+    return LadderRequest.of(viewer, **{"coarsest": 1 / 4, "ratio": 2.0, **BRIEF, **options})
 
 
 # Bands of views
@@ -135,9 +135,10 @@ def test_a_base_that_the_viewer_draws_as_its_training_did_stays_as_it_is():
 
 def test_the_ratio_suits_the_viewer():
     effects = Effects(sh_degree=1)
-    assert request().first_ratio(replace(effects, screen_filter="mip")) == WIDE
-    assert request().first_ratio(replace(effects, screen_filter="classic", eps2d=0.075)) == WIDE
-    assert request().first_ratio(replace(effects, screen_filter="classic", eps2d=0.3)) == NARROW
+    usual = LadderRequest("spark")
+    assert usual.first_ratio(replace(effects, screen_filter="mip")) == WIDE
+    assert usual.first_ratio(replace(effects, screen_filter="classic", eps2d=0.075)) == WIDE
+    assert usual.first_ratio(replace(effects, screen_filter="classic", eps2d=0.3)) == NARROW
     assert request(ratio=1.5).first_ratio(effects) == 1.5
 
 
@@ -180,9 +181,9 @@ def test_zooms_include_both_ends():
 
 def test_levels_of_a_bound_are_made_again_for_narrower_bands():
     """No level of so few steps is this good, so that every band ends up at the finest ratio."""
-    ladder = make_levels(wrapped(), request(coarsest=0.6, least_db=99.0))
+    ladder = make_levels(wrapped(), request(coarsest=0.6, ratio=2.0, least_db=99.0))
     assert [level.band.scale for level in ladder.levels] == pytest.approx([1, (2 * FINEST_RATIO) ** -0.5])
-    assert [level.band.scale for level in make_levels(wrapped(), request(coarsest=0.6)).levels] == pytest.approx([1, 0.6])
+    assert [level.band.scale for level in make_levels(wrapped(), request(coarsest=0.6, ratio=2.0)).levels] == pytest.approx([1, 0.6])
 
 
 def test_a_ladder_ends_with_few_enough_splats():
@@ -192,7 +193,7 @@ def test_a_ladder_ends_with_few_enough_splats():
 
 def test_a_saved_ladder_says_what_it_is(tmp_path):
     base = wrapped()
-    saved = base.levels("antialiased", coarsest=1 / 2, **BRIEF).save(tmp_path / "ladder")
+    saved = base.levels("antialiased", coarsest=1 / 2, ratio=2.0, **BRIEF).save(tmp_path / "ladder")
     manifest = json.loads((saved / MANIFEST).read_text())
     levels = manifest["levels"]
     assert [level["scale"] for level in levels] == pytest.approx([1, 1 / 2])
@@ -255,8 +256,8 @@ def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
 
 def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
-    options = ["--viewer", "antialiased", "--coarsest", "1/2", "--recipe", "instant", "--views", "given", "--backend", "reference", "--json"]
-    words = ["levels", str(base), "--output", str(tmp_path / "ladder"), *options]
+    options = ["--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given", "--backend", "reference"]
+    words = ["levels", str(base), "--output", str(tmp_path / "ladder"), "--json", *options]
     assert cli.main(words) == 0
     manifest = json.loads(capsys.readouterr().out)
     assert manifest == json.loads((tmp_path / "ladder" / MANIFEST).read_text())

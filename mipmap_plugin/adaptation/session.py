@@ -101,7 +101,8 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        if self.scale == 1 and self.config.band == (1, 1) and all(target == self.base_effects for target in self.targets.values()):
+        few = _rows(self.base) <= (self.config.most_splats or sys.maxsize)
+        if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             reason = "scale 1, at which the base is right as it is"
             return Adapted(self.copy_of_base(), self._report(self.copy_of_base(), [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         began = time.perf_counter()

@@ -10,8 +10,9 @@ import tyro
 
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter, unique_scales
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 def adapt(
     checkpoint: Checkpoint,
-    scale: Scales,
+    scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (),
     output: Path | None = None,
     recipe: str = "default",
     viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
@@ -31,6 +32,8 @@ def adapt(
     steps: int | None = None,
     time_budget_s: float | None = None,
     target_db: float | None = None,
+    splats: int | None = None,
+    bytes: str | None = None,
     resize: ResizeFilter | None = None,
     upsampler: str | None = None,
     images: Path | None = None,
@@ -46,7 +49,7 @@ def adapt(
 
     Args:
         checkpoint: A PLY or a model folder.
-        scale: Target focal length over base focal length, such as 1/4 or 4. Required; may be given several times.
+        scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without splats or bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
         viewer: Viewer to make the file for: classic (the default; INRIA, gsplat, nerfstudio), spark, ...; portable: all; repeat it for a file each.
@@ -55,6 +58,8 @@ def adapt(
         steps: Maximum number of optimizer steps.
         time_budget_s: Maximum number of seconds.
         target_db: Stop at this PSNR against the pseudo truth (not against photographs).
+        splats: Maximum number of splats. Without a scale, the file is made for the zoom that so many splats suit.
+        bytes: Maximum size of the file, such as 20MB, in place of a number of splats.
         resize: Filter that makes base images smaller.
         upsampler: What makes base images larger: a registered name, or the file of a super-resolution network.
         images: Folder of the scene. A zoom-in is then adapted to its training images, at the resolution of the base, instead of the base's own.
@@ -66,8 +71,13 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
+    from mipmap_plugin.levels.fitting import fitting_scale
+
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     settings = without_none(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
+    if splats is not None or bytes is not None:
+        settings["most_splats"] = most = _most_splats(wrapped.model, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False))
+        scale = scale or (fitting_scale(most, wrapped.model),)
     requests = _requests(scale, viewer)
     targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]
     for (factor, name), target in zip(requests, targets, strict=True):
@@ -98,10 +108,20 @@ def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> d
     return {"file": str(saved), **adapted.report.model_dump()}
 
 
-def _requests(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:
+def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:
     """Each scale with each viewer, without repetitions."""
     names: list[str | None] = [*dict.fromkeys(viewers)] or [None]
     return [(scale, name) for scale in unique_scales(scales) for name in names]
+
+
+def _most_splats(model: SplatModel, splats: int | None, size: str | None, output: Path) -> int:
+    """The smaller of a number of splats and of what fits into a size."""
+    from mipmap_plugin.levels.fitting import read_size, splats_within
+
+    if splats is not None and splats < 1:
+        raise SettingsError(f"splats: must be at least 1, got {splats}")
+    within = [] if size is None else [splats_within(model, read_size(size), output.name)]
+    return min([*within, *([] if splats is None else [splats])])
 
 
 def _made_for(model: SplatModel) -> str:

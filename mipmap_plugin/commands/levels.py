@@ -37,7 +37,7 @@ def levels(
         viewer: Viewer to make the levels for: spark, supersplat, classic, ... An unknown name lists all.
         output: Folder for the levels, a report beside each, and levels.json, which says when each is to be shown.
         coarsest: Zoom down to which levels are made; below it the last level is shown.
-        ratio: Of neighboring scales; by default 2 for viewers that compensate or hardly dilate, else 1.41.
+        ratio: Of neighboring scales; by default 1.74 for viewers that compensate or hardly dilate, else 1.41.
         least_db: Make a level again for a narrower band, down to a ratio of 1.19, if it falls below this PSNR at the ends of its band.
         until_splats: End with the first level that has at most this many splats, if that comes before the coarsest scale.
         recipe: default, thorough (more steps and views), instant (no optimization), or a registered one.
