@@ -8,6 +8,8 @@ from typing import Any
 from mipmap_plugin.commands.common import print_facts, without_none, wrap
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter
 from mipmap_plugin.config import ViewPolicy
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.splat_transform import refuse_exchange
 
 
 def levels(
@@ -18,6 +20,9 @@ def levels(
     ratio: float | None = None,
     least_db: float | None = None,
     until_splats: int | None = None,
+    streamed_sog: bool = False,
+    tiles: bool = False,
+    canvas: int = 1080,
     recipe: str = "default",
     views: ViewPolicy | None = None,
     cameras: Path | None = None,
@@ -40,6 +45,9 @@ def levels(
         ratio: Of neighboring scales; by default 1.74 for viewers that compensate or hardly dilate, else 1.41.
         least_db: Make a level again for a narrower band, down to a ratio of 1.19, if it falls below this PSNR at the ends of its band.
         until_splats: End with the first level that has at most this many splats, if that comes before the coarsest scale.
+        streamed_sog: Also write Streamed SOG for PlayCanvas, SuperSplat and Babylon.js, through splat-transform, with the distances to set there.
+        tiles: Also write 3D Tiles for Cesium, through splat-transform.
+        canvas: Shorter side in px of the canvas that the distances of Streamed SOG are computed for.
         recipe: default, thorough (more steps and views), instant (no optimization), or a registered one.
         views: Which views to adapt to; by default those of the recipe.
         cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
@@ -52,22 +60,28 @@ def levels(
         overwrite: Replace a ladder that exists.
         json: Print levels.json.
     """
-    from mipmap_plugin.formats.json_file import read_json
     from mipmap_plugin.levels.ladder import make_levels
-    from mipmap_plugin.levels.manifest import MANIFEST, refuse_ladder
+    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.request import LadderRequest
+    from mipmap_plugin.levels.streamed import write_streamed
+    from mipmap_plugin.levels.tiles import write_tiles
     from mipmap_plugin.wrap import state_path
 
+    if canvas < 1:
+        raise SettingsError(f"canvas: must be at least 1 px, got {canvas}")
+    if streamed_sog or tiles:
+        refuse_exchange(output)
     settings = {"seed": seed, **without_none(views=views, steps=steps)}
     request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, settings)
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     refuse_ladder(output, wrapped, overwrite=overwrite)
     saved = make_levels(wrapped, request, resume=state_path(output)).save(output, overwrite=overwrite)
-    manifest = read_json(saved / MANIFEST)
+    exports = ([write_streamed(saved, canvas)] if streamed_sog else []) + ([write_tiles(saved)] if tiles else [])
     if json:
-        print_facts(manifest, json)
+        print_facts(read_manifest(saved), json)
     else:
-        print_summary(saved, manifest)
+        print_summary(saved, read_manifest(saved))
+        print("".join(f"  {path}\n" for path in exports), end="")
 
 
 def print_summary(folder: Path, manifest: dict[str, Any]) -> None:

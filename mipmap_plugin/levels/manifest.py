@@ -9,6 +9,7 @@ from typing import Any
 
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
 from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, sha256, write_json
+from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.yardstick import TRUTH
 from mipmap_plugin.wrap import Wrapped
@@ -37,6 +38,12 @@ def write_ladder(ladder: Contents, folder: Path, overwrite: bool) -> Path:
         files = [level.adapted.save(temporary / level_name(number)) for number, level in enumerate(ladder.levels)]
         write_json(temporary / MANIFEST, manifest(ladder, files), overwrite=False)
     return folder
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a ladder in a folder. Raises SceneError if it is missing or no JSON."""
+    found: dict[str, Any] = read_json(folder / MANIFEST)
+    return found
 
 
 def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
