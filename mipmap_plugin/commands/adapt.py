@@ -71,23 +71,27 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    from mipmap_plugin.levels.fitting import fitting_scale
-
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    size, fitting = _fitting(wrapped.model, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False))
     settings = without_none(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
-    if splats is not None or bytes is not None:
-        settings["most_splats"] = most = _most_splats(wrapped.model, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False))
-        scale = scale or (fitting_scale(most, wrapped.model),)
-    requests = _requests(scale, viewer)
+    requests = _requests(scale or fitting, viewer)
     targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]
-    for (factor, name), target in zip(requests, targets, strict=True):
-        config = make_config(recipe, factor, seed=seed, **settings)
-        wrapped.targets(name)
-        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
-    settings |= dict(recipe=recipe, seed=seed, images=images and scene(images))
+    _check(wrapped, requests, targets, settings | size | dict(recipe=recipe, seed=seed), overwrite)
+    settings |= size | dict(recipe=recipe, seed=seed, images=images and scene(images))
     reports = [_saved(adapted, target, overwrite, quiet=json) for adapted, target in _adapted(wrapped, requests, targets, settings)]
     if json:
         print_facts(reports, json)
+
+
+def _check(
+    wrapped: Wrapped, requests: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any], overwrite: bool
+) -> None:
+    """Raise now what adapting and saving would raise, as far as it can be predicted."""
+    further = {name: value for name, value in settings.items() if name != "recipe"}
+    for (scale, viewer), target in zip(requests, targets, strict=True):
+        config = make_config(settings["recipe"], scale, **further)
+        wrapped.targets(viewer)
+        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=viewer)
 
 
 def _adapted(
@@ -114,14 +118,17 @@ def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[f
     return [(scale, name) for scale in unique_scales(scales) for name in names]
 
 
-def _most_splats(model: SplatModel, splats: int | None, size: str | None, output: Path) -> int:
-    """The smaller of a number of splats and of what fits into a size."""
-    from mipmap_plugin.levels.fitting import read_size, splats_within
+def _fitting(model: SplatModel, splats: int | None, size: str | None, output: Path) -> tuple[dict[str, int], Sequence[float]]:
+    """The setting for the smaller of a number of splats and of what fits into a size, and the scale that suits it; nothing if neither is given."""
+    if splats is None and size is None:
+        return {}, ()
+    from mipmap_plugin.levels.fitting import fitting_scale, read_size, splats_within
 
     if splats is not None and splats < 1:
         raise SettingsError(f"splats: must be at least 1, got {splats}")
     within = [] if size is None else [splats_within(model, read_size(size), output.name)]
-    return min([*within, *([] if splats is None else [splats])])
+    most = min([*within, *([] if splats is None else [splats])])
+    return {"most_splats": most}, (fitting_scale(most, model),)
 
 
 def _made_for(model: SplatModel) -> str:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts, without_none, wrap
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter
 from mipmap_plugin.config import ViewPolicy
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.splat_transform import refuse_exchange
+
+if TYPE_CHECKING:
+    from mipmap_plugin.levels.request import LadderRequest
+    from mipmap_plugin.wrap import Wrapped
 
 
 def levels(
@@ -60,31 +66,54 @@ def levels(
         overwrite: Replace a ladder that exists.
         json: Print levels.json.
     """
-    from mipmap_plugin.levels.ladder import make_levels
-    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.request import LadderRequest
-    from mipmap_plugin.levels.streamed import write_streamed
-    from mipmap_plugin.levels.tiles import write_tiles
-    from mipmap_plugin.wrap import state_path
 
-    if canvas < 1:
-        raise SettingsError(f"canvas: must be at least 1 px, got {canvas}")
-    if streamed_sog or tiles:
-        refuse_exchange(output)
+    exports = Exports(streamed_sog, tiles, canvas)
+    exports.check(output)
     settings = {"seed": seed, **without_none(views=views, steps=steps)}
     request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, settings)
-    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    manifest, files = _saved(wrap(checkpoint, cameras, background, backend, screen_filter, threads), request, output, exports, overwrite)
+    if json:
+        print_facts(manifest, json)
+    else:
+        print_summary(output, manifest, files)
+
+
+@dataclass(frozen=True)
+class Exports:
+    """What is written besides the levels."""
+
+    streamed_sog: bool
+    tiles: bool
+    canvas: int  # px
+
+    def check(self, output: Path) -> None:
+        """Raise SettingsError for an impossible canvas, or if splat-transform is needed and not installed."""
+        if self.canvas < 1:
+            raise SettingsError(f"canvas: must be at least 1 px, got {self.canvas}")
+        if self.streamed_sog or self.tiles:
+            refuse_exchange(output)
+
+    def write(self, ladder: Path) -> list[Path]:
+        """Write them into the folder of a ladder; return the files that viewers open."""
+        from mipmap_plugin.levels.streamed import write_streamed
+        from mipmap_plugin.levels.tiles import write_tiles
+
+        return ([write_streamed(ladder, self.canvas)] if self.streamed_sog else []) + ([write_tiles(ladder)] if self.tiles else [])
+
+
+def _saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
+    """Make and save a ladder; return its manifest and what was exported."""
+    from mipmap_plugin.levels.ladder import make_levels
+    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
+    from mipmap_plugin.wrap import state_path
+
     refuse_ladder(output, wrapped, overwrite=overwrite)
     saved = make_levels(wrapped, request, resume=state_path(output)).save(output, overwrite=overwrite)
-    exports = ([write_streamed(saved, canvas)] if streamed_sog else []) + ([write_tiles(saved)] if tiles else [])
-    if json:
-        print_facts(read_manifest(saved), json)
-    else:
-        print_summary(saved, read_manifest(saved))
-        print("".join(f"  {path}\n" for path in exports), end="")
+    return read_manifest(saved), exports.write(saved)
 
 
-def print_summary(folder: Path, manifest: dict[str, Any]) -> None:
+def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = ()) -> None:
     """Print what a ladder's manifest says, in lines."""
     print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels")
     for level in manifest["levels"]:
@@ -96,3 +125,4 @@ def print_summary(folder: Path, manifest: dict[str, Any]) -> None:
     base = min(point["base_db"] for point in manifest["curve"])
     print(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
     print(f"  {manifest['measured']}")
+    print("".join(f"  {path}\n" for path in exports), end="")
