@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, cast
 
@@ -16,6 +17,7 @@ from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
+from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import settings_for_several
@@ -149,6 +151,7 @@ class Wrapped:
         resume: str | Path | None = None,
         observe: Observer | None = None,
         images: Scene | None = None,
+        start: FinerLevel | None = None,
         **settings: Any,
     ) -> Adapted:
         """Return a new model for `scale` (target focal length in px over base focal length in px); the base does not change.
@@ -160,12 +163,14 @@ class Wrapped:
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` is called with the model
         before the first step and after each step.
         `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
+        `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
         Raises SettingsError and BackendUnavailable.
         """
         check_scale(scale)
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
-        if not model.traits.same_for_all_views and settings.setdefault("merge_to", 1.0) < 1:
-            raise SettingsError(f"{model.family}: its splats differ by view or time, or have a 3D filter, so none are merged; leave merge_to out")
+        if not model.traits.same_for_all_views and (settings.setdefault("merge_to", 1.0) < 1 or settings.get("most_splats")):
+            reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
+            raise SettingsError(f"{model.family}: {reason}; leave merge_to and most_splats out")
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
@@ -175,20 +180,27 @@ class Wrapped:
         if cameras is None:
             cameras = photographs.cameras if photographs else self.cameras
         needs = [replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
-        needs_gradients = config.steps > 0 or config.merge_to < 1
+        needs_gradients = config.steps > 0 or config.merge_to < 1 or config.most_splats is not None
         backend, note = choose_backend(self._backend, *(replace(need, gradients=needs_gradients) for need in needs), self._needs)
         has_gradients = not any(backend.lacking(need) for need in needs)
         if config.steps:
             largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
+        if start is not None and start.scale <= scale:
+            raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
         in_viewer = self._read_by(viewer)
         base_in_viewer = model if in_viewer is self.model else in_viewer
         if self.images is None or not self.images.are_of(model, backend, self.effects()):
             self.images = BaseImages(model, backend, self.effects())
-        request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer)
+        request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer, start)
         with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
             adapted = Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
         return replace(adapted, cameras=self.views())
+
+    def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Any:
+        """Return a ladder of levels (`levels.ladder.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`."""
+        ladder = import_module("mipmap_plugin.levels.ladder")  # which builds on this class, so that it cannot be imported above
+        return ladder.make_levels(self, ladder.LadderRequest.of(viewer, **options), resume)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
         """Raise now the error that saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be predicted."""

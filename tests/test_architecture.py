@@ -23,6 +23,7 @@ STOREYS = [
     {"recipes"},
     {"adaptation"},
     {"wrap"},
+    {"levels"},
     {"evaluation", "models.conformance"},
     {"pages"},
     {"demo"},

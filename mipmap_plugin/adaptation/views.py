@@ -22,6 +22,10 @@ ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
 
 
+# Views take their places in a band at multiples of the golden ratio, so that any number of consecutive ones is spread evenly.
+GOLDEN = (math.sqrt(5) - 1) / 2
+
+
 class ViewSchedule:
     """The views that each step uses. It has no state, so that a run can be resumed at any step."""
 
@@ -115,6 +119,14 @@ def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: A
         extra = jittered(views, config.extra_views, generator)
         return views + extra, f"{len(views)} train views and {len(extra)} around them"
     return views, f"the {len(views)} {split} views"
+
+
+def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:
+    """The views of the base scale, each at one multiple of it out of the settings' band, evenly spread over the band's logarithm."""
+    low, high = config.band
+    if low == high == 1:
+        return list(views)
+    return [view.zoomed(low * (high / low) ** ((number + 0.5) * GOLDEN % 1)) for number, view in enumerate(views)]
 
 
 def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:

@@ -48,7 +48,8 @@ class BaseImages:
     @torch.no_grad()
     def _render(self, view: Camera, fraction: float) -> Tensor:
         # Resized, not zoomed: the model sees the `zoom` of its training, so that it shows the same splats, only with fewer pixels.
-        camera = view if fraction == 1 else view.resized(max(1, round(view.width * fraction)), max(1, round(view.height * fraction)))
+        factor = fraction / view.zoom  # a view of a band (`over_band`) samples `zoom` times as finely as the base
+        camera = view if factor == 1 else replace(view.resized(max(1, round(view.width * factor)), max(1, round(view.height * factor))), zoom=1.0)
         effects = replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
         return self.backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
 

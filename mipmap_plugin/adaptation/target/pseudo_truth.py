@@ -56,10 +56,10 @@ class PseudoTruth:
             photograph = self._photographs(view) if self._photographs else None
             target = self._base(view) if photograph is None else photograph
         else:
-            target = resize(self._base(view, self._resolution()), size, self._config.resize)
+            target = resize(self._base(view, self._resolution(view)), size, self._config.resize)
         return target.clamp(0, 1).mul(255).round().div(255) if self._config.quantize_truth else target
 
-    def _resolution(self) -> float:
+    def _resolution(self, view: Camera) -> float:
         """The fraction of the base scale at which the base is rendered: more than `truth_oversampling` samples a pixel gain nothing."""
         oversampling = self._config.truth_oversampling
-        return 1.0 if oversampling is None else min(1.0, oversampling * self._scale)
+        return 1.0 if oversampling is None else min(1.0, oversampling * self._scale * view.zoom)
