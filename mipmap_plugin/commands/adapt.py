@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
+from mipmap_plugin.commands.many import Many, Request, adapt_many
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.types import Background, Checkpoints, Scales, ScreenFilter, unique_scales
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
+from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def adapt(
-    checkpoint: Checkpoint,
+    checkpoints: Checkpoints,
     scale: Scales,
     output: Path | None = None,
     recipe: str = "default",
@@ -41,11 +43,12 @@ def adapt(
     seed: int = 0,
     overwrite: bool = False,
     json: bool = False,
+    many: tyro.conf.OmitArgPrefixes[Many] = Many(),  # noqa: B008
 ) -> None:
     """Make a checkpoint that looks right at another scale, in the viewer that it is opened in.
 
     Args:
-        checkpoint: A PLY or a model folder.
+        checkpoints: A PLY or a model folder, or several; patterns such as 'output/*' too.
         scale: Target focal length over base focal length, such as 1/4 or 4. Required; may be given several times.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
@@ -66,18 +69,29 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     settings = without_none(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     requests = _requests(scale, viewer)
+    if many.asked(checkpoints):
+        request = Request(requests, output, recipe, settings | {"seed": seed}, images, overwrite)
+        return adapt_many(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
+    [checkpoint] = checkpoints
+    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]
-    for (factor, name), target in zip(requests, targets, strict=True):
-        config = make_config(recipe, factor, seed=seed, **settings)
-        wrapped.targets(name)
-        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
+    _refuse(wrapped, requests, targets, settings | dict(name=recipe, seed=seed), overwrite)
     settings |= dict(recipe=recipe, seed=seed, images=images and scene(images))
     reports = [_saved(adapted, target, overwrite, quiet=json) for adapted, target in _adapted(wrapped, requests, targets, settings)]
     if json:
         print_facts(reports, json)
+
+
+def _refuse(
+    wrapped: Wrapped, requests: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any], overwrite: bool
+) -> None:
+    """Raise now the errors that adapting or saving would raise, as far as they can be predicted."""
+    for (factor, name), target in zip(requests, targets, strict=True):
+        config = make_config(scale=factor, **settings)
+        wrapped.targets(name)
+        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
 
 
 def _adapted(
