@@ -43,3 +43,7 @@ class OutputError(MipmapPluginError, OSError):
 
 class OutputExists(MipmapPluginError, FileExistsError):
     """An output that exists already and must not be overwritten."""
+
+
+class JobsFailed(MipmapPluginError):
+    """Some of many jobs failed; the others are done."""

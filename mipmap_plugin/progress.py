@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 from tqdm import tqdm
 
+Item = TypeVar("Item")
+
 # Seconds before anything is shown, and between two looks at the clock.
 PATIENCE, PERIOD = 1.0, 0.5
+
+
+def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator[Item]:
+    """Yield the items, and show on a terminal how many of them there were."""
+    yield from tqdm(items, total=total, desc=what, unit=unit, disable=None)
+
+
+def note(line: str) -> None:
+    """Write a line to standard error, above the bars that are shown there."""
+    tqdm.write(line, file=sys.stderr)
 
 
 @contextmanager

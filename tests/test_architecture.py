@@ -26,7 +26,7 @@ STOREYS = [
     {"wrap"},
     {"levels"},
     {"evaluation", "models.conformance"},
-    {"pages"},
+    {"pages", "jobs"},
     {"demo"},
     {"commands"},
     {"cli"},
@@ -35,6 +35,7 @@ STOREYS = [
 # Where each outside library may be imported; torch and the standard library may be anywhere.
 CONFINED = {
     "PIL": ["formats/images.py"],
+    "distributed": ["jobs/farm.py"],
     "gsplat": ["backends/gsplat"],
     "llvmlite": ["backends/cpu_kernels/"],
     "lpips": ["evaluation/perceptual.py"],
@@ -43,7 +44,7 @@ CONFINED = {
     "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/"],
     "plyfile": ["formats/ply.py"],
     "pycolmap": ["scenes/"],
-    "pydantic": ["config.py", "recipes.py", "adaptation/curve.py", "adaptation/report.py"],
+    "pydantic": ["config.py", "recipes.py", "adaptation/curve.py", "adaptation/report.py", "jobs/finished.py"],
     "pytest": ["backends/conformance/suite.py", "models/conformance.py"],
     "safetensors": ["adaptation/target/super_resolution.py"],
     "skimage": ["evaluation/metrics.py"],
@@ -153,7 +154,7 @@ def test_outside_libraries_stay_in_their_modules(path):
 
 def test_importing_the_package_loads_nothing_optional():
     optional = ["numba", "llvmlite", "gsplat", "triton", "matplotlib", "pycolmap", "pytest", "skimage", "tyro"]
-    optional += ["spandrel", "safetensors", "lpips", "torchvision"]
+    optional += ["distributed", "spandrel", "safetensors", "lpips", "torchvision"]
     code = f"import sys, mipmap_plugin; print([name for name in {optional} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"

@@ -25,6 +25,8 @@ import mipmap_plugin
 from mipmap_plugin import cli, wrap_model
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS
 from mipmap_plugin.backends import BACKENDS
+from mipmap_plugin.commands.adapt import Changes
+from mipmap_plugin.commands.many import Many
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models.families import BUILT_IN
@@ -189,7 +191,8 @@ def test_there_are_commands_to_check():
 
 def options() -> set[str]:
     """Those of all commands."""
-    names = {name.replace("_", "-") for command in COMMANDS.values() for name in inspect.signature(command).parameters}
+    parameters = {name for command in COMMANDS.values() for name in inspect.signature(command).parameters} | set(vars(Many())) | set(vars(Changes()))
+    names = {name.replace("_", "-") for name in parameters}
     return {f"--{name}" for name in names} | {f"--no-{name}" for name in names} | {"--help", "--version", "--quiet", "--log"}
 
 

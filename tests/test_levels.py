@@ -12,6 +12,7 @@ import torch
 from mipmap_plugin import cli, load_model, wrap_model
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.adaptation.target.image_store import STEPS
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import over_band
@@ -62,7 +63,7 @@ def test_the_truth_of_a_zoomed_view_is_the_bases_own_image():
     base, view, effects = tiny.model(), tiny.cameras()[0], Effects(sh_degree=1)
     truth = PseudoTruth(BaseImages(base, ReferenceBackend(), effects), 1 / 2, AdaptConfig(band=(0.5, 1.0)))
     image = ReferenceBackend().render(base.gaussians(), view, effects).image.clamp(0, 1)
-    torch.testing.assert_close(truth(view.zoomed(0.5)), resize(image, (6, 8), "pil-bicubic"))
+    torch.testing.assert_close(truth(view.zoomed(0.5)), resize(image, (6, 8), "pil-bicubic"), atol=1 / STEPS, rtol=0)
 
 
 @pytest.mark.parametrize(

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
+from mipmap_plugin.commands.many import Many, Request, adapt_many
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
-from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter, unique_scales
+from mipmap_plugin.commands.types import Background, Checkpoints, Scale, ScreenFilter, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
@@ -24,21 +27,33 @@ if TYPE_CHECKING:
     from mipmap_plugin.wrap import Wrapped
 
 
+@dataclass(frozen=True)
+class Changes:
+    """Settings of the recipe that are changed."""
+
+    views: ViewPolicy | None = None
+    """Which views to adapt to; by default those of the recipe."""
+    steps: int | None = None
+    """Maximum number of optimizer steps."""
+    time_budget_s: float | None = None
+    """Maximum number of seconds."""
+    target_db: float | None = None
+    """Stop at this PSNR against the pseudo truth (not against photographs)."""
+    resize: ResizeFilter | None = None
+    """Filter that makes base images smaller."""
+    upsampler: str | None = None
+    """What makes base images larger: a registered name, or the file of a super-resolution network."""
+
+
 def adapt(
-    checkpoint: Checkpoint,
+    checkpoints: Checkpoints,
     scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (),
     output: Path | None = None,
     recipe: str = "default",
     viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    views: ViewPolicy | None = None,
     cameras: Path | None = None,
-    steps: int | None = None,
-    time_budget_s: float | None = None,
-    target_db: float | None = None,
     splats: int | None = None,
     bytes: str | None = None,
-    resize: ResizeFilter | None = None,
-    upsampler: str | None = None,
     images: Path | None = None,
     background: Background | None = None,
     screen_filter: ScreenFilter | None = None,
@@ -48,24 +63,20 @@ def adapt(
     report: bool = False,
     overwrite: bool = False,
     json: bool = False,
+    changes: tyro.conf.OmitArgPrefixes[Changes] = Changes(),
+    many: tyro.conf.OmitArgPrefixes[Many] = Many(),  # noqa: B008
 ) -> None:
     """Make a checkpoint that looks right at another scale, in the viewer that it is opened in.
 
     Args:
-        checkpoint: A PLY or a model folder.
+        checkpoints: A PLY or a model folder, or several; patterns such as 'output/*' too.
         scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without splats or bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
         viewer: Viewer to make the file for: classic (the default; INRIA, gsplat, nerfstudio), spark, ...; portable: all; repeat it for a file each.
-        views: Which views to adapt to; by default those of the recipe.
         cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
-        steps: Maximum number of optimizer steps.
-        time_budget_s: Maximum number of seconds.
-        target_db: Stop at this PSNR against the pseudo truth (not against photographs).
         splats: Maximum number of splats. Without a scale, the file is made for the zoom that so many splats suit.
         bytes: Maximum size of the file, such as 20MB, in place of a number of splats.
-        resize: Filter that makes base images smaller.
-        upsampler: What makes base images larger: a registered name, or the file of a super-resolution network.
         images: Folder of the scene. A zoom-in is then adapted to its training images, at the resolution of the base, instead of the base's own.
         background: Of the scene; by default that of the checkpoint, or else black.
         screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
@@ -76,15 +87,28 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
+    settings = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed)
+    if many.asked(checkpoints):
+        _refuse_for_many(scale, bytes, report)
+        request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
+        return adapt_many(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
+    [checkpoint] = checkpoints
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     size, fitting = _fitting(wrapped.model, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False))
-    settings = without_none(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
     requests = _requests(scale or fitting, viewer)
     targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]
-    _check(wrapped, requests, targets, settings | size | dict(recipe=recipe, seed=seed), overwrite)
+    _check(wrapped, requests, targets, settings | size, overwrite)
     page = AdaptationPage(checkpoint, targets, overwrite) if report else None
-    settings |= size | dict(recipe=recipe, seed=seed, images=images and scene(images))
-    _save_all(wrapped, _adapted(wrapped, requests, targets, settings), page, overwrite, json)
+    models = _adapted(wrapped, requests, targets, settings | size | dict(images=images and scene(images)))
+    _save_all(wrapped, models, page, overwrite, json)
+
+
+def _refuse_for_many(scales: Sequence[float], size: str | None, page: bool) -> None:
+    """Raise SettingsError for what only one checkpoint can have."""
+    if not scales:
+        raise SettingsError("several checkpoints need a scale; give --scale")
+    if size is not None or page:
+        raise SettingsError("--bytes and --report are for one checkpoint at a time; leave them out, or adapt the checkpoints one by one")
 
 
 def _check(

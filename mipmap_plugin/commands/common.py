@@ -32,17 +32,10 @@ def wrap(
     checkpoint: Path, cameras: Path | None, background: Background | None, backend: str, screen_filter: ScreenFilter | None = None,
     threads: int | None = None,
 ) -> Wrapped:  # fmt: skip
-    from mipmap_plugin.backends import BACKENDS
-    from mipmap_plugin.models.inria_folder import read_options
-    from mipmap_plugin.scenes import load_scene
-    from mipmap_plugin.wrap import wrap_model
+    from mipmap_plugin.jobs.base import Base
 
-    if backend != "auto":
-        BACKENDS.get(backend)
-    scene_cameras = None if cameras is None else load_scene(cameras, read_options(checkpoint)[0])
-    color = {None: None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}[background]
     with announced(f"reading {checkpoint.name}"):
-        return wrap_model(checkpoint, cameras=scene_cameras, backend=backend, background=color, screen_filter=screen_filter, threads=threads)
+        return Base(checkpoint, cameras, background, backend, screen_filter).load(threads)
 
 
 def scene(path: Path) -> Scene:

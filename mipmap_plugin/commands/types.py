@@ -46,3 +46,4 @@ Scales = tyro.conf.UseAppendAction[list[Scale]]
 Background = Literal["white", "black"]
 ScreenFilter = TrainedName
 Checkpoint = tyro.conf.Positional[Path]
+Checkpoints = tyro.conf.Positional[tuple[Path, ...]]

@@ -31,7 +31,7 @@ def parts_of(source: Path | None, folder: Path | None) -> list[Path]:
     files = [] if source is None else [file for file in source.absolute().parent.iterdir() if _belongs(file.name, source.name)]
     if folder is not None:
         files += [*folder.iterdir(), *(file for part in PARTS for file in (folder / part).rglob("*"))]
-    return [*([source] if source else []), *(file for file in files if file.is_file() and not _is_adapted(file))]
+    return [*([source] if source else []), *(file for file in files if file.is_file() and not is_adapted(file))]
 
 
 def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path | None, holds: str | None) -> None:
@@ -77,5 +77,6 @@ def _belongs(name: str, source: str) -> bool:
     return bool(rank and re.fullmatch(re.escape(rank[1]) + r"\d+\.pt", name)) or name.endswith((".pth", "_mlp.pt", "embedding_appearance.pt"))
 
 
-def _is_adapted(file: Path) -> bool:
+def is_adapted(file: Path) -> bool:
+    """Whether a file is the output of an adaptation, its report or the state of its run."""
     return file.name.endswith((REPORT, ".resume")) or file.with_name(file.name + REPORT).exists()

@@ -1,0 +1,164 @@
+"""`mipmap-plugin adapt` with several checkpoints, or as jobs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Generator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.outputs import adapted_path
+from mipmap_plugin.errors import JobsFailed, SettingsError
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.jobs.listing import find_checkpoints, is_pattern, read_list, shard, without_outputs
+from mipmap_plugin.jobs.summary import facts, in_order, table, totals
+from mipmap_plugin.progress import counted, note
+
+
+@dataclass(frozen=True)
+class Many:
+    """Several checkpoints."""
+
+    list: Path | None = None
+    """A text file with a checkpoint or a pattern on each line."""
+    jobs: int | None = None
+    """How many to adapt at the same time, in processes that share the threads."""
+    dask: str | None = None
+    """Adapt on the workers of dask.distributed: tcp://HOST:8786 for a scheduler, local:4 for four workers of this machine."""
+    shard: str | None = None
+    """Do a part of the jobs only, such as 3/50: every fiftieth, from the third on."""
+    skip_existing: bool = False
+    """Do nothing where the output was already made, from the same base with the same settings. Several checkpoints do so by default."""
+
+    def asked(self, checkpoints: Sequence[Path]) -> bool:
+        """Whether these are jobs, rather than one checkpoint."""
+        options = (self.jobs, self.dask, self.shard)
+        return self.is_list(checkpoints) or self.skip_existing or any(each is not None for each in options)
+
+    def is_list(self, checkpoints: Sequence[Path]) -> bool:
+        """Whether there may be several checkpoints, so that an output is a folder for all."""
+        return self.list is not None or len(checkpoints) != 1 or is_pattern(checkpoints[0])
+
+
+@dataclass(frozen=True)
+class Request:
+    """What each of the checkpoints is adapted to."""
+
+    targets: Sequence[tuple[float, str | None]]  # scale and viewer
+    output: Path | None
+    settings: dict[str, Any]  # the recipe's name among them
+    images: Path | None
+    overwrite: bool
+
+
+def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, threads: int | None, json: bool) -> None:
+    """Run a job for each checkpoint, scale and viewer; print one table, or JSON.
+
+    `given`: checkpoints and patterns; `base`: how each checkpoint is read. Raises SettingsError before any work, JobsFailed and
+    KeyboardInterrupt after it.
+    """
+    jobs = make_jobs(many, given, request, base)
+    outcomes: list[Outcome] = []
+    try:
+        with closing(_engine(many, jobs, threads)) as running:
+            for outcome in counted(running, len(jobs), "adapting", "job"):
+                outcomes.append(outcome)
+                note(str(outcome))
+    except KeyboardInterrupt as interrupt:
+        _print(outcomes, jobs, json)
+        again = " with --skip-existing" if request.overwrite and not many.skip_existing else ""
+        raise KeyboardInterrupt(f"interrupted; run the same command again{again} to go on where it stopped") from interrupt
+    _print(outcomes, jobs, json)
+    if failed := [outcome for outcome in outcomes if outcome.status != "done" and outcome.status != "finished before"]:
+        raise JobsFailed(f"{len(failed)} of {len(jobs)} jobs failed; the same command does these again, and no other")
+
+
+def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -> list[Job]:
+    """A job for each checkpoint, scale and viewer of this shard. Raises SettingsError if none of them can be right."""
+    checkpoints = _checkpoints([*given, *(read_list(many.list) if many.list else [])])
+    several = many.is_list(given) or len(request.targets) > 1
+    skip, settings = many.skip_existing or not request.overwrite, dict(request.settings)
+    recipe = settings.pop("recipe")
+    jobs = []
+    for path in checkpoints:
+        own = replace(base, checkpoint=path.absolute(), cameras=_of_scene(base.cameras, path))
+        for scale, viewer in request.targets:
+            target = adapted_path(path, request.output, scale, viewer, several=several).absolute()
+            images = _of_scene(request.images, path)
+            jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite, skip))
+    _refuse(jobs)
+    return shard(jobs, *_part(many.shard))
+
+
+def _checkpoints(given: Sequence[Path]) -> list[Path]:
+    """The checkpoints of the command and of its list, without outputs of earlier runs, which a pattern such as output/* finds too."""
+    if not given:
+        raise SettingsError("there is no checkpoint to adapt; give a PLY or a model folder, several of them, or --list FILE")
+    checkpoints, outputs = without_outputs(find_checkpoints(given))
+    if outputs and not checkpoints:
+        raise SettingsError(f"{outputs[0]}: this was adapted already; give the checkpoint that it was made of")
+    if outputs:
+        note(f"left out, because an adaptation made them: {', '.join(path.name for path in outputs)}")
+    return checkpoints
+
+
+def _of_scene(path: Path | None, checkpoint: Path) -> Path | None:
+    """A path in which {name} stands for the checkpoint's name."""
+    return path and Path(str(path).replace("{name}", checkpoint.resolve().stem)).absolute()
+
+
+def _refuse(jobs: Sequence[Job]) -> None:
+    """Raise the errors of settings that are wrong for every checkpoint, and SettingsError for two jobs with one output."""
+    from mipmap_plugin.backends import BACKENDS
+    from mipmap_plugin.splatting.viewers import viewers_for
+
+    if jobs[0].base.backend != "auto":
+        BACKENDS.get(jobs[0].base.backend)
+    makers: dict[Path, Job] = {}
+    for job in jobs:
+        job.config()
+        if job.viewer is not None:
+            viewers_for(job.viewer)
+        if (other := makers.setdefault(job.target, job)) is not job:
+            both = f"{other.base.checkpoint} and {job.base.checkpoint}"
+            raise SettingsError(f"{both} would both be written to {job.target}; leave --output out, or adapt them one by one")
+
+
+def _part(text: str | None) -> tuple[int, int]:
+    """Parse a shard, such as 3/50. Raises SettingsError."""
+    match = re.fullmatch(r"(\d+)/(\d+)", text or "1/1")
+    if match is None:
+        raise SettingsError(f"--shard {text}: give the part and the number of parts, such as 3/50")
+    return int(match[1]), int(match[2])
+
+
+def _engine(many: Many, jobs: Sequence[Job], threads: int | None) -> Generator[Outcome, None, None]:
+    """The outcomes of the jobs, from where they are to run. Raises SettingsError."""
+    from mipmap_plugin.jobs.engines import in_this_process, in_workers
+
+    count = 1 if many.jobs is None else many.jobs
+    if count < 1 or (threads is not None and threads < 1):
+        raise SettingsError(f"--jobs and --threads must be at least 1, got {count} and {threads}")
+    if many.dask is None:
+        return in_this_process(jobs, threads) if count == 1 else in_workers(jobs, count, threads)
+    if many.jobs is not None:
+        raise SettingsError("--jobs are processes of this machine, and --dask has workers of its own; leave one of them out")
+    try:
+        from mipmap_plugin.jobs.farm import on_dask
+    except ModuleNotFoundError as error:
+        raise SettingsError(f"--dask needs dask.distributed ({error}); pip install 'mipmap-plugin[farm]'") from None
+    return on_dask(jobs, many.dask, threads)
+
+
+def _print(outcomes: Sequence[Outcome], jobs: Sequence[Job], json: bool) -> None:
+    """The outcomes in the order of their jobs, whatever the order in which they ended."""
+    sorted_outcomes = in_order(outcomes, jobs)
+    if json:
+        print_facts(facts(sorted_outcomes), json)
+        return
+    print(table(sorted_outcomes))
+    print(totals(outcomes, len(jobs)))

@@ -1,0 +1,38 @@
+"""A base checkpoint as paths and options, from which any process can load it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mipmap_plugin.wrap import Wrapped
+
+COLORS = {None: None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+
+
+@dataclass(frozen=True)
+class Base:
+    """A checkpoint, and how it is to be read and rendered; the options are those of `wrap_model`."""
+
+    checkpoint: Path
+    cameras: Path | None = None  # a cameras.json, a transforms file or a COLMAP scene
+    background: str | None = None  # "white" or "black"; None: as the checkpoint says
+    backend: str = "auto"
+    screen_filter: str | None = None
+
+    def load(self, threads: int | None = None) -> Wrapped:
+        """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
+        from mipmap_plugin.backends import BACKENDS
+        from mipmap_plugin.models.inria_folder import read_options
+        from mipmap_plugin.scenes import load_scene
+        from mipmap_plugin.wrap import wrap_model
+
+        if self.backend != "auto":
+            BACKENDS.get(self.backend)
+        scene = None if self.cameras is None else load_scene(self.cameras, read_options(self.checkpoint)[0])
+        color = COLORS[self.background]
+        return wrap_model(
+            self.checkpoint, cameras=scene, backend=self.backend, background=color, screen_filter=self.screen_filter, threads=threads
+        )

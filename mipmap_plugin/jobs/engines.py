@@ -1,0 +1,60 @@
+"""What runs jobs on one machine: this process, or several workers at a time. (`farm`: more than one machine.)"""
+
+from __future__ import annotations
+
+import os
+import queue
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed, wait
+
+from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.jobs.worker import Worker, do
+
+
+def in_this_process(jobs: Sequence[Job], threads: int | None = None) -> Generator[Outcome, None, None]:
+    """Do the jobs one after the other, and yield the outcome of each. Ctrl-C saves the state of the one that runs."""
+    from mipmap_plugin.jobs.run import run
+
+    for job in jobs:
+        yield run(job, threads)
+
+
+def in_workers(jobs: Sequence[Job], count: int, threads: int | None = None) -> Generator[Outcome, None, None]:
+    """Do the jobs in `count` processes that share `threads` threads (None: all); yield each outcome when it is there.
+
+    Ctrl-C lets every running job save its state, and begins no other; a second one ends them at once. What was registered in this
+    process at run time is unknown in others; register it by an entry point.
+    """
+    workers = [Worker(max(1, (threads or usable_threads()) // count)) for _ in range(min(count, len(jobs)))]
+    free: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+    for worker in workers:
+        free.put(worker)
+
+    def do_in_free_worker(job: Job) -> Outcome:
+        worker = free.get()
+        try:
+            return do(job, worker)
+        finally:
+            free.put(worker)
+
+    pool = ThreadPoolExecutor(max(1, len(workers)), "mipmap_plugin-jobs")
+    futures = [pool.submit(do_in_free_worker, job) for job in jobs]
+    try:
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for worker in workers:
+            worker.stop()
+        try:
+            wait(futures)
+        finally:
+            for worker in workers:
+                worker.close()
+
+
+def usable_threads() -> int:
+    """The threads that this process may use: as OMP_NUM_THREADS says, or those of its processors."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return int(wanted) if wanted.isdigit() and int(wanted) else available or 1

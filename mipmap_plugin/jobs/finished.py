@@ -1,0 +1,79 @@
+"""Outputs that need not be made again: they were made from the same base, for the same scale and viewer, with the same settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from mipmap_plugin.adaptation.target.portable import settings_for_several
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.atomic import named, settled, sha256
+from mipmap_plugin.formats.ply import read_header
+from mipmap_plugin.formats.splat_transform import WRITTEN
+from mipmap_plugin.formats.tags import provenance_of
+from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.models import detect
+from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.recipes import recipe
+from mipmap_plugin.splatting.viewers import viewers_for
+
+
+def finished(job: Job) -> tuple[Path, dict[str, Any]] | None:
+    """The checkpoint that the job would make, and its report, if they are there already; None if not.
+
+    Provenance has no cameras, photographs or background: outputs that differ in these alone count as the same.
+    """
+    for file, report in _outputs(job.target):
+        provenance = _in_header(file) or report
+        if _is_requested(provenance, job) and provenance.get("base") == _digest(job, provenance.get("base")):
+            return file, report
+    return None
+
+
+def _outputs(target: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The adapted checkpoints at `target`, a file or a model folder, with their reports."""
+    target = settled(named(target))
+    reports = sorted(target.rglob("*" + REPORT)) if target.is_dir() else [target.with_name(target.name + REPORT)]
+    for path in reports:
+        file = path.with_name(path.name.removesuffix(REPORT))
+        try:
+            report = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            continue
+        if isinstance(report, dict) and file.is_file():
+            yield file, report
+
+
+def _in_header(file: Path) -> dict[str, Any] | None:
+    """The provenance in the header of a PLY, which another file may have replaced since the report was written; None in other formats."""
+    if file.suffix.lower() != ".ply" or file.name.lower().endswith(WRITTEN):
+        return None
+    try:
+        return provenance_of(read_header(file).comments) or {"base": None}
+    except CheckpointError:
+        return {"base": None}
+
+
+def _is_requested(provenance: dict[str, Any], job: Job) -> bool:
+    """Whether scale, viewer and settings are those of the job."""
+    try:
+        settings = AdaptConfig.model_validate(provenance.get("settings"))
+    except ValidationError:  # of another version
+        return False
+    expected = job.config()
+    if job.viewer is not None and len(viewers_for(job.viewer)) > 1:
+        expected = recipe(job.recipe, job.scale, **(settings_for_several(expected) | job.settings))
+    if "merge_to" not in job.settings and settings.merge_to == 1:  # splats of this family are not merged
+        expected = expected.model_copy(update={"merge_to": 1.0})
+    return (provenance.get("scale"), provenance.get("viewer"), settings) == (job.scale, job.viewer, expected)
+
+
+def _digest(job: Job, wanted: Any) -> str:
+    """The hash of the base checkpoint: of its file where that is `wanted`, otherwise as its family computes it, which loads all of it."""
+    digest = sha256(detect(job.base.checkpoint).path)
+    return digest if digest == wanted else job.base.load().model.digest

@@ -1,0 +1,52 @@
+"""A job: one checkpoint, adapted to one scale for one viewer. It can be sent to any process, and done again without harm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.recipes import recipe
+
+Status = Literal["done", "finished before", "failed", "interrupted"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to adapt and where to save it: paths and settings, no tensors."""
+
+    base: Base
+    target: Path  # where the adapted model is saved; the state of an interrupted run lies beside it
+    scale: float
+    viewer: str | None = None
+    recipe: str = "default"
+    settings: dict[str, Any] = field(default_factory=dict)  # that override those of the recipe: seed, steps, ...
+    images: Path | None = None  # a scene whose photographs are the truth of a zoom-in
+    overwrite: bool = False
+    skip_finished: bool = True  # do nothing if the target was made from the same base with the same settings
+
+    def config(self) -> AdaptConfig:
+        """The settings to adapt with, unless the model calls for others. Raises SettingsError."""
+        return recipe(self.recipe, self.scale, **self.settings)
+
+    def __str__(self) -> str:
+        return f"{self.base.checkpoint} x{self.scale:g}{f' in {self.viewer}' if self.viewer else ''}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a job."""
+
+    job: Job
+    status: Status
+    file: Path | None = None  # the adapted checkpoint
+    report: dict[str, Any] = field(default_factory=dict)  # of the adaptation
+    reason: str = ""  # why it failed or was interrupted, in a sentence
+    trace: str = ""  # of a failure that is a bug
+    seconds: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return f"{self.job}: {self.status}{f', {self.reason}' if self.reason else ''}"

@@ -1,0 +1,71 @@
+"""The checkpoints that a command is given: names, patterns, and files with a list of these; and the part of the list that is this shard's."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from mipmap_plugin.errors import CheckpointError, SettingsError
+
+Item = TypeVar("Item")
+
+
+def read_list(path: Path) -> list[Path]:
+    """The checkpoints or patterns in a text file, one a line; what follows a # is a comment. Raises SettingsError."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file"
+        raise SettingsError(f"{path}: {reason}; --list takes a text file with a checkpoint on each line") from None
+    return [Path(text) for line in lines if (text := line.partition("#")[0].strip())]
+
+
+def find_checkpoints(given: Iterable[Path]) -> list[Path]:
+    """The checkpoints that are given by name or as patterns (*, ?, **), in their order, each once. Raises SettingsError if a pattern fits none."""
+    found: dict[Path, Path] = {}
+    for path in given:
+        for each in _matches(path) if is_pattern(path) else [path]:
+            found.setdefault(each.resolve(), each)
+    return list(found.values())
+
+
+def is_pattern(path: Path) -> bool:
+    """Whether a path stands for others by *, ? or [...]; a file may have these in its name."""
+    return glob.has_magic(str(path)) and not path.exists()
+
+
+def _matches(pattern: Path) -> list[Path]:
+    paths = [Path(each) for each in sorted(glob.glob(str(pattern.expanduser()), recursive=True))]
+    if not paths:
+        raise SettingsError(f"{pattern}: no file or folder fits this pattern; check it")
+    return paths
+
+
+def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]]:
+    """The checkpoints that no adaptation has made, and the others, which a pattern such as output/* finds too once there are outputs."""
+    kept: list[Path] = []
+    left_out: list[Path] = []
+    for path in checkpoints:
+        (left_out if _is_output(path) else kept).append(path)
+    return kept, left_out
+
+
+def _is_output(path: Path) -> bool:
+    from mipmap_plugin.models import detect
+    from mipmap_plugin.models.outputs import is_adapted
+
+    if is_adapted(path):
+        return True
+    try:
+        return path.is_dir() and is_adapted(detect(path).path)
+    except (CheckpointError, OSError):  # a job of its own says what is wrong with it
+        return False
+
+
+def shard(items: Sequence[Item], part: int, parts: int) -> list[Item]:
+    """Every `parts`-th item from the `part`-th on, counted from 1: all parts together are all items, each once. Raises SettingsError."""
+    if not 1 <= part <= parts:
+        raise SettingsError(f"--shard {part}/{parts}: there is no such part; give 1/{max(parts, 1)} to {max(parts, 1)}/{max(parts, 1)}")
+    return list(items[part - 1 :: parts])

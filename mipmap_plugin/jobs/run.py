@@ -1,0 +1,52 @@
+"""One job, from the checkpoint to the saved model; whatever goes wrong with it is its outcome."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from dataclasses import replace
+
+from mipmap_plugin.errors import MipmapPluginError, OutputExists
+from mipmap_plugin.jobs.finished import finished
+from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.limits import is_out_of_memory
+from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.wrap import state_path
+
+
+def run(job: Job, threads: int | None = None) -> Outcome:
+    """Do a job; what is wrong with it becomes its outcome. An interrupted job raises KeyboardInterrupt, and continues when it is run again."""
+    began = time.perf_counter()
+    outcome = _attempt(job, threads)
+    return replace(outcome, seconds=time.perf_counter() - began)
+
+
+def _attempt(job: Job, threads: int | None) -> Outcome:
+    try:
+        return _finished_before(job) or _adapt(job, threads)
+    except OutputExists as error:
+        # Another process may have finished the same job meanwhile.
+        return _finished_before(job) or Outcome(job, "failed", reason=str(error))
+    except (MipmapPluginError, OSError) as error:
+        return Outcome(job, "failed", reason=str(error))
+    except Exception as error:
+        if isinstance(error, (MemoryError, RuntimeError)) and is_out_of_memory(error):
+            return Outcome(job, "failed", reason="out of memory; use a smaller scale, fewer views or fewer jobs at a time")
+        return Outcome(job, "failed", reason=f"{type(error).__name__}: {error}", trace=traceback.format_exc())
+
+
+def _finished_before(job: Job) -> Outcome | None:
+    found = finished(job) if job.skip_finished else None
+    return found and Outcome(job, "finished before", *found)
+
+
+def _adapt(job: Job, threads: int | None) -> Outcome:
+    base = job.base.load(threads)
+    config = job.config()
+    base.targets(job.viewer)
+    networks_move = config.steps > 0 and config.rates.networks > 0
+    base.refuse_output(job.target, overwrite=job.overwrite, networks_move=networks_move, viewer=job.viewer)
+    scene = None if job.images is None else load_scene(job.images)
+    adapted = base.adapt(job.scale, recipe=job.recipe, viewer=job.viewer, resume=state_path(job.target), images=scene, **job.settings)
+    file = adapted.save(job.target, overwrite=job.overwrite)
+    return Outcome(job, "done", file, adapted.report.model_dump())

@@ -1,0 +1,76 @@
+"""The main function of a worker process: it reads jobs from its standard input and answers with their outcomes on its standard output.
+
+It ends when its input ends, in the middle of a job too: a worker whose owner was killed must not go on beside the one that takes its place.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import queue
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import replace
+from typing import IO
+
+from mipmap_plugin.jobs.job import Job, Outcome
+
+Request = tuple[Job, "int | None"]
+
+
+def main() -> None:
+    signal.signal(signal.SIGINT, _leave)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a library prints must not mix with the answers
+    requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(sys.stdin.buffer, requests), daemon=True).start()
+    while True:
+        pickle.dump(_run_quietly(*requests.get()), answers)
+        answers.flush()
+
+
+def _read(stream: IO[bytes], requests: queue.SimpleQueue[Request]) -> None:
+    try:
+        while True:
+            requests.put(pickle.load(stream))
+    except EOFError:
+        os._exit(0)
+
+
+def _leave(number: int, frame: object) -> None:
+    """What Ctrl-C does where no job can be lost."""
+    os._exit(130)
+
+
+def _run_quietly(job: Job, threads: int | None) -> Outcome:
+    """Do a job without its progress bars, which would mix with those of other workers; its warnings are part of its outcome."""
+    with redirect_stderr(io.StringIO()), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("default", module=r"mipmap_plugin(\.|$)")
+        try:
+            with _interruptible():
+                from mipmap_plugin.jobs.run import run  # loads torch, which takes a second that Ctrl-C may come in
+
+                outcome = run(job, threads)
+        except KeyboardInterrupt as interrupt:
+            outcome = Outcome(job, "interrupted", reason=str(interrupt) or "interrupted")
+    return replace(outcome, warnings=tuple(str(each.message) for each in caught))
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Inside, Ctrl-C raises KeyboardInterrupt."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, _leave)
+
+
+if __name__ == "__main__":
+    main()

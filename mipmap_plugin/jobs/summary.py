@@ -1,0 +1,76 @@
+"""What became of many jobs, as a table and as JSON."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.jobs.job import Job, Outcome
+
+COLUMNS = ("checkpoint", "scale", "viewer", "outcome", "splats", "dB", "seconds", "file, or what is wrong")
+
+
+def in_order(outcomes: Iterable[Outcome], jobs: Sequence[Job]) -> list[Outcome]:
+    """The outcomes in the order of the jobs; those of jobs that were never begun are missing."""
+    places = {job.target: place for place, job in enumerate(jobs)}
+    return sorted(outcomes, key=lambda outcome: places[outcome.job.target])
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """A row for each job, in columns."""
+    rows = [COLUMNS, *(_row(outcome) for outcome in outcomes)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def _row(outcome: Outcome) -> tuple[str, ...]:
+    job, report = outcome.job, outcome.report
+    splats = f"{report['gaussians_before']:,} -> {report['gaussians_after']:,}" if report else ""
+    seconds = f"{outcome.seconds:.1f}"
+    return (_short(job.base.checkpoint), f"x{job.scale:g}", job.viewer or "", outcome.status, splats, _psnr(report), seconds, _last(outcome))
+
+
+def _psnr(report: dict[str, Any]) -> str:
+    """dB before (the base as it is) and after, on views that nothing was adapted to."""
+    psnrs = report.get("validation") or {}
+    after = next((psnr for name, psnr in psnrs.items() if str(report.get("returned", "")).startswith(name)), None)
+    before = next(iter(psnrs.values()), None)
+    return "" if before is None or after is None else f"{before:.2f} -> {after:.2f}"
+
+
+def _last(outcome: Outcome) -> str:
+    return _short(outcome.file) if outcome.file else outcome.reason
+
+
+def _short(path: Path) -> str:
+    """A path from the current directory, if it lies in it."""
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def totals(outcomes: Sequence[Outcome], count: int) -> str:
+    """How many of `count` jobs became what, in a sentence."""
+    statuses = Counter(outcome.status for outcome in outcomes)
+    waiting = count - sum(statuses.values())
+    parts = [f"{number} {status}" for status, number in statuses.items()] + ([f"{waiting} not begun"] if waiting else [])
+    return f"{count} job{'s' if count != 1 else ''}: {', '.join(parts) or 'none begun'}"
+
+
+def facts(outcomes: Sequence[Outcome]) -> list[dict[str, Any]]:
+    """Each job and its outcome, for JSON; of one that succeeded also its report."""
+    return [
+        {
+            "checkpoint": str(outcome.job.base.checkpoint),
+            "scale": outcome.job.scale,
+            "viewer": outcome.job.viewer,
+            "outcome": outcome.status,
+            "file": outcome.file and str(outcome.file),
+            "reason": outcome.reason,
+            "trace": outcome.trace,
+            "warnings": list(outcome.warnings),
+            "job_seconds": outcome.seconds,
+            "report": outcome.report or None,
+        }
+        for outcome in outcomes
+    ]

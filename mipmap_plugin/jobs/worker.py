@@ -1,0 +1,112 @@
+"""A worker: another process of this Python, which does one job after another. Torch and OpenMP do not survive a fork, so it is started anew."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from typing import IO, cast
+
+from mipmap_plugin.jobs.job import Job, Outcome
+
+# Where libraries look for the number of threads that they may start.
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+# A job whose worker dies is begun again this many times in all, and continues where its state was last saved.
+ATTEMPTS = 2
+
+
+class WorkerDied(RuntimeError):
+    """A worker ended in the middle of a job."""
+
+
+class Worker:
+    """A process that does jobs, with `threads` threads each (None: as many as torch finds). It ends when this process ends, in whatever way."""
+
+    def __init__(self, threads: int | None) -> None:
+        self.threads, self.stopped = threads, False
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def begin(self, job: Job) -> None:
+        """Start a job; no other may be running. Raises WorkerDied."""
+        if self.stopped:
+            raise WorkerDied("the worker was stopped")
+        self._process = self._process or _start(self.threads)
+        stream = cast(IO[bytes], self._process.stdin)
+        try:
+            pickle.dump((job, self.threads), stream)
+            stream.flush()
+        except BrokenPipeError:
+            raise self._death() from None
+
+    def has_ended(self, seconds: float) -> bool:
+        """Wait for the end of the job, at most so many seconds; return whether it has ended."""
+        return bool(self._process is None or select.select([cast(IO[bytes], self._process.stdout)], [], [], seconds)[0])
+
+    def outcome(self) -> Outcome:
+        """Wait for the outcome of the job. Raises WorkerDied."""
+        try:
+            if self._process is None:
+                raise self._death()
+            outcome: Outcome = pickle.load(cast(IO[bytes], self._process.stdout))
+            return outcome
+        except (EOFError, ValueError, pickle.UnpicklingError):  # ValueError: closed from outside
+            raise self._death() from None
+
+    def stop(self) -> None:
+        """Begin no other job, and let the running one save its state and end."""
+        self.stopped = True
+        if self._process is not None and self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+
+    def close(self) -> None:
+        """End the process at once, and the job that it may have."""
+        self.stopped = True
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            process.wait()
+            _close(process)
+
+    def _death(self) -> WorkerDied:
+        process, self._process = self._process, None
+        if process is None:
+            return WorkerDied("the worker was stopped")
+        code = process.wait()
+        _close(process)
+        if code == -signal.SIGKILL:
+            return WorkerDied("the process that did it was killed, perhaps for want of memory; run fewer jobs at a time")
+        return WorkerDied(f"the process that did it ended with {f'signal {-code}' if code < 0 else f'exit code {code}'}")
+
+
+def do(job: Job, worker: Worker, watch: Callable[[], None] = lambda: None, attempts: int = ATTEMPTS) -> Outcome:
+    """Do a job in a worker; if that dies, in a new one, up to `attempts` times. `watch` is called while the job runs."""
+    for attempt in range(1, attempts + 1):
+        try:
+            worker.begin(job)
+            watch()
+            return worker.outcome()
+        except WorkerDied as death:
+            if worker.stopped:
+                return Outcome(job, "interrupted", reason="interrupted")
+            if attempt == attempts:
+                return Outcome(job, "failed", reason=f"{death} ({attempts} attempts)")
+    raise ValueError(f"attempts must be at least 1, got {attempts}")
+
+
+def _start(threads: int | None) -> subprocess.Popen[bytes]:
+    """Start a worker, in a session of its own: its owner alone tells it of Ctrl-C."""
+    limits = {} if threads is None else dict.fromkeys(THREAD_VARIABLES, str(threads))
+    command = [sys.executable, "-m", "mipmap_plugin.jobs.serve"]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **limits}, start_new_session=True)
+
+
+def _close(process: subprocess.Popen[bytes]) -> None:
+    for pipe in filter(None, (process.stdin, process.stdout)):
+        with suppress(OSError):  # a job that was on its way
+            pipe.close()
