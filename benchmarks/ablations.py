@@ -16,7 +16,7 @@ import tyro
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.commands.types import Scale
 from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row
-from mipmap_plugin.evaluation.measure import warm_up
+from mipmap_plugin.evaluation.measure import adapt_alone, warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import table
 from mipmap_plugin.formats.atomic import new_file
@@ -73,7 +73,7 @@ def main(
         recipe, variants = ABLATIONS[name]
         rows = []
         for variant, settings in variants.items():
-            adapted = wrapped.adapt(scale, recipe=recipe, **{"patience": None, **settings, **(scored if variant == SCORED else {})})
+            adapted = adapt_alone(wrapped, scale, recipe=recipe, **{"patience": None, **settings, **(scored if variant == SCORED else {})})
             rows.append(adapted_row(variant, adapted, evaluator))
         text = f"## {name}: the `{recipe}` recipe on {base} at x{scale:g}\n\n{table(rows)}\n"
         print(text, flush=True)

@@ -23,7 +23,7 @@ from pydantic import TypeAdapter
 from scenes import SPECS, Name
 from tables import GROWTH, Row, Rows, growth_table, sizes_table, speed_table
 from tqdm import tqdm
-from workloads import Size, prepare
+from workloads import Size, Variant, prepare, users_scenes
 
 from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.backends import survey
@@ -46,6 +46,7 @@ def main(
     runs: int = 5,
     keep: bool = False,
     scaling: bool = True,
+    users: Path | None = None,
 ) -> None:
     """Measure, print the tables and write the JSON, which replaces an older one.
 
@@ -56,10 +57,11 @@ def main(
         output: Path of the JSON.
         runs: How many of each; the median counts.
         keep: Add to the rows of an older JSON, so that a long measurement can be done in parts; rows measured again are replaced.
+        users: The folder DATA of `real_bases.py`: adds the scenes that users have, students and bases at every zoom-out and a million splats.
         scaling: Compare two threads with one; meaningless on a busy machine, and half of the run time.
     """
-    by_default = [] if checkpoint else [name for name in SPECS if name != WARM_UP]
-    sources: list[Name | Path] = [*(scene or by_default), *checkpoint]
+    by_default = [] if checkpoint or users else [name for name in SPECS if name != WARM_UP]
+    sources: list[Name | Path | Variant] = [*(scene or by_default), *checkpoint, *(users_scenes(users) if users else [])]
     able, reasons = installed(backend)
     with TemporaryDirectory() as folder:
         rows, sizes, failed = measure_all(able, sources, Path(folder), runs, scaling=scaling)
@@ -86,7 +88,7 @@ def installed(wanted: tuple[str, ...]) -> tuple[list[str], dict[str, str]]:
 
 
 def measure_all(
-    backends: list[str], sources: list[Name | Path], folder: Path, runs: int, *, scaling: bool
+    backends: list[str], sources: list[Name | Path | Variant], folder: Path, runs: int, *, scaling: bool
 ) -> tuple[list[Row], list[Size], dict[str, str]]:
     """Every backend on every source: rows, sizes of the workloads, and what failed with its reason."""
     warm_up, rows, failed = folder / "warm_up", list[Row](), dict[str, str]()

@@ -11,6 +11,7 @@ from real_bases import SCALES
 
 from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row
+from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.wrap import own_cameras
 
@@ -48,7 +49,7 @@ def _of_base(data: Path, base: str, backend: str, device: str, settings: dict) -
     for scale in SCALES[base]:
         if scale == 1:
             continue
-        adapted = wrapped.adapt(scale, **settings)
+        adapted = adapt_alone(wrapped, scale, **settings)
         report, psnr_db = adapted.report, adapted_row("", adapted, evaluator).psnr_db
         steps = report.curve[-1].step if report.curve else 0
         took = dict(seconds=report.seconds["total"], steps=steps, ended_by=report.ended_by, peak_mib=report.peak_memory_mib)

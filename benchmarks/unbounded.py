@@ -29,7 +29,7 @@ from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
-from mipmap_plugin.evaluation.measure import RESIZED, RenderView, baselines, resized_base, views_seen, warm_up
+from mipmap_plugin.evaluation.measure import RESIZED, RenderView, adapt_alone, baselines, resized_base, views_seen, warm_up
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TestView
 from mipmap_plugin.evaluation.report import records, table
 from mipmap_plugin.evaluation.tradeoff.truth import EVALUATION_SEED
@@ -149,7 +149,7 @@ def rows_of(name: str, scale: float, data: Path, most: int | None) -> list[Row]:
     rows = [free_rows(base, judge, scale) for judge in judged_by]
     warm_up(base, scale, others)
     for recipe, settings in recipes(capture, scale).items():
-        adapted = base.adapt(scale, cameras=others, **settings)
+        adapted = adapt_alone(base, scale, cameras=others, **settings)
         assert not views_seen(judged, adapted.adapted_to), f"{name}: views that are judged were adapted to"
         for judge, beside in zip(judged_by, rows, strict=True):
             beside.append(adapted_row(recipe, adapted, judge))

@@ -24,7 +24,7 @@ from mipmap_plugin.formats.atomic import write_json
 
 HERE = Path(__file__).parents[1]
 COMMAND = "import sys; from mipmap_plugin.cli import main; sys.exit(main())"
-PHASES = ("compilation", "blend weights", "merging", "closed form", "optimization", "validation")
+PHASES = ("compilation", "blend weights", "merging", "closed form", "pseudo truth", "optimization", "validation")
 INTRO = """# How long a person waits
 
 Made by `python benchmarks/wait.py DATA`: seconds of whole processes, the quickest of {runs}; the phases of the report of the same run. Two cores.

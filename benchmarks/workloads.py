@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -13,9 +13,13 @@ from mipmap_plugin import Camera, Effects, Gaussians, wrap_model
 from mipmap_plugin.effects import DILATION, MIN_ALPHA
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.splatting.projection import project
+from mipmap_plugin.splatting.rotations import rotations
 
 # Splats counted at once, so that counting pairs takes little memory whatever the checkpoint.
 CHUNK = 1 << 16
+
+# Distance of the halves of a split splat from its center, in standard deviations.
+APART = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +52,31 @@ class Size:
     pairs: int
 
 
-def prepare(source: Name | Path, path: Path) -> Size:
-    """Write the workload of a scene's name or of a checkpoint to `path`."""
-    workload = from_checkpoint(source) if isinstance(source, Path) else from_scene(source)
+@dataclass(frozen=True)
+class Variant:
+    """What users have of a checkpoint: a student at the start of an adaptation, the base as its truth is drawn, or a larger stand-in."""
+
+    checkpoint: Path
+    scale: float = 1.0  # of the student, or of the truth
+    student: bool = False
+    splats: int | None = None  # split into so many
+
+
+def users_scenes(data: Path) -> list[Variant]:
+    """Students and bases at every zoom-out, a real capture, and a million splats; DATA as of `real_bases.py`."""
+    bases = [data / "checkpoints" / "bases" / name for name in ("lego_200", "chair_400")]
+    zoomed_out = [Variant(base, scale, student) for base in bases for scale in (1 / 2, 1 / 4, 1 / 8) for student in (True, False)]
+    return [*zoomed_out, Variant(data / "checkpoints" / "flowers_r8"), Variant(bases[1], splats=1_000_000)]
+
+
+def prepare(source: Name | Path | Variant, path: Path) -> Size:
+    """Write the workload of a scene's name, of a checkpoint or of what users have of one to `path`."""
+    if isinstance(source, Variant):
+        workload = from_variant(source)
+    elif isinstance(source, Path):
+        workload = from_checkpoint(source)
+    else:
+        workload = from_scene(source)
     workload.save(path)
     camera = workload.camera
     return Size(workload.name, len(workload.raw["means"]), camera.width, camera.height, workload.pairs)
@@ -66,15 +92,47 @@ def from_checkpoint(path: Path) -> Workload:
     """The first view of a checkpoint, its own or of the orbit that is generated where it has none."""
     wrapped = wrap_model(path)
     camera = wrapped.views()[0]
-    gaussians = wrapped.model.gaussians(camera).detach()
+    return of_gaussians(path.name, wrapped.model.gaussians(camera).detach(), camera)
+
+
+def from_variant(variant: Variant) -> Workload:
+    """The first view of the checkpoint, zoomed as in an adaptation: a truth has up to four times as many pixels as its target along each axis."""
+    wrapped, name = wrap_model(variant.checkpoint), variant.checkpoint.name
+    view = wrapped.views()[0]
+    if variant.student:
+        camera, model = view.zoomed(variant.scale), wrapped.adapt(variant.scale, steps=0, returns="last").model
+        return of_gaussians(f"{name} student x{variant.scale:g}", model.gaussians(camera).detach(), camera)
+    camera, gaussians = view.zoomed(min(1.0, 4 * variant.scale)), wrapped.model.gaussians(view).detach()
+    if variant.splats is None:
+        return of_gaussians(f"{name} base x{variant.scale:g}", gaussians, camera)
+    return of_gaussians(f"{name} in {variant.splats:,}", split_into(gaussians, variant.splats), camera)
+
+
+def split_into(gaussians: Gaussians, count: int) -> Gaussians:
+    """Split splats in two along their longest axis, with mass, mean and covariance kept, until there are `count`: the most opaque first."""
+    while len(gaussians) < count:
+        order = gaussians.opacities.argsort(descending=True, stable=True)
+        halved, rest = gaussians[order[: count - len(gaussians)]], gaussians[order[count - len(gaussians) :]]
+        longest = torch.nn.functional.one_hot(halved.scales.argmax(1), 3)
+        shorter = halved.scales * torch.where(longest > 0, (1 - APART**2) ** 0.5, 1.0)
+        along = (rotations(halved.quats) @ (APART * halved.scales * longest)[..., None])[..., 0]
+        opacities = halved.opacities / (2 * (1 - APART**2) ** 0.5)
+        halves = [replace(halved, means=halved.means + side * along, scales=shorter, opacities=opacities) for side in (-1, 1)]
+        parts = [rest, *halves]
+        names = ("means", "quats", "scales", "opacities", "sh")
+        gaussians = Gaussians(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+    return gaussians
+
+
+def of_gaussians(name: str, gaussians: Gaussians, camera: Camera) -> Workload:
     if gaussians.covariances is not None:
-        raise SettingsError(f"{path}: its family gives covariances, which have no raw parameters to measure from; take another checkpoint")
+        raise SettingsError(f"{name}: its family gives covariances, which have no raw parameters to measure from; take another checkpoint")
     raw = {
         "means": gaussians.means, "log_scales": gaussians.scales.log(), "quats": gaussians.quats,
         "logits": gaussians.opacities.logit(eps=1e-6), "sh": gaussians.sh,
     }  # fmt: skip
     weights = torch.randn(*camera.size, 3, generator=torch.Generator().manual_seed(0))
-    return Workload(path.name, raw, camera, weights, count_pairs(activated(raw), camera))
+    return Workload(name, raw, camera, weights, count_pairs(activated(raw), camera))
 
 
 def activated(raw: dict[str, Tensor]) -> Gaussians:

@@ -21,7 +21,7 @@ from zoom_in_plot import draw
 
 from mipmap_plugin import load_scene, wrap_model
 from mipmap_plugin.evaluation.evaluate import Evaluator, Row, adapted_row
-from mipmap_plugin.evaluation.measure import BASE, resized_base, warm_up
+from mipmap_plugin.evaluation.measure import BASE, adapt_alone, resized_base, warm_up
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.evaluation.report import records, table
@@ -58,8 +58,9 @@ def rows_of(model: Wrapped, judge: Evaluator, scale: float) -> list[Row]:
     base = lambda camera: model.render(camera.zoomed(scale), scale).image  # noqa: E731
     rows = [judge.row(BASE, scale, base, gaussians=_count(model)), enlarged(model, judge, scale, "bicubic")]
     for each in CRISPNESS:
-        rows.append(adapted_row(f"closed form, crispness {each:g}", model.adapt(scale, recipe="instant", views="train", crispness=each), judge))
-        rows.append(adapted_row(f"default, crispness {each:g}", model.adapt(scale, crispness=each), judge))
+        instant = adapt_alone(model, scale, recipe="instant", views="train", crispness=each)
+        rows.append(adapted_row(f"closed form, crispness {each:g}", instant, judge))
+        rows.append(adapted_row(f"default, crispness {each:g}", adapt_alone(model, scale, crispness=each), judge))
     return rows
 
 
@@ -69,7 +70,7 @@ def network_rows(model: Wrapped, judge: Evaluator, scale: float, networks: list[
     for network in networks:
         rows.append(enlarged(model, judge, scale, str(network)))
         for recipe in ("default", "thorough"):
-            adapted = model.adapt(scale, recipe=recipe, upsampler=str(network), **limit)
+            adapted = adapt_alone(model, scale, recipe=recipe, upsampler=str(network), **limit)
             rows.append(adapted_row(f"{recipe} + {network.name}", adapted, judge))
     return rows
 

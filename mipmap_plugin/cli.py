@@ -16,6 +16,7 @@ from mipmap_plugin.commands.backends import backends
 from mipmap_plugin.commands.demo import demo
 from mipmap_plugin.commands.evaluate import evaluate
 from mipmap_plugin.commands.inspect import inspect
+from mipmap_plugin.commands.levels import levels
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.errors import MipmapPluginError
@@ -27,7 +28,7 @@ DESCRIPTION = (
 )
 
 app = tyro.extras.SubcommandApp()
-for command in (inspect, adapt, render, evaluate, tradeoff, backends, demo):
+for command in (inspect, adapt, levels, render, evaluate, tradeoff, backends, demo):
     app.command(command)
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mipmap_plugin.limits import MAX_SEED
 
 ResizeFilter = Literal["box", "area", "bilinear", "pil-bicubic", "lanczos"]
 ViewPolicy = Literal["given", "train", "test", "orbit", "jittered"]
+Factor = Annotated[float, Field(gt=0)]
 Momentum = Annotated[float, Field(ge=0, lt=1)]
 
 
@@ -44,6 +45,7 @@ class AdaptConfig(BaseModel):
     check_every: int = Field(50, gt=0, description="Steps between two points of the curve.")
     seed: int = Field(0, ge=0, le=MAX_SEED, description="Seed of everything random.")
 
+    band: tuple[Factor, Factor] = Field((1.0, 1.0), description="Zoom-out: the file is shown from the first to the second multiple of its scale.")
     resize: ResizeFilter = Field("pil-bicubic", description="Filter that makes base images smaller; that of the protocol to be evaluated by.")
     upsampler: str = Field("bicubic", description="What makes base images larger: a registered name, or the file of a network.")
     compare_at: Literal["target", "base", "both"] = Field("target", description="Zoom-in: compare with the upsampled base, the base itself, or both.")
@@ -61,6 +63,7 @@ class AdaptConfig(BaseModel):
     crispness: float = Field(0.0, ge=0, le=1, description="Zoom-in: from 0 (highest PSNR) to 1 (splats as small as the base's, but more opaque).")
     merge_to: float = Field(1.0, gt=0, le=1, description="Fraction of the splats to keep when similar splats that share pixels are merged.")
     merging_costs: float = Field(0.3, ge=0, description="Maximum loss of merging in dB on validation views before the first step.")
+    most_splats: int | None = Field(None, gt=0, description="Merge to at most this many splats, whatever it costs, in place of `merge_to`.")
     rates: LearningRates = LearningRates()
     loss: Literal["psnr", "l2", "l1"] = Field("l2", description="Logarithm of the mean square error, mean square error, or mean absolute error.")
     decay: float = Field(1.0, gt=0, le=1, description="Fraction of itself that every learning rate decays to, along half a cosine.")
@@ -77,6 +80,12 @@ class AdaptConfig(BaseModel):
     densify_on_trial: bool = Field(False, description="Undo growth that leaves views farther from the base than at the start.")
     most_growth: float | None = Field(None, ge=1, description="Maximum ratio of splats after densifying to splats before; None: unlimited.")
     reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
+
+    @model_validator(mode="after")
+    def _band_rises(self) -> AdaptConfig:
+        if self.band[0] > self.band[1]:
+            raise ValueError(f"band: must rise, got {self.band[0]:g} to {self.band[1]:g}")
+        return self
 
     @property
     def warm_up_steps(self) -> int:

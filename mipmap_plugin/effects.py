@@ -103,6 +103,8 @@ class RenderSettings:
 
     def changed(self) -> list[str]:
         """The names of the settings that differ from the defaults."""
+        if self == USUAL:  # a quick answer, as this is asked for every image
+            return []
         return [f.name for f in fields(self) if getattr(self, f.name) != getattr(USUAL, f.name)]
 
     def without_color_rounding(self) -> RenderSettings:

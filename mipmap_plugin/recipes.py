@@ -24,6 +24,12 @@ MERGE_TO = 0.8
 # The scale up to which a zoom-out uses its full learning rates. Above it there is less to learn, and rates fall as 1 / scale.
 FULL_RATES_SCALE = 0.25
 
+# A file of fewer splats at the base's own scale has as much to learn as one just below it.
+JUST_BELOW = 1 - 1e-3
+
+# A band ends at the base's scale, up to rounding.
+HIGHEST = 1 + 1e-6
+
 # The published code of Mipmap-GS (renaissanceee/Mipmap-GS), with a named setting for each of its quirks. Its means never move, because its
 # loader leaves the factor of their learning rate at 0.
 PAPER = dict(
@@ -32,7 +38,7 @@ PAPER = dict(
 )  # fmt: skip
 
 DEFAULT_OUT = dict(
-    steps=600, loss="psnr", decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=3, gathering=0.5, warm_up=0.1, extra_views=250,
+    steps=600, loss="psnr", decay=0.02, betas=(0.8, 0.95), truth_oversampling=4, views_per_step=3, gathering=0.5, warm_up=0.1, extra_views=150,
 )  # fmt: skip
 RATES_OUT = LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=5e-4)
 THOROUGH_OUT = dict(DEFAULT_OUT, steps=2500, views_per_step=8, warm_up=0.05, extra_views=1000, merging_costs=0.1)
@@ -93,13 +99,22 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     if not callable(function):
         raise PluginError(f"recipe {name!r} is of type {type(function).__name__}; make it a function (scale, network) -> settings")
     try:
-        settings = {**function(scale, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)}
+        at = JUST_BELOW if scale == 1 and overrides.get("most_splats") else scale
+        settings = {**function(at, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)}
     except Exception as error:  # third-party code may fail in any way
         raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
     try:
-        return AdaptConfig(**{"recipe": name, **settings, **overrides})
+        config = AdaptConfig(**{"recipe": name, **settings, **overrides})
     except ValidationError as error:
         raise SettingsError("; ".join(f"setting {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())) from None
+    if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
+        raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
+    return config
+
+
+def scale_of_fraction(kept: float) -> float:
+    """The scale at which a zoom-out keeps this fraction of the splats, the inverse of `_zoom_out_settings`; at most 1."""
+    return min(1.0, kept / MERGE_TO if kept < MERGE_TO**2 / 2 else (kept / 2) ** 0.5)
 
 
 def _zoom_out_settings(scale: float) -> dict[str, Any]:

@@ -25,10 +25,18 @@ Result = TypeVar("Result")
 # The number of threads that kernels and parallel views share; None: they are not shared, and torch has its own.
 _shared: ContextVar[int | None] = ContextVar("_shared", default=None)
 
+# The number of items that are computed in parallel.
+_side_by_side: ContextVar[int] = ContextVar("_side_by_side", default=1)
+
 
 def for_kernels() -> int:
     """The number of threads for one image."""
     return _shared.get() or torch.get_num_threads()
+
+
+def side_by_side_now() -> int:
+    """The number of items that `side_by_side` computes in parallel with this one, this one included."""
+    return _side_by_side.get()
 
 
 def for_views() -> int:
@@ -90,7 +98,11 @@ def side_by_side(function: Callable[[Item], Result], items: Sequence[Item], thre
                     break
                 results[index] = function(items[index])
 
-    team(work, min(threads, len(items)))
+    token = _side_by_side.set(min(threads, len(items)))
+    try:
+        team(work, min(threads, len(items)))
+    finally:
+        _side_by_side.reset(token)
     yield from results  # type: ignore[misc]
 
 

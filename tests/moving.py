@@ -10,6 +10,7 @@ import tiny
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
@@ -91,7 +92,7 @@ def at(time: float | None) -> Camera:
 def decibels(wrapped: Wrapped, adapted: Adapted, views: list[Camera]) -> tuple[float, float]:
     """Mean dB against the pseudo truth, at its size: of the unadapted base at the adapted model's scale, and of the adapted model."""
     report, zoom = adapted.report, [view.zoomed(adapted.report.scale) for view in views]
-    truth = PseudoTruth(wrapped.model, adapted.backend, wrapped.effects(), report.scale, report.settings)
+    truth = PseudoTruth(BaseImages(wrapped.model, adapted.backend, wrapped.effects()), report.scale, report.settings)
     targets = [truth(view) for view in views]
 
     def quality(images: list[Tensor]) -> float:

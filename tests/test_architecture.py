@@ -22,7 +22,9 @@ STOREYS = [
     {"backends", "models", "scenes"},
     {"recipes"},
     {"adaptation"},
+    {"wrapped"},
     {"wrap"},
+    {"levels"},
     {"evaluation", "models.conformance"},
     {"pages"},
     {"demo"},
@@ -49,14 +51,14 @@ CONFINED = {
     "tqdm": ["adaptation/", "evaluation/", "progress.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
-    "typing_extensions": ["wrap.py"],
+    "typing_extensions": ["wrapped.py"],
 }
 
 MAX_FILE, MAX_FUNCTION = 300, 60  # lines
 MAX_ARGUMENTS = 6
 
 # Where functions may have more: kernels, which numba and Triton give no records, the commands, whose arguments are options, and the door.
-MANY_ARGUMENTS = ("backends/cpu_kernels/", "backends/triton_kernels/", "commands/", "wrap.py: adapt")
+MANY_ARGUMENTS = ("backends/cpu_kernels/", "backends/triton_kernels/", "commands/", "wrapped.py: adapt")
 
 
 def name_of(path: Path) -> str:

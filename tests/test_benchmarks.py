@@ -23,7 +23,7 @@ from pages import write_page  # noqa: E402
 from real_bases import kept  # noqa: E402
 from scenes import make  # noqa: E402
 from tables import Row, Rows  # noqa: E402
-from workloads import Size, activated, count_pairs, effects_of, from_scene  # noqa: E402
+from workloads import Size, Variant, activated, count_pairs, effects_of, from_scene, from_variant, split_into  # noqa: E402
 from zoom_in import kept as kept_with_networks  # noqa: E402
 from zoom_in_plot import draw  # noqa: E402
 
@@ -34,6 +34,7 @@ from mipmap_plugin.evaluation.report import records  # noqa: E402
 from mipmap_plugin.formats.atomic import write_json  # noqa: E402
 from mipmap_plugin.recipes import recipe as make_config  # noqa: E402
 from mipmap_plugin.splatting.projection import project  # noqa: E402
+from mipmap_plugin.splatting.rotations import rotations  # noqa: E402
 from mipmap_plugin.wrap import wrap_model  # noqa: E402
 
 
@@ -51,6 +52,30 @@ def brute_force_pairs(gaussians, camera):
 def test_pairs_are_counted_exactly():
     work = from_scene("T")
     assert count_pairs(activated(work.raw), work.camera) == brute_force_pairs(activated(work.raw).to(dtype=torch.float64), work.camera)
+
+
+def moments(gaussians):
+    """Mass, mean and covariance of all splats together."""
+    mass = gaussians.opacities * gaussians.scales.prod(1)
+    mean = (mass[:, None] * gaussians.means).sum(0) / mass.sum()
+    axes = rotations(gaussians.quats) * gaussians.scales[:, None]
+    gap = gaussians.means - mean
+    covariance = (mass[:, None, None] * (axes @ axes.mT + gap[:, :, None] * gap[:, None])).sum(0) / mass.sum()
+    return mass.sum(), mean, covariance
+
+
+def test_a_larger_stand_in_has_the_same_moments():
+    splats = tiny.gaussians(20).to(dtype=torch.float64)
+    larger = split_into(splats, 130)
+    assert len(larger) == 130
+    for one, other in zip(moments(splats), moments(larger), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize(("student", "pixels"), [(True, (6, 8)), (False, (24, 32))])
+def test_users_scenes_are_as_an_adaptation_sees_them(tmp_path, student, pixels):
+    work = from_variant(Variant(tiny.folder(tmp_path / "base"), 1 / 4, student))
+    assert work.camera.size == pixels and work.pairs > 0
 
 
 def test_scenes_are_those_that_peers_were_measured_on():

@@ -184,7 +184,7 @@ def test_a_wrong_command_is_found(parse):
 
 
 def test_there_are_commands_to_check():
-    assert len(COMMANDS) == 7 and {shlex.split(call.text)[1] for call in CALLS} >= set(COMMANDS)
+    assert len(COMMANDS) == 8 and {shlex.split(call.text)[1] for call in CALLS} >= set(COMMANDS)
 
 
 def options() -> set[str]:

@@ -11,6 +11,7 @@ import tiny
 import torch
 from anchor_checkpoints import Layout
 
+from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
@@ -129,7 +130,7 @@ def gain(model, scale, **settings):
     wrapped = wrap_model(model, cameras=VIEWS, backend="reference")
     adapted = wrapped.adapt(scale, views="given", check_every=10, **{"steps": 30, **settings})
     config = recipe("default", scale)
-    truth = PseudoTruth(model, adapted.backend, wrapped.effects(), scale, config)
+    truth = PseudoTruth(BaseImages(model, adapted.backend, wrapped.effects()), scale, config)
 
     def decibel(image, view):
         return psnr(resize(image, truth(view).shape[:2], config.resize), truth(view))

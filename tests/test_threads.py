@@ -11,8 +11,7 @@ import torch
 from anchor_checkpoints import write
 
 from mipmap_plugin import progress, threads
-from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
-from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
@@ -39,13 +38,13 @@ def test_a_model_whose_splats_differ_by_view_is_validated_alike_on_any_number_of
     assert all(report(4) == report(1) for _ in range(3))
 
 
-def test_the_truth_keeps_no_splats_that_differ_by_view(tmp_path):
+def test_base_images_keep_no_splats_that_differ_by_view(tmp_path):
     """Else a view that is rendered in parallel might get those of another."""
     model, view = load_model(write(tmp_path / "anchors")), tiny.cameras()[0]
     wrapped = wrap_model(model, backend="cpu")
-    truth = PseudoTruth(model, wrapped.backend()[0], wrapped.effects(), 1 / 2, AdaptConfig())
-    truth(view)
-    assert truth._activated is None
+    images = BaseImages(model, wrapped.backend()[0], wrapped.effects())
+    images(view)
+    assert images._activated is None
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])

@@ -28,6 +28,7 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model
@@ -131,12 +132,19 @@ def judge(truth, views=2):
 
 
 def shows(*brightness):
-    return SimpleNamespace(gaussians=lambda camera: brightness, parameters=lambda: {"means": torch.zeros(1, 3)})
+    return SimpleNamespace(gaussians=lambda camera: brightness, parameters=lambda: {"means": torch.zeros(1, 3)}, traits=Traits())
 
 
 def test_decibels_are_the_mean_of_each_view_as_it_is_displayed():
     by_hand = (-10 * math.log10(0.1**2) - 10 * math.log10(0.5**2)) / 2  # 1.7 is displayed as 1
     assert judge(0.5).steer(shows(0.6, 1.7)) == pytest.approx(by_hand, abs=1e-4)
+
+
+def test_splats_that_are_the_same_for_all_views_are_activated_once():
+    activated, model = [], tiny.model(2)
+    model.gaussians = lambda camera: activated.append(camera) or (0.6, 1.7)
+    judge(0.5).steer(model)
+    assert len(activated) == 1
 
 
 def test_the_best_state_is_chosen_and_every_score_is_told():

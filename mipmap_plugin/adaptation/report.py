@@ -32,7 +32,7 @@ class Report(BaseModel):
     effects: list[Effect]  # what adapting and rendering simulate, what they do not, and why
     gaussians_before: int
     gaussians_after: int
-    seconds: dict[str, float]  # by phase; "optimization" includes pseudo truth and steering, "total" everything
+    seconds: dict[str, float]  # by phase; "total": all of them but "loading"
     ended_by: str
     returned: str  # which of the run's states the file holds, and why if it is not the last
     validation: dict[str, float]  # dB of each state on views that nothing was adapted to and that did not steer the run

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import cast
 
 from torch import Tensor
 
@@ -23,12 +24,13 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
-from mipmap_plugin.adaptation.start.candidates import StartProblem, StartSearch, warm_up_backend
+from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch, warm_up_backend
+from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.views import choose_views, with_times
+from mipmap_plugin.adaptation.views import choose_views, over_band, with_times
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -49,37 +51,40 @@ COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}
 class AdaptationRequest:
     """What is adapted, for which viewers, and by which backend."""
 
-    model: SplatModel
-    base_effects: Effects  # how the base was rendered in training
+    images: BaseImages  # of the model, rendered as in its training, by the backend
     targets: Mapping[str, Effects]  # how the adapted file is rendered, by viewer; the file names the first of them
     viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: no particular one
-    backend: Backend
     backend_note: str  # which backend was chosen, and why
     has_gradients: bool  # whether the backend has gradients for this request
     base_in_viewer: SplatModel  # what the viewer reads of the base's own file: the base itself, where the viewer reads all of it
+    finer: FinerLevel | None = None  # what the run starts from instead of the base
 
 
 class Session:
     """One call of `adapt`: makes the parts, and runs them in order."""
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
-        self.base, self.backend, self.backend_note = request.model, request.backend, request.backend_note
-        self.base_effects, self.targets, self.has_gradients = request.base_effects, request.targets, request.has_gradients
+        self.base, self.backend, self.base_effects = request.images.model, request.images.backend, request.images.effects
+        self.targets, self.has_gradients, self.backend_note = request.targets, request.has_gradients, request.backend_note
         self.effects = next(iter(self.targets.values()))
         self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
+        self.finer = request.finer
         self.seconds, self.peak = {"optimization": 0.0}, PeakMemory(self.base.parameters()["means"].device)
-        self.views, validation, self.views_note = self._choose_views(cameras)
+        self.base_views, validation, self.views_note = self._choose_views(cameras)
+        self.views = over_band(self.base_views, config)
         self.views_note += f", {len(real.cameras)} of them real images" if real else ""
-        self.truth = PseudoTruth(self.base, self.backend, self.base_effects, scale, config, real)
+        request.images.keep_only([*self.views, *validation])
+        self.truth = PseudoTruth(request.images, scale, config, real)
         self.detail = DetailLoss(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
         if self.detail is not None:
             self.views = evenly(self.views, config.upsampled_views)
             self.views_note += f", {len(self.views)} of them upsampled"
         self.state: StateFile | None = None
-        truth = PseudoTruth(self.base, self.backend, self.base_effects, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
+        truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
         first, *further = [_renderer(self.backend, target) for target in self.extremes.values()]
-        self.validation = Validation(validation[::2], validation[1::2], scale, truth, first, config.resize, further)
+        steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
+        self.validation = Validation(steering, choosing, scale, truth, first, config.resize, further)
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
@@ -95,7 +100,8 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        if self.scale == 1 and all(target == self.base_effects for target in self.targets.values()):
+        few = _rows(self.base) <= (self.config.most_splats or sys.maxsize)
+        if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             reason = "scale 1, at which the base is right as it is"
             return Adapted(self.copy_of_base(), self._report(self.copy_of_base(), [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         began = time.perf_counter()
@@ -116,10 +122,11 @@ class Session:
 
     def _start_problem(self) -> StartProblem:
         has_blend_weights = self.has_gradients and self.base.traits.same_for_all_views
-        return StartProblem(
-            self.copy_of_base, self.views, self.scale, self.base_effects, self.start_target, self.config, self.backend, has_blend_weights, self.steer,
-            self.phase,
+        from_base = StartProblem(
+            self.copy_of_base, self.base_views, self.scale, self.base_effects, self.start_target, self.config, self.backend, has_blend_weights,
+            self.steer, self.phase,
         )  # fmt: skip
+        return from_base if self.finer is None else from_base.from_level(self.finer, lambda: self._for_target(cast(FinerLevel, self.finer).model))
 
     def _run_states(self, run: Run, initial: SplatModel) -> dict[str, SplatModel]:
         """The best and the last state of a run, where they differ from the start (the `initial` model) and from each other."""
@@ -132,7 +139,9 @@ class Session:
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
-        began, last = time.perf_counter(), next(reversed(states))
+        began, most = time.perf_counter(), self.config.most_splats or sys.maxsize
+        states = {name: model for name, model in states.items() if _rows(model) <= most}
+        last = next(reversed(states))
         with self.phase("validation"):
             best, psnrs = self.validation.choose(states)
         self.seconds["total"] += time.perf_counter() - began
@@ -151,6 +160,7 @@ class Session:
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
         max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
+        max_splats = min(max_splats, self.config.most_splats or sys.maxsize)
         first, *further = [_renderer(self.backend, _unrounded(target)) for target in self.extremes.values()]
         task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further)
         keeper = StateKeeper(resume, self._fingerprint())
@@ -161,7 +171,6 @@ class Session:
                 self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
-        before = run.watch.seconds if run.step == 0 else self.seconds["total"]
 
         def after_step(run: Run) -> None:
             keeper.save_if_due(run)
@@ -170,7 +179,9 @@ class Session:
 
         ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
         self.state = keeper.remaining_file()
-        self.seconds["optimization"] = run.watch.seconds - before
+        self.seconds["pseudo truth"] = sum(run.costs.truths.values())
+        self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
+        self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
         return run, ended_by + growth_note(run)
 
@@ -206,6 +217,7 @@ class Session:
         poses = [[view.width, view.height, view.fx, view.fy, view.time, *view.viewmat.flatten().tolist()] for view in self.views]
         base = self.base.digest or _digest(self.base)
         targets = [asdict(target) for target in self.targets.values()]
+        base += "" if self.finer is None else _digest(self.finer.model)
         facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.base_effects), targets, poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 

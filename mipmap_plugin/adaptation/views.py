@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -21,6 +22,10 @@ ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
 
 
+# Views take their places in a band at multiples of the golden ratio, so that any number of consecutive ones is spread evenly.
+GOLDEN = (math.sqrt(5) - 1) / 2
+
+
 class ViewSchedule:
     """The views that each step uses. It has no state, so that a run can be resumed at any step."""
 
@@ -28,6 +33,12 @@ class ViewSchedule:
         self._rounds, self._seed, self._steps = ShuffledRounds(views, config.seed), config.seed, config.steps
         self._max_views, self._warm_up = min(config.views_per_step, len(views)), config.warm_up_steps
         self._gathering = math.ceil(config.gathering * config.steps)  # steps during which new views are introduced
+        self._draws_in_warm_up = [0, *accumulate(self._views_in_step(step) for step in range(self._warm_up))]  # before each of its steps
+
+    @property
+    def views(self) -> int:
+        """The number of views."""
+        return len(self._rounds.views)
 
     def __call__(self, step: int, progress: float) -> list[Camera]:
         """Return the views of a step: at first its new views and some of the earlier ones, later the next ones of a round through all.
@@ -36,7 +47,7 @@ class ViewSchedule:
         """
         pace, count = max(step, int(progress * self._steps)), self._views_in_step(step)
         if pace >= self._gathering:
-            first = self._draws_before(step)
+            first = self.draws_before(step)
             return [self._rounds(first + number) for number in range(count)]
         before, after = self._introduced(pace - 1), self._introduced(pace)
         new = range(before, min(after, before + count))
@@ -48,17 +59,16 @@ class ViewSchedule:
         """The number of views of a step. It rises during the warm-up: the first gradients are alike in all views, so few views suffice."""
         return self._max_views if self._warm_up <= max(0, step) else math.ceil(self._max_views * (step + 1) / self._warm_up)
 
-    def _draws_before(self, step: int) -> int:
+    def draws_before(self, step: int) -> int:
         """The number of draws of all earlier steps; that of the warm-up is rounded up to whole steps, so that rounds align with steps."""
-        first = sum(self._views_in_step(earlier) for earlier in range(min(step, self._warm_up)))
         if step < self._warm_up:
-            return first
-        return math.ceil(first / self._max_views) * self._max_views + (step - self._warm_up) * self._max_views
+            return self._draws_in_warm_up[max(0, step)]
+        return (math.ceil(self._draws_in_warm_up[-1] / self._max_views) + step - self._warm_up) * self._max_views
 
     def _introduced(self, step: int) -> int:
         """The number of views introduced up to a step: spread evenly, at least one per step, and no more per step than it uses."""
         count = max(self._views_in_step(step), step + 1, math.ceil(len(self._rounds.views) * (step + 1) / self._gathering))
-        return min(count, self._draws_before(step + 1), len(self._rounds.views))
+        return min(count, self.draws_before(step + 1), len(self._rounds.views))
 
 
 class ShuffledRounds:
@@ -109,6 +119,14 @@ def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: A
         extra = jittered(views, config.extra_views, generator)
         return views + extra, f"{len(views)} train views and {len(extra)} around them"
     return views, f"the {len(views)} {split} views"
+
+
+def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:
+    """The views of the base scale, each at one multiple of it out of the settings' band, evenly spread over the band's logarithm."""
+    low, high = config.band
+    if low == high == 1:
+        return list(views)
+    return [view.zoomed(low * (high / low) ** ((number + 0.5) * GOLDEN % 1)) for number, view in enumerate(views)]
 
 
 def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:

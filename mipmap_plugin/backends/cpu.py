@@ -70,10 +70,19 @@ def _drawing() -> ModuleType:
     return drawing
 
 
+def _ahead() -> ModuleType:
+    from mipmap_plugin.backends.cpu_kernels import ahead
+
+    return ahead
+
+
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, camera: Camera, effects: Effects, ranks: Any, *tensors: Any) -> tuple[Tensor, Tensor]:
         drawing, gradients = _drawing(), any(ctx.needs_input_grad)
+        ctx.kind = tensors[-1] is not None, effects
+        if gradients:
+            _ahead().start(*ctx.kind)
         image, alpha, ctx.drawing = drawing.draw(drawing.as_arrays(*tensors), camera, effects, ranks, gradients=gradients)
         ctx.save_for_backward(*tensors)
         return torch.from_numpy(image), torch.from_numpy(alpha)
@@ -83,6 +92,7 @@ class _Draw(torch.autograd.Function):
     def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Tensor | None, ...]:
         tensors = ctx.saved_tensors  # read even where unused: torch raises an error here if one was modified in place
         d_outputs = d_image.contiguous().numpy(), d_alpha.contiguous().numpy()
+        _ahead().wait(*ctx.kind)
         grads = _drawing().draw_back(ctx.drawing, *d_outputs, harmonics=ctx.needs_input_grad[SH])
         # Gradients that are not wanted, and those of the shape that is not in use, are empty: None for torch.
         pairs = zip(tensors, grads, strict=True)

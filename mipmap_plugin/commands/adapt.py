@@ -11,9 +11,10 @@ import tyro
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
-from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.recipes import recipe as make_config
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 def adapt(
     checkpoint: Checkpoint,
-    scale: Scales,
+    scale: tyro.conf.UseAppendAction[tuple[Scale, ...]] = (),
     output: Path | None = None,
     recipe: str = "default",
     viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
@@ -34,6 +35,8 @@ def adapt(
     steps: int | None = None,
     time_budget_s: float | None = None,
     target_db: float | None = None,
+    splats: int | None = None,
+    bytes: str | None = None,
     resize: ResizeFilter | None = None,
     upsampler: str | None = None,
     images: Path | None = None,
@@ -50,7 +53,7 @@ def adapt(
 
     Args:
         checkpoint: A PLY or a model folder.
-        scale: Target focal length over base focal length, such as 1/4 or 4. Required; may be given several times.
+        scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without splats or bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
         viewer: Viewer to make the file for: classic (the default; INRIA, gsplat, nerfstudio), spark, ...; portable: all; repeat it for a file each.
@@ -59,6 +62,8 @@ def adapt(
         steps: Maximum number of optimizer steps.
         time_budget_s: Maximum number of seconds.
         target_db: Stop at this PSNR against the pseudo truth (not against photographs).
+        splats: Maximum number of splats. Without a scale, the file is made for the zoom that so many splats suit.
+        bytes: Maximum size of the file, such as 20MB, in place of a number of splats.
         resize: Filter that makes base images smaller.
         upsampler: What makes base images larger: a registered name, or the file of a super-resolution network.
         images: Folder of the scene. A zoom-in is then adapted to its training images, at the resolution of the base, instead of the base's own.
@@ -72,16 +77,25 @@ def adapt(
         json: Print the reports as JSON.
     """
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    size, fitting = _fitting(wrapped.model, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False))
     settings = without_none(views=views, resize=resize, upsampler=upsampler, steps=steps, time_budget_s=time_budget_s, target_db=target_db)
-    requests = _requests(scale, viewer)
+    requests = _requests(scale or fitting, viewer)
     targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]
-    for (factor, name), target in zip(requests, targets, strict=True):
-        config = make_config(recipe, factor, seed=seed, **settings)
-        wrapped.targets(name)
-        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=name)
+    _check(wrapped, requests, targets, settings | size | dict(recipe=recipe, seed=seed), overwrite)
     page = AdaptationPage(checkpoint, targets, overwrite) if report else None
-    settings |= dict(recipe=recipe, seed=seed, images=images and scene(images))
+    settings |= size | dict(recipe=recipe, seed=seed, images=images and scene(images))
     _save_all(wrapped, _adapted(wrapped, requests, targets, settings), page, overwrite, json)
+
+
+def _check(
+    wrapped: Wrapped, requests: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any], overwrite: bool
+) -> None:
+    """Raise now what adapting and saving would raise, as far as it can be predicted."""
+    further = {name: value for name, value in settings.items() if name != "recipe"}
+    for (scale, viewer), target in zip(requests, targets, strict=True):
+        config = make_config(settings["recipe"], scale, **further)
+        wrapped.targets(viewer)
+        wrapped.refuse_output(target, overwrite=overwrite, networks_move=config.steps > 0 and config.rates.networks > 0, viewer=viewer)
 
 
 def _adapted(
@@ -117,10 +131,23 @@ def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> d
     return {"file": str(saved), **adapted.report.model_dump()}
 
 
-def _requests(scales: list[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:
+def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:
     """Each scale with each viewer, without repetitions."""
     names: list[str | None] = [*dict.fromkeys(viewers)] or [None]
     return [(scale, name) for scale in unique_scales(scales) for name in names]
+
+
+def _fitting(model: SplatModel, splats: int | None, size: str | None, output: Path) -> tuple[dict[str, int], Sequence[float]]:
+    """The setting for the smaller of a number of splats and of what fits into a size, and the scale that suits it; nothing if neither is given."""
+    if splats is None and size is None:
+        return {}, ()
+    from mipmap_plugin.levels.fitting import fitting_scale, read_size, splats_within
+
+    if splats is not None and splats < 1:
+        raise SettingsError(f"splats: must be at least 1, got {splats}")
+    within = [] if size is None else [splats_within(model, read_size(size), output.name)]
+    most = min([*within, *([] if splats is None else [splats])])
+    return {"most_splats": most}, (fitting_scale(most, model),)
 
 
 def _made_for(report: Report, model: SplatModel) -> str:

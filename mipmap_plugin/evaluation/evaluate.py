@@ -14,7 +14,7 @@ from tqdm import tqdm
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.measure import FILTERS, RenderView, base_in_viewer, baselines, views_seen, warm_stopwatch, warm_up
+from mipmap_plugin.evaluation.measure import FILTERS, RenderView, adapt_alone, base_in_viewer, baselines, views_seen, warm_stopwatch, warm_up
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_exposed, test_views
@@ -169,7 +169,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
         if recipes and (scale != 1 or viewer):
             warm_up(model, scale, model.cameras)
         for name, on in product(recipes if scale != 1 or viewer else [], ("train", "scored")):
-            adapted = model.adapt(scale, recipe=name, **(settings | _views(make_config(name, scale), on, judge.views)))
+            adapted = adapt_alone(model, scale, recipe=name, **(settings | _views(make_config(name, scale), on, judge.views)))
             rows.append(adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge))
     return rows
 

@@ -6,11 +6,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import Stopwatch
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
@@ -124,6 +125,12 @@ def warm_stopwatch(show: RenderView, view: Camera) -> Stopwatch:
 def warm_up(model: Wrapped, scale: float, cameras: Sequence[Camera]) -> None:
     """Adapt one step on one view, so that compiling at first use is not counted in an adaptation."""
     model.adapt(scale, cameras=cameras[:1], views="given" if cameras else "orbit", extra_views=1, steps=1, validation_views=2)
+
+
+def adapt_alone(model: Wrapped, scale: float, **options: Any) -> Adapted:
+    """Adapt as the first call does: the seconds include every base image, whatever earlier calls have drawn. `options`: of `adapt`."""
+    model.images = None
+    return model.adapt(scale, **options)
 
 
 def views_seen(judged: Sequence[Camera], adapted: Sequence[Camera]) -> list[Camera]:

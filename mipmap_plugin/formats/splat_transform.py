@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ def is_written(path: Path) -> bool:
 
 def refuse_exchange(path: Path) -> list[str]:
     """The command of splat-transform. Raises SettingsError, naming the output `path`, if it is not installed."""
-    tool = _tool()
+    tool = find_tool()
     if tool is None:
         raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}; or give a .ply")
     return tool
@@ -64,7 +64,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
     Raises CheckpointError.
     """
     name, ending = EXCHANGE[kind]
-    tool = _tool()
+    tool = find_tool()
     if tool is None:
         raise CheckpointError(f"{path} is {name}, an exchange format, which {TOOL} reads, but {TOOL} is not installed; run: {INSTALL}")
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
@@ -73,7 +73,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
             source = Path(folder, f"source{ending}")
             shutil.copyfile(path, source)
         plain = Path(folder, "plain.ply")
-        if reason := _run(tool, source, plain):
+        if reason := _run(tool, [source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
         yield plain
 
@@ -88,13 +88,13 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
         ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
         plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
         write(plain)
-        if reason := _run(tool, plain, converted):
+        if reason := _run(tool, [plain], converted):
             raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
         shutil.copyfile(converted, temporary)
     return path
 
 
-def _tool() -> list[str] | None:
+def find_tool() -> list[str] | None:
     """The command on the PATH, or the one that npx finds without downloading; None if there is neither."""
     if found := shutil.which(TOOL):
         return [found]
@@ -109,10 +109,17 @@ def _tool() -> list[str] | None:
     return command if version.returncode == 0 else None
 
 
-def _run(tool: list[str], source: Path, target: Path) -> str:
+def convert(inputs: Sequence[str | Path], output: Path) -> None:
+    """Write `output`, in a format given by its name, from files and the options after each. Raises OutputError."""
+    tool = refuse_exchange(output)
+    if reason := _run(tool, inputs, output):
+        raise OutputError(f"{output}: {TOOL} does not write it ({reason})")
+
+
+def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
     """Run splat-transform. Returns its error message, empty on success."""
     # On a GPU SOG's palette may differ; on the CPU the same file is written on every machine.
-    command = [*tool, "--quiet", "--overwrite", "--gpu", "cpu", str(source), str(target)]
+    command = [*tool, "--quiet", "--overwrite", "--gpu", "cpu", *map(str, inputs), str(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:

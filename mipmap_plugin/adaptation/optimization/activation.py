@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -58,11 +60,22 @@ class Activation:
         if self._splats is None:
             return
         splats = _tensors(self._splats)
-        # The sum of splats times gradients has exactly these gradients. torch.autograd.backward would take them directly, but it loads sympy.
-        products = [(splats[name] * gradient).sum() for name, gradient in self._gradients.items()]
-        self._splats, self._gradients = None, {}  # free the memory for the optimizer and density control
-        if products:
-            torch.stack(products).sum().backward()
+        gradients, self._splats, self._gradients = self._gradients, None, {}  # free the memory for the optimizer and density control
+        if gradients:
+            _WithGradients.apply(list(gradients.values()), *(splats[name] for name in gradients)).backward()  # type: ignore[no-untyped-call]  # torch's
+
+
+class _WithGradients(torch.autograd.Function):
+    """A number whose backward pass hands `gradients` on to `tensors`. torch.autograd.backward takes them too, but it loads sympy."""
+
+    @staticmethod
+    def forward(ctx: Any, gradients: Sequence[Tensor], *tensors: Tensor) -> Tensor:
+        ctx.gradients = gradients
+        return tensors[0].new_zeros(())
+
+    @staticmethod
+    def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, ...]:
+        return None, *ctx.gradients
 
 
 def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:

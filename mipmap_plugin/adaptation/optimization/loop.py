@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 from torch import Tensor
-from tqdm import tqdm
 
 from mipmap_plugin.adaptation.curve import CurvePoint, decibel, reason_to_stop
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
+from mipmap_plugin.adaptation.optimization.estimate import BAR, Bar, Forecast
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
@@ -36,7 +37,8 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     step and after each step; its time is not counted.
     """
     order, cameras = ViewSchedule(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
-    bar = tqdm(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step")
+    forecast, began = Forecast(order, config, lambda step: is_checked(step, config), run.step), run.watch.seconds - run.costs.seconds()
+    bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
     with bar, interruptible() as interrupted:
         observe(run)
         while (reason := reason_to_stop(run.curve, run.watch.seconds, config)) is None and run.step < config.steps:
@@ -44,6 +46,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
                 _step(run, task, config, order(run.step, run.progress(config)), cameras)
                 if is_checked(run.step, config):
                     _check(run, task, config)
+            bar.seconds_left = min(forecast.left(run.step, run.watch.seconds - began, run.costs), _budget_left(run, config))
             bar.update()
             if run.curve[-1].step == run.step:
                 bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
@@ -55,6 +58,10 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             if run.curve[-1].step < run.step:
                 _check(run, task, config)
     return reason or f"{config.steps} steps"
+
+
+def _budget_left(run: Run, config: AdaptConfig) -> float:
+    return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - run.watch.seconds)
 
 
 def is_checked(step: int, config: AdaptConfig) -> bool:
@@ -80,12 +87,13 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         draw, view = draw_and_view
         camera = cameras[view]
         gaussians = splats(camera)
-        target = task.truth(view)  # r(x̂): the frozen base, resized
+        target = run.costs.truth(view, task.truth)  # r(x̂): the frozen base, resized
         image = task.renderer(draw)(gaussians, camera)  # x: the student at the new scale
         difference = difference_from(target, image, config.resize)
-        loss = _loss(difference, config.loss)
+        square_error = difference.square().mean()
+        loss = _loss(difference, square_error, config.loss)
         (loss if task.detail is None else loss + task.detail(view, image)).backward()
-        return gaussians, camera, difference.detach().square().mean()
+        return gaussians, camera, square_error.detach()
 
     draws = list(enumerate(views, run.step * config.views_per_step))
     threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if splats.shares else 1
@@ -105,18 +113,17 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
 # --8<-- [end:step]
 
 
-def _loss(difference: Tensor, name: str) -> Tensor:
+def _loss(difference: Tensor, square_error: Tensor, name: str) -> Tensor:
     """The loss of one image. `psnr` is the logarithm of the mean square error, so that a view that is far off does not outweigh the others."""
     if name == "l1":
         return difference.abs().mean()
-    square = difference.square().mean()
-    return (square + INVISIBLE_ERROR).log() if name == "psnr" else square
+    return (square_error + INVISIBLE_ERROR).log() if name == "psnr" else square_error
 
 
 def _check(run: Run, task: Task, config: AdaptConfig) -> None:
     """Measure the run on validation views: keep its state or undo the last steps, and append a point to the curve."""
     steering, steps = run.steering, run.step - run.curve[-1].step
-    validation_db = task.validation.steer(run.student)
+    validation_db = run.costs.check(lambda: task.validation.steer(run.student))
     growing = run.trial is not None and run.trial.before is not None  # a growth gets some steps before it is assessed
     harmful = config.returns == "best" and not growing and steering.is_harmful(validation_db)
     if harmful:

@@ -12,6 +12,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
+from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
@@ -89,6 +90,7 @@ class Run:
     curve: list[CurvePoint] = field(default_factory=list)
     square_error: Tensor | float = 0.0  # summed since the last point of the curve, on the device of the images, so that no step waits for it
     rows_changed: bool = False  # splats were added or removed
+    costs: Costs = field(default_factory=Costs)  # in this process
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
@@ -96,9 +98,10 @@ class Run:
         means = student.parameters()["means"]
         optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch(seconds=spent)
         with watch:
-            trial, steering = Trial.begin(student, task, config), Steering.begin(student, task.validation)
+            trial, costs = Trial.begin(student, task, config), Costs()
+            steering = Steering.begin(student, costs.check(lambda: task.validation.steer(student)))
         first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=steering.start_db, gaussians=len(means))
-        return cls(student, optimizer, watch, ScreenGradients.of(means, config), steering, trial, curve=[first])
+        return cls(student, optimizer, watch, ScreenGradients.of(means, config), steering, trial, curve=[first], costs=costs)
 
     def progress(self, config: AdaptConfig) -> float:
         """Fraction (0..1) of the steps or of the time budget that is used, whichever is larger."""

@@ -69,9 +69,11 @@ class Validation:
 
     @torch.no_grad()
     def _mean_psnr(self, render: Callable[[Gaussians, Camera], Tensor], model: SplatModel, views: Sequence[Camera]) -> float:
+        shared = model.gaussians(views[0]) if views and model.traits.same_for_all_views else None
+
         def psnr(view: Camera) -> float:
             camera = view.zoomed(self.scale)
-            image = render(model.gaussians(camera), camera).clamp(0, 1)
+            image = render(shared or model.gaussians(camera), camera).clamp(0, 1)
             return decibel(float(difference_from(self.truth(view), image, self.resize).square().mean()))
 
         threads = max_threads(model.parameters()["means"], views[0].zoomed(self.scale)) if views else 1
@@ -140,9 +142,8 @@ class Steering:
     ceiling: float = 1.0  # upper limit of the rate factor, after larger rates did harm
 
     @classmethod
-    def begin(cls, student: SplatModel, validation: Validation) -> Steering:
-        """The steering of a run that begins with `student`."""
-        psnr = validation.steer(student)
+    def begin(cls, student: SplatModel, psnr: float) -> Steering:
+        """The steering of a run that begins with `student`, which has this PSNR (dB) on the steering views."""
         return cls(psnr, psnr, Snapshot.of(student))
 
     def rate_factor(self, progress: float, config: AdaptConfig) -> float:

@@ -13,7 +13,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, filter_suffices, pixel_size
 from mipmap_plugin.adaptation.start.matching import matched_opacities
-from mipmap_plugin.adaptation.start.merging import merge
+from mipmap_plugin.adaptation.start.merging import merge, merge_down
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -23,6 +23,14 @@ from mipmap_plugin.models.base import Rebuilt, SplatModel
 
 # Views from which blend weights are computed.
 WEIGHT_VIEWS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class FinerLevel:
+    """A model for the same viewer at a finer scale than the wanted one, to start from instead of from the base."""
+
+    model: SplatModel
+    scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +47,21 @@ class StartProblem:
     has_blend_weights: bool  # whether splats are the same for all views, and the backend has the gradients that blend weights need
     steer: Callable[[SplatModel], float]  # PSNR (dB) of a model on the views that steer the run
     phase: Callable[[str], AbstractContextManager[None]]  # counts the seconds spent inside under a phase of that name
+    name: str = "the base"  # what the base is called in the report
+    may_lose: float = 0.0  # dB by which merged splats may be worse than the base as it is
+
+    def from_level(self, finer: FinerLevel, model: Callable[[], SplatModel]) -> StartProblem:
+        """The same request, starting from a finer level instead of from the base; `model` makes copies of it.
+
+        The settings' `merge_to` stays a fraction of the base's splats. A finer level may be as good as it is: it is merged all the same.
+        """
+        counts = [len(splats.parameters()["means"]) for splats in (self.base(), finer.model)]
+        config = self.config.model_copy(update={"merge_to": min(1.0, self.config.merge_to * counts[0] / counts[1])})
+        views = [view.zoomed(finer.scale) for view in self.views]
+        return replace(
+            self, base=model, views=views, scale=self.scale / finer.scale, base_effects=self.target, config=config, name="the finer level",
+            may_lose=config.merging_costs,
+        )  # fmt: skip
 
 
 class StartSearch:
@@ -53,10 +76,13 @@ class StartSearch:
     def best(self) -> tuple[SplatModel, str]:
         """Return the model to begin with, and its name."""
         problem, config, base = self._problem, self._problem.config, self._problem.base()
-        if not (config.closed_form or config.merge_to < 1):
-            return base, "the base"
+        too_many = config.most_splats is not None and len(base.parameters()["means"]) > config.most_splats
+        if not (config.closed_form or config.merge_to < 1 or too_many):
+            return base, problem.name
         with problem.phase("blend weights"):
-            weights = self._base_weights(base) if self._matches_weights or config.merge_to < 1 else None
+            weights = self._base_weights(base) if self._matches_weights or config.merge_to < 1 or too_many else None
+        if too_many:
+            return self._candidate(weights, 0.0), "the closed form of merged splats"
         formed = self._candidate(weights, 1.0)
         if config.merge_to == 1 and config.returns == "last":
             return formed, "the closed form"
@@ -64,11 +90,11 @@ class StartSearch:
         for fraction in (config.merge_to ** (1 / root) for root in (1, 2, 4)) if config.merge_to < 1 else ():
             merged = self._candidate(weights, fraction)
             if (merged_db := problem.steer(merged)) >= formed_db - config.merging_costs:
-                return (merged, "the closed form of merged splats") if merged_db >= base_db else (base, "the base")
-        return (formed, "the closed form") if formed_db >= base_db else (base, "the base")
+                return (merged, "the closed form of merged splats") if merged_db >= base_db - problem.may_lose else (base, problem.name)
+        return (formed, "the closed form") if formed_db >= base_db else (base, problem.name)
 
     def _candidate(self, weights: Tensor | None, fraction: float) -> SplatModel:
-        """The base in closed form, after merging its splats down to a fraction of them."""
+        """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""
         problem, student = self._problem, self._problem.base()
         if fraction < 1 and weights is not None:
             with problem.phase("merging"):
@@ -79,12 +105,17 @@ class StartSearch:
         return student
 
     def _merge(self, student: SplatModel, weights: Tensor, fraction: float) -> Tensor:
-        """Merge the student's splats down to a fraction of them; return the blend weights of the merged splats."""
-        merged_weights = []
+        """Merge the student's splats down to a fraction of them, or to `most_splats`; return the blend weights of the merged splats."""
+        merged_weights, most = [], self._problem.config.most_splats
+
+        def pixel_of(means: Tensor) -> Tensor:
+            return pixel_size(means, self._problem.views) / self._problem.scale
 
         def merged(gaussians: Gaussians) -> Gaussians:
-            pixel = pixel_size(gaussians.means, self._problem.views) / self._problem.scale
-            splats, new_weights = merge(gaussians, pixel, weights, fraction)
+            if most is None:
+                splats, new_weights = merge(gaussians, pixel_of(gaussians.means), weights, fraction)
+            else:
+                splats, new_weights = merge_down(gaussians, pixel_of, weights, most)
             merged_weights.append(new_weights)
             return splats
 

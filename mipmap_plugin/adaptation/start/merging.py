@@ -9,6 +9,7 @@ objective function"); many pairs are merged at a time.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -41,6 +42,9 @@ MERGED_PER_ROUND = 0.7
 # Merging ends when a round finds fewer pairs than this fraction of the splats.
 MIN_PAIRS = 0.002
 
+# Merging down to a count takes pixels up to this many times as large as those of the target.
+COARSEST_MERGE = 16.0
+
 # Cells of the space-filling curve lie at -2^19..2^19 on each axis, and are shifted by 2^19..2^20, so that 21 bits suffice.
 CELL_RANGE = 2**19
 
@@ -68,6 +72,22 @@ def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float)
         splats, new_rows = splats.merged(first[:count], second[:count])
         rows = new_rows[rows]
     return splats.gaussians(gaussians, rows, old_weights), splats.weights
+
+
+def merge_down(gaussians: Gaussians, pixel_of: Callable[[Tensor], Tensor], weights: Tensor, most: int) -> tuple[Gaussians, Tensor]:
+    """Merge splats until there are at most `most`; return them and their blend weights.
+
+    Where too few share a pixel, they are merged as at coarser and coarser scales; if too many are left at `COARSEST_MERGE`, those of the
+    least blend weight are dropped. `pixel_of`: the size of a target pixel at means [N, 3], [N] in world units. `weights` [N]: as in `merge`.
+    """
+    coarser = 1.0
+    while len(gaussians) > most and coarser <= COARSEST_MERGE:
+        gaussians, seen = merge(gaussians, coarser * pixel_of(gaussians.means), weights / coarser**2, (most + 0.5) / len(gaussians))
+        weights, coarser = seen * coarser**2, coarser * 2**0.5
+    if len(gaussians) > most:
+        kept = weights.topk(most).indices.sort().values
+        gaussians, weights = gaussians[kept], weights[kept]
+    return gaussians, weights
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from mipmap_plugin.adaptation.target.pseudo_truth import moved_off_full_gpu
+from mipmap_plugin.adaptation.target.image_store import moved_off_full_gpu
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.structure import similarity
 from mipmap_plugin.adaptation.target.upsamplers import find_upsampler

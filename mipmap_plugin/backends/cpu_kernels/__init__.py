@@ -24,13 +24,14 @@ Memory layout. All arrays are contiguous; a pair is a splat and a tile that it t
                         v                                v                               v
         members, slots  | tile 0, front to back          | tile 1 ...                    |
 
-    tile (`planes`), on the stack: 16 rows of 64 px. Each quantity is a plane with rows of 64 + 16 floats, so that 16 lanes may start at
-    any pixel. Then come the current splat's bounds in each row.
+    tile (`planes`), on the stack: 16 x 4 patches of 4 x 4 px. Each quantity is a plane with the 16 px of one patch after the other's, so
+    that a patch is one set of lanes.
 
-        red, green, blue, TRANSMITTANCE,      | row 0: 64 px     | 16 spare |
-        STOPS, BEHIND_DOT_GRAD: each          | ...                         |
-                                              | row 15: 64 px    | 16 spare |
-        ROW_BEGIN, ROW_END, ROW_CENTER, ROW_PEAK: 16 floats each
+        red, green, blue, TRANSMITTANCE,      | patch 0: 16 px | patch 1 ...                  | patch 15 |
+        STOPS, BEHIND_DOT_GRAD: each          | patch 16       | ...                          |          |
+                                              | ...            |                              | patch 63 |
+
+    batch (`compositing.find_patches`), on the stack: for 32 splats of a list, an integer whose bits are the patches that each touches.
 
 numba counts references to arrays, and to records that hold arrays; each count is an atomic operation, and a few per splat cost more
 than all of its geometry. So a kernel takes arrays out of their records once, and passes pointers, numbers and tuples of them to the

@@ -10,9 +10,9 @@ from mipmap_plugin.backends.cpu_kernels.blocks import get, put
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, floor, lowest_bit, maximum, minimum, narrow, select, sqrt, wide
 from mipmap_plugin.effects import MIN_ALPHA
 
-# px. One row per lane, so that a splat's outline in all rows is computed at once. Tiles are wide so that splats touch few of them; pixels
-# outside the ellipse cost nothing, since each row is visited from edge to edge of the ellipse. A tile's state fits a first-level cache.
-TILE_HEIGHT = WIDTH
+# px. Tiles are wide so that splats touch few of them; what lies outside an ellipse costs little, since a splat visits only the patches of
+# 4 x 4 px that it touches (`planes`). There are 64 of those, the bits of an integer. A tile's state fits a first-level cache.
+TILE_HEIGHT = 16
 TILE_WIDTH = 64
 
 # px. Pixels this close to the outside of a splat's ellipse are visited too, so that rounding loses no pixel that passes the alpha test.

@@ -1,4 +1,4 @@
-"""Front-to-back compositing of tiles: splat by splat, over the rows of its ellipse, 16 pixels at a time.
+"""Front-to-back compositing of tiles: splat by splat, over the patches of 4 x 4 pixels that its ellipse touches.
 
 `planes` updates the pixels themselves.
 """
@@ -6,33 +6,49 @@
 # numba redefines calls and operators.
 # mypy: ignore-errors
 
+import numpy as np
 from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, SLACK, TILE_HEIGHT, TILE_WIDTH, tile_grid
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, floor, fma, lowest_bit, maximum, minimum, ramp, sqrt
-from mipmap_plugin.backends.cpu_kernels.memory import load, prefetch, row_of, scratch, store
+from mipmap_plugin.backends.cpu_kernels.lanes import (
+    WIDTH,
+    across,
+    bit_ranges,
+    bits,
+    both,
+    ceil,
+    down,
+    floor,
+    fma,
+    lowest_bit,
+    maximum,
+    minimum,
+    next_four,
+    select,
+    sqrt,
+)
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, prefetch, row_of, scratch
 from mipmap_plugin.backends.cpu_kernels.planes import (
     BEHIND_DOT_GRAD,
+    PATCH,
+    PATCHES,
     PLANE,
-    ROW_BEGIN,
-    ROW_CENTER,
-    ROW_END,
-    ROW_PEAK,
-    STATE_SIZE,
     STOPS,
-    STRIDE,
     TRANSMITTANCE,
     blend,
+    distances,
+    new_state,
+    offset_of,
 )
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MIN_ALPHA
 
-# Splats between two checks whether the tile is finished.
-CHECK_EVERY = 16
+# Splats whose patches are found before the first of them is drawn: drawing waits for nothing then, and what is finished is left out.
+BATCH = 32
 
-new_state = scratch(STATE_SIZE, types.float32)
+new_patches = scratch(BATCH, types.int64)
 
 # Splats between prefetching a row of the table and using it.
 PREFETCH_AHEAD = 4
@@ -47,22 +63,20 @@ def tile_box(tile, width, height):
 
 
 @inner
-def outline_rows(splat, box, state):
-    """Write a splat's outline in each row of a tile, and return a bit per row that it touches.
-
-    Row r has in `state`, from ROW_BEGIN on: the first and last x, and the x and log2 alpha of the maximum.
-    """
+def touched_patches(splat, box):
+    """A bit per patch of a tile that the box around a splat's ellipse reaches in that row of patches."""
     left, top, width, height = box
-    dy = ramp(top + 0.5 - splat[layout.Y])
-    center = fma(dy, splat[layout.SHEAR], splat[layout.X] - left - 0.5)
-    peak = fma(dy * dy, -splat[layout.FALL_Y], splat[layout.PEAK])
-    half_width = sqrt(maximum(peak - LOG_MIN_ALPHA, 0) * splat[layout.PER_FALL_X]) + SLACK
-    begin, end = maximum(ceil(center - half_width), 0), minimum(floor(center + half_width), width - 1)
-    store(state, ROW_BEGIN, begin)
-    store(state, ROW_END, end)
-    store(state, ROW_CENTER, center)
-    store(state, ROW_PEAK, peak)
-    return bits(both(peak >= LOG_MIN_ALPHA, end >= begin)) & ((1 << height) - 1)
+    # Lanes 0 to 3 are the rows of patches for the rightmost x of the ellipse in each, lanes 4 to 7 for the leftmost x.
+    side, first_row = select(down(0) < 1, 1, -1), across(0) * PATCH
+    above = first_row + (np.float32(top + 0.5) - splat[layout.Y])
+    dy = minimum(maximum(side * splat[layout.RIGHTMOST_DY], above), above + (PATCH - 1))
+    margin = fma(dy * dy, 0 - splat[layout.FALL_Y], splat[layout.PEAK] - np.float32(LOG_MIN_ALPHA))
+    half_width = sqrt(maximum(margin, 0) * splat[layout.PER_FALL_X]) + SLACK
+    edge = fma(dy, splat[layout.SHEAR], fma(side, half_width, splat[layout.X] - np.float32(left + 0.5)))
+    touched = both(margin >= 0, first_row < height)
+    end = select(touched, maximum(floor(minimum(edge, width - 1) * (1 / PATCH)) + 1, 0), 0)
+    begin = minimum(maximum(ceil((next_four(edge) - (PATCH - 1)) * (1 / PATCH)), 0), end)
+    return bit_ranges(begin, end)
 
 
 @kernel
@@ -75,22 +89,32 @@ def composite(start, stop, integrated, limits, table, lists, frame, outputs):
     starts, members, _, _ = lists
     _, transmittance, _ = frame
     height, width = transmittance.shape
-    state = new_state()
+    state, patches = new_state(), new_patches()
     for tile in range(start, stop):
-        box = tile_box(tile, width, height)
-        length = starts[tile + 1] - starts[tile]
+        box, first = tile_box(tile, width, height), starts[tile]
+        length = starts[tile + 1] - first
         init_tile(box, length, state)
-        for n in range(length):
-            if n % CHECK_EVERY == 0 and finished(state):
+        for begin in range(0, length, BATCH):
+            unfinished = unfinished_patches(state)
+            if unfinished == 0:
                 break
-            at = starts[tile] + n
-            prefetch(table, members[min(at + PREFETCH_AHEAD, starts[stop] - 1)])
-            splat = row_of(table, members[at])
-            if integrated is not None:
-                draw_integral(splat, limits, n, box, state)
-            elif splat[layout.GATE] > 0:
-                draw_splat(splat, limits, n, box, state)
+            end = min(begin + BATCH, length)
+            find_patches(table, members, first + begin, first + end, box, unfinished, patches)
+            for n in range(begin, end):
+                splat = row_of(table, members[first + n])
+                if integrated is not None:
+                    draw_integral(splat, limits, patches[n - begin], n, box, state)
+                elif splat[layout.GATE] > 0:
+                    draw_splat(splat, limits, patches[n - begin], n, box, state)
         write_tile(box, state, frame, outputs)
+
+
+@inner
+def find_patches(table, members, begin, end, box, wanted, patches):
+    """Write the patches that each of the members begin..end touches, of those `wanted`."""
+    for at in range(begin, end):
+        prefetch(table, members[min(at + PREFETCH_AHEAD, end - 1)])
+        patches[at - begin] = touched_patches(row_of(table, members[at]), box) & wanted
 
 
 @inner
@@ -107,53 +131,49 @@ def init_tile(box, length, state):
     fill_range(state, TRANSMITTANCE, STOPS, -1)
     fill_range(state, STOPS, BEHIND_DOT_GRAD, length)
     for r in range(tile_height):
-        fill_range(state, TRANSMITTANCE + r * STRIDE, TRANSMITTANCE + r * STRIDE + tile_width, 1)
+        for c in range(0, tile_width, PATCH):
+            at = TRANSMITTANCE + offset_of(r, c)
+            fill_range(state, at, at + min(PATCH, tile_width - c), 1)
 
 
 @inner
-def finished(state):
-    """Whether all pixels of the tile stopped."""
-    largest = load(state, TRANSMITTANCE)
-    for at in range(TRANSMITTANCE + WIDTH, STOPS, WIDTH):
-        largest = maximum(largest, load(state, at))
-    return bits(largest >= 0) == 0
+def unfinished_patches(state):
+    """A bit per patch of which some pixel has not stopped."""
+    patches = 0
+    for patch in range(PATCHES):
+        if bits(load(state, TRANSMITTANCE + patch * WIDTH) >= 0) != 0:
+            patches |= 1 << patch
+    return patches
 
 
 @inner
-def draw_splat(splat, limits, n, box, state):
-    """Blend a splat, the n-th of its tile, behind those already blended."""
-    fall, gain, offset = splat[layout.FALL_X], splat[layout.GAIN], splat[layout.OFFSET]
+def draw_splat(splat, limits, patches, n, box, state):
+    """Blend a splat, the n-th of its tile, behind those already blended, into `patches`."""
     color = splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]
-    rows = outline_rows(splat, box, state)
-    while rows != 0:
-        r = lowest_bit(rows)
-        rows &= rows - 1
-        x, end, center, peak = state[ROW_BEGIN + r], state[ROW_END + r], state[ROW_CENTER + r], state[ROW_PEAK + r]
-        at = r * STRIDE + int(x)
-        while x <= end:
-            u = ramp(x - center)
-            power = fma(u * u, -fall, peak)
-            blend(fma(exp2(power), gain, 0 - offset), power >= LOG_MIN_ALPHA, limits, color, n, at, state)
-            x += WIDTH
-            at += WIDTH
+    while patches != 0:
+        patch = lowest_bit(patches)
+        patches &= patches - 1
+        power = log_alpha(splat, *distances(splat, patch, box))
+        alpha = fma(exp2(power), splat[layout.GAIN], 0 - splat[layout.OFFSET])
+        blend(alpha, power >= LOG_MIN_ALPHA, limits, color, n, patch * WIDTH, state)
 
 
 @inner
-def draw_integral(splat, limits, n, box, state):
-    """As `draw_splat`, for a splat that is integrated over pixels; `outline_rows` then outlines its bounding ellipse."""
+def log_alpha(splat, dx, dy):
+    """log2 of alpha, before GAIN and OFFSET, at lanes of pixels dx, dy px from the center."""
+    u = fma(dy, 0 - splat[layout.SHEAR], dx)
+    return fma(u * u, 0 - splat[layout.FALL_X], fma(dy * dy, 0 - splat[layout.FALL_Y], splat[layout.PEAK]))
+
+
+@inner
+def draw_integral(splat, limits, patches, n, box, state):
+    """As `draw_splat`, for a splat that is integrated over pixels; the outline is that of its bounding ellipse."""
     color = splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]
-    rows = outline_rows(splat, box, state)
-    while rows != 0:
-        r = lowest_bit(rows)
-        rows &= rows - 1
-        x, end = state[ROW_BEGIN + r], state[ROW_END + r]
-        at = r * STRIDE + int(x)
-        center, dy = splat[layout.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[layout.Y]
-        while x <= end:
-            alpha = integrals.alpha(splat, ramp(x - center), dy)
-            blend(alpha, alpha >= MIN_ALPHA, limits, color, n, at, state)
-            x += WIDTH
-            at += WIDTH
+    while patches != 0:
+        patch = lowest_bit(patches)
+        patches &= patches - 1
+        alpha = integrals.alpha(splat, *distances(splat, patch, box))
+        blend(alpha, alpha >= MIN_ALPHA, limits, color, n, patch * WIDTH, state)
 
 
 @inner
@@ -162,11 +182,13 @@ def write_tile(box, state, frame, outputs):
     left, top, tile_width, tile_height = box
     background, transmittance, stops = frame
     image, alpha = outputs
+    width = transmittance.shape[1]
+    colors, alphas, transmittances, stop_list = pointer(image), pointer(alpha), pointer(transmittance), pointer(stops)
     for r in range(tile_height):
         for c in range(tile_width):
-            at, y, x = r * STRIDE + c, top + r, left + c
+            at, pixel = offset_of(r, c - c % PATCH) + c % PATCH, (top + r) * width + left + c
             remaining = abs(state[TRANSMITTANCE + at])
             for k in range(3):
-                image[y, x, k] = state[k * PLANE + at] + remaining * background[k]
-            transmittance[y, x], alpha[y, x] = remaining, 1 - remaining
-            stops[y, x] = state[STOPS + at]
+                colors[3 * pixel + k] = state[k * PLANE + at] + remaining * background[k]
+            transmittances[pixel], alphas[pixel] = remaining, 1 - remaining
+            stop_list[pixel] = state[STOPS + at]

@@ -9,6 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import compositing, compositing_back, layout, projection, projection_back, rounding, sorting, window_tiles
+from mipmap_plugin.backends.cpu_kernels.pool import empty
 from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL, OVER_WINDOW, Flags, Frame, Limits, Lists, SplatArrays, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
@@ -16,9 +17,6 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, w_end
 
 SAMPLING = {"analytic": OVER_PIXEL, "window": OVER_WINDOW}
-
-# float32 per cache line.
-CACHE_LINE = 16
 
 
 class Drawing(NamedTuple):
@@ -43,9 +41,9 @@ def draw(
     view = view_of(camera, effects, splats, gradients)
     limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, effects.settings.picture_step or 0.0)
     count, (height, width) = len(splats.means), camera.size
-    table, depths, counts, slots = _empty(count, layout.SPLAT_FIELDS), _empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
-    outputs = _empty(height, width, 3), _empty(height, width)
-    frame = Frame(np.array(effects.background, np.float32), _empty(height, width), _empty(height, width))
+    table, depths, counts, slots = empty(count, layout.SPLAT_FIELDS), empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
+    outputs = empty(height, width, 3), empty(height, width)
+    frame = Frame(np.array(effects.background, np.float32), empty(height, width), empty(height, width))
     threads = team(count + width * height)
     flags = flags_of(view, splats)
     threads.share(projection.project, count, flags, view, splats, table, depths, counts)
@@ -66,7 +64,7 @@ def draw_back(drawing: Drawing, d_image: np.ndarray, d_alpha: np.ndarray, *, har
     harmonics: whether to compute those of the coefficients, by far the largest array; else that array is empty.
     """
     view, splats, table, slots, lists, frame, limits = drawing
-    tile_grads, grads = _empty(len(lists.members), layout.GRADS), SplatArrays(*(_empty(*array.shape) for array in splats))
+    tile_grads, grads = empty(len(lists.members), layout.GRADS), SplatArrays(*(empty(*array.shape) for array in splats))
     if not harmonics:
         grads = grads._replace(sh=grads.sh[:0])
     threads, flags = team(len(splats.means) + view.width * view.height), flags_of(view, splats)
@@ -141,11 +139,3 @@ def as_arrays(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, s
     else:
         quats, scales = quats[:0], scales[:0]
     return SplatArrays(*(tensor.detach().contiguous().numpy() for tensor in (means, quats, scales, opacities, sh, covariances)))
-
-
-def _empty(*shape: int) -> np.ndarray:
-    """Uninitialized float32, aligned to cache lines, unlike numpy's memory; large arrays in huge pages, unlike torch's memory."""
-    count = math.prod(shape)
-    space = np.empty(count + CACHE_LINE, np.float32)
-    start = -space.__array_interface__["data"][0] // space.itemsize % CACHE_LINE
-    return space[start : start + count].reshape(shape)

@@ -8,7 +8,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from mipmap_plugin.backends.cpu_kernels.lanes import DOUBLES, LANES, VECTOR32, VECTOR64
+from mipmap_plugin.backends.cpu_kernels.lanes import DOUBLES, LANES, VECTOR32, VECTOR64, WIDTH
 
 # Bytes of a cache line.
 CACHE_LINE = 64
@@ -85,6 +85,19 @@ def store(_context, array, index, lanes):
         return context.get_dummy_value()
 
     return types.void(array, index, lanes), generate
+
+
+@intrinsic
+def store_half(_context, array, lanes):
+    """array[0 : 8] = the first half of float32 lanes, for a pointer."""
+
+    def generate(context, builder, signature, values):
+        half = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH // 2), list(range(WIDTH // 2)))
+        first = builder.shuffle_vector(values[1], values[1], half)
+        builder.store(first, builder.bitcast(values[0], first.type.as_pointer()), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, lanes), generate
 
 
 @intrinsic

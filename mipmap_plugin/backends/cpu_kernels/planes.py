@@ -1,46 +1,69 @@
-"""The pixels of a tile while its splats are blended in or, in the backward pass, removed again, 16 pixels at a time.
+"""The pixels of a tile while its splats are blended in or, in the backward pass, removed again, a patch of 4 x 4 pixels at a time.
 
-Each quantity of the tile's pixels is a plane of TILE_HEIGHT rows, each WIDTH longer than the tile, so that 16 lanes never run past it.
+Each quantity of the tile's pixels is a plane: patch after patch, row by row, and in each patch row by row. A patch is one set of
+lanes, always at the same place in memory: what one splat stores the next one loads without waiting.
 """
 
 # numba redefines calls and operators.
 # mypy: ignore-errors
 
-from mipmap_plugin.backends.cpu_kernels import inner
-from mipmap_plugin.backends.cpu_kernels.binning import TILE_HEIGHT, TILE_WIDTH
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, fma, minimum, select
-from mipmap_plugin.backends.cpu_kernels.memory import load, store
+import numpy as np
+from numba import types
 
-STRIDE = TILE_WIDTH + WIDTH
-PLANE = TILE_HEIGHT * STRIDE
+from mipmap_plugin.backends.cpu_kernels import inner, layout
+from mipmap_plugin.backends.cpu_kernels.binning import TILE_HEIGHT, TILE_WIDTH
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, across, bits, both, down, fma, minimum, select
+from mipmap_plugin.backends.cpu_kernels.memory import load, scratch, store
+
+# px: the width and height of a patch.
+PATCH = 4
+
+# Patches in a row of a tile, and in a tile: a set of them is the bits of an integer.
+PATCH_COLUMNS = TILE_WIDTH // PATCH
+PATCHES = PATCH_COLUMNS * TILE_HEIGHT // PATCH
+PLANE = PATCHES * WIDTH
+
+# All pixels of a patch.
+ALL = (1 << WIDTH) - 1
 
 # Offsets of planes in a tile's state: red, green and blue (in the backward pass dLoss/dimage), then
 TRANSMITTANCE = 3 * PLANE  # behind the splats so far; negative: the pixel stopped
 STOPS = 4 * PLANE  # the position in the tile's list at which the pixel stopped
 BEHIND_DOT_GRAD = 5 * PLANE  # the color behind the current splat, dotted with dLoss/dimage
+STATE_SIZE = 6 * PLANE
 
-# and, for the current splat, numbers per row of the tile (`compositing.outline_rows`).
-ROW_BEGIN = 6 * PLANE
-ROW_END, ROW_CENTER, ROW_PEAK = ROW_BEGIN + TILE_HEIGHT, ROW_BEGIN + 2 * TILE_HEIGHT, ROW_BEGIN + 3 * TILE_HEIGHT
-STATE_SIZE = ROW_BEGIN + 4 * TILE_HEIGHT
+new_state = scratch(STATE_SIZE, types.float32)
+
+
+@inner
+def offset_of(row, column):
+    """Where the four pixels of a tile's row that begin at `column`, a multiple of 4, are in a plane."""
+    return (row // PATCH * PATCH_COLUMNS + column // PATCH) * WIDTH + row % PATCH * PATCH
+
+
+@inner
+def distances(splat, patch, box):
+    """px from a splat's center to the pixels' centers of a patch, in x and in y."""
+    left, top, _, _ = box
+    dx, dy = np.float32(left + 0.5) - splat[layout.X], np.float32(top + 0.5) - splat[layout.Y]
+    column, row = np.float32(patch % PATCH_COLUMNS * PATCH), np.float32(patch // PATCH_COLUMNS * PATCH)
+    return across(dx + column), down(dy + row)
 
 
 @inner
 def blend(alpha, bright, limits, color, n, at, state):
-    """Blend the n-th splat of a tile into the 16 pixels at `at`, where it is bright enough."""
+    """Blend the n-th splat of a tile into the patch at `at`, where it is bright enough."""
     max_alpha, min_transmittance, _ = limits
-    alpha = minimum(alpha, max_alpha)
-    before = load(state, TRANSMITTANCE + at)
+    alpha, before = select(bright, minimum(alpha, max_alpha), 0), load(state, TRANSMITTANCE + at)
     after = before * (1 - alpha)
-    visible = both(bright, after >= min_transmittance)
-    stopping = both(both(bright, before >= min_transmittance), after < min_transmittance)
-    weight = select(visible, before * alpha, 0)
+    is_open = after >= min_transmittance  # the pixel stopped neither before this splat nor at it
+    weight = select(is_open, before * alpha, 0)
     store(state, at, fma(weight, color[0], load(state, at)))
     store(state, PLANE + at, fma(weight, color[1], load(state, PLANE + at)))
     store(state, 2 * PLANE + at, fma(weight, color[2], load(state, 2 * PLANE + at)))
-    store(state, TRANSMITTANCE + at, select(visible, after, select(stopping, 0 - before, before)))
-    if bits(stopping) != 0:
-        store(state, STOPS + at, select(stopping, n, load(state, STOPS + at)))
+    store(state, TRANSMITTANCE + at, select(is_open, after, minimum(before, 0 - before)))
+    if bits(is_open) != ALL:
+        store(state, STOPS + at, select(both(before >= 0, after < min_transmittance), n, load(state, STOPS + at)))
 
 
 @inner

@@ -13,6 +13,7 @@ from numba import types
 from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
+from mipmap_plugin.backends.cpu_kernels.pool import empty
 from mipmap_plugin.backends.cpu_kernels.records import Lists
 from mipmap_plugin.backends.cpu_kernels.threads import Team
 
@@ -38,12 +39,12 @@ def tile_lists(table: np.ndarray, depths: np.ndarray, slots: np.ndarray, width: 
     tiles_x, tiles_y = binning.tile_grid(width, height)
     pairs = int(slots[-1])
     runs = 1 if team.threads == 1 else RUNS_PER_THREAD * team.threads
-    tiles, splats, counts = np.empty(pairs, np.int32), np.empty(pairs, np.int32), np.empty((runs, tiles_x * tiles_y), np.int64)
+    tiles, splats, counts = empty(pairs, dtype=np.int32), empty(pairs, dtype=np.int32), np.empty((runs, tiles_x * tiles_y), np.int64)
     team.share(write_slots, runs, table, slots, width, height, tiles, splats, counts)
     starts = np.append(offsets(counts), pairs)
-    entries = np.empty(pairs, np.int64)
+    entries = empty(pairs, dtype=np.int64)
     team.share(fill_entries, runs, depths.view(np.int32), slots, tiles, counts, entries)
-    return Lists(starts, np.empty(pairs, np.int32), entries, splats)
+    return Lists(starts, empty(pairs, dtype=np.int32), entries, splats)
 
 
 @inner

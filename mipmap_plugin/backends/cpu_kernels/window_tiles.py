@@ -11,21 +11,21 @@ import numpy as np
 from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout, windows
-from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, TILE_HEIGHT, TILE_WIDTH
+from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels.compositing import (
-    CHECK_EVERY,
-    PREFETCH_AHEAD,
+    BATCH,
     fill_range,
-    finished,
+    find_patches,
     init_tile,
-    outline_rows,
+    new_patches,
     tile_box,
+    unfinished_patches,
     write_tile,
 )
-from mipmap_plugin.backends.cpu_kernels.compositing_back import init_tile_back
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, fma, lowest_bit, ramp, select, total
-from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, prefetch, row_of, scratch, store
-from mipmap_plugin.backends.cpu_kernels.planes import PLANE, ROW_BEGIN, ROW_END, STATE_SIZE, STOPS, STRIDE, TRANSMITTANCE, blend, unblend
+from mipmap_plugin.backends.cpu_kernels.compositing_back import init_tile_back, write_sums
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, fma, lowest_bit, select
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, scratch, store
+from mipmap_plugin.backends.cpu_kernels.planes import PATCHES, PLANE, STATE_SIZE, STOPS, TRANSMITTANCE, blend, distances, unblend
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
@@ -36,10 +36,8 @@ WINDOWS = STATE_SIZE
 WINDOW_STATE_SIZE = STATE_SIZE + 4 * PLANE
 new_window_state = scratch(WINDOW_STATE_SIZE, types.float32)
 
-# A visit blends one splat into 16 pixels. The backward pass stores VISIT_SIZE numbers per visit, the windows before it. A splat makes at
-# most MAX_VISITS visits in a tile.
+# A visit blends one splat into a patch. The backward pass stores VISIT_SIZE numbers per visit, the windows before it.
 VISIT_SIZE = 4 * WIDTH
-MAX_VISITS = TILE_HEIGHT * (TILE_WIDTH // WIDTH + 1)
 
 
 @kernel
@@ -49,18 +47,19 @@ def composite(start, stop, table, lists, frame, outputs):
     starts, members, _, _ = lists
     _, transmittance, _ = frame
     height, width = transmittance.shape
-    state, no_record = new_window_state(), (pointer(table), pointer(starts), False)
+    state, patches, no_record = new_window_state(), new_patches(), (pointer(table), pointer(starts), False)
     for tile in range(start, stop):
-        box = tile_box(tile, width, height)
-        length = starts[tile + 1] - starts[tile]
+        box, first = tile_box(tile, width, height), starts[tile]
+        length = starts[tile + 1] - first
         init_windows(box, length, state)
-        for n in range(length):
-            if n % CHECK_EVERY == 0 and finished(state):
+        for begin in range(0, length, BATCH):
+            unfinished = unfinished_patches(state)
+            if unfinished == 0:
                 break
-            at = starts[tile] + n
-            prefetch(table, members[min(at + PREFETCH_AHEAD, starts[stop] - 1)])
-            splat = row_of(table, members[at])
-            draw_splat(splat, n, box, state, no_record, 0)
+            end = min(begin + BATCH, length)
+            find_patches(table, members, first + begin, first + end, box, unfinished, patches)
+            for n in range(begin, end):
+                draw_splat(row_of(table, members[first + n]), patches[n - begin], n, box, state, no_record, 0)
         write_tile(box, state, frame, outputs)
 
 
@@ -112,25 +111,20 @@ def draw_pixels(shape, margin, dx, dy, open_pixels, color, n, at, state, record,
 
 
 @inner
-def draw_splat(splat, n, box, state, record, visits):
+def draw_splat(splat, patches, n, box, state, record, visits):
     """Blend a splat, the n-th of its tile, behind those already blended; returns the number of visits so far.
 
-    record: where the windows before each visit are stored, where its position, and whether to store them.
+    record: where the windows before each visit are stored, where its patch, and whether to store them.
     """
     color, shape = (splat[layout.RED], splat[layout.GREEN], splat[layout.BLUE]), windows.splat_parameters(splat)
-    margin, rows = splat[layout.PEAK] - LOG_MIN_ALPHA, outline_rows(splat, box, state)
-    while rows != 0:
-        r = lowest_bit(rows)
-        rows &= rows - 1
-        x, end = state[ROW_BEGIN + r], state[ROW_END + r]
-        at = r * STRIDE + int(x)
-        center, dy = splat[layout.X] - box[0] - 0.5, box[1] + r + 0.5 - splat[layout.Y]
-        while x <= end:
-            open_pixels = both(load(state, TRANSMITTANCE + at) >= 0, end >= ramp(x))
-            if bits(open_pixels) != 0:
-                visits += draw_pixels(shape, margin, ramp(x - center), dy, open_pixels, color, n, at, state, record, visits)
-            x += WIDTH
-            at += WIDTH
+    margin = splat[layout.PEAK] - LOG_MIN_ALPHA
+    while patches != 0:
+        patch = lowest_bit(patches)
+        patches &= patches - 1
+        open_pixels = load(state, TRANSMITTANCE + patch * WIDTH) >= 0
+        if bits(open_pixels) != 0:
+            dx, dy = distances(splat, patch, box)
+            visits += draw_pixels(shape, margin, dx, dy, open_pixels, color, n, patch * WIDTH, state, record, visits)
     return visits
 
 
@@ -144,30 +138,32 @@ def composite_back(start, stop, table, lists, frame, d_outputs, tile_grads):
     background, transmittance, stops = frame
     d_image, d_alpha = d_outputs
     height, width = transmittance.shape
-    state, stored, positions = new_window_state(), np.empty(16 * MAX_VISITS * VISIT_SIZE, np.float32), np.empty(16 * MAX_VISITS, np.int64)
+    state, patches = new_window_state(), new_patches()
+    stored, positions = np.empty(BATCH * PATCHES * VISIT_SIZE, np.float32), np.empty(BATCH * PATCHES, np.int64)
     for tile in range(start, stop):
-        box = tile_box(tile, width, height)
-        length = starts[tile + 1] - starts[tile]
+        box, first = tile_box(tile, width, height), starts[tile]
+        length = starts[tile + 1] - first
         visit_offsets, visits = np.zeros(length + 1, np.int64), 0
         init_windows(box, length, state)
-        for n in range(length):
-            if n % CHECK_EVERY == 0 and finished(state):
+        for begin in range(0, length, BATCH):
+            unfinished = unfinished_patches(state)
+            if unfinished == 0:
                 break
-            if visits + MAX_VISITS > len(positions):
+            if visits + BATCH * PATCHES > len(positions):
                 stored, positions = np.append(stored, np.empty_like(stored)), np.append(positions, np.empty_like(positions))
-            record = pointer(stored), pointer(positions), True
-            visits = draw_splat(row_of(table, members[starts[tile] + n]), n, box, state, record, visits)
-            visit_offsets[n + 1] = visits
+            record, end = (pointer(stored), pointer(positions), True), min(begin + BATCH, length)
+            find_patches(table, members, first + begin, first + end, box, unfinished, patches)
+            for n in range(begin, end):
+                visits = draw_splat(row_of(table, members[first + n]), patches[n - begin], n, box, state, record, visits)
+                visit_offsets[n + 1] = visits
 
         used = init_tile_back(box, background, transmittance, stops, d_image, d_alpha, state)
         fill_range(state, WINDOWS, WINDOW_STATE_SIZE, 0)
-        for at in range(starts[tile] + used, starts[tile + 1]):
+        for at in range(first + used, starts[tile + 1]):
             for k in range(layout.GRADS):
                 tile_grads[slots[at], k] = 0
         for n in range(used - 1, -1, -1):
-            at = starts[tile] + n
-            prefetch(table, members[max(at - PREFETCH_AHEAD, 0)])
-            splat, grads = row_of(table, members[at]), row_of(tile_grads, slots[at])
+            splat, grads = row_of(table, members[first + n]), row_of(tile_grads, slots[first + n])
             undraw_splat(splat, n, box, state, record, (visit_offsets[n], visit_offsets[n + 1]), grads)
 
 
@@ -179,8 +175,7 @@ def undraw_splat(splat, n, box, state, record, visits, grads):
     sum_1 = sum_u = sum_v = sum_log_long = sum_log_short = sum_angle = sum_red = sum_green = sum_blue = broadcast(0)
     for visit in range(visits[0], visits[1]):
         at, window = positions[visit], load_windows(stored, visit * VISIT_SIZE, WIDTH)
-        r = at // STRIDE
-        dx, dy = ramp(at - r * STRIDE - (splat[layout.X] - box[0] - 0.5)), box[1] + r + 0.5 - splat[layout.Y]
+        dx, dy = distances(splat, at // WIDTH, box)
         alpha, integral = windows.integrate(shape, dx, dy, window)
         bright = alpha >= MIN_ALPHA
         visible = both(bright, n < load(state, STOPS + at))
@@ -193,6 +188,5 @@ def undraw_splat(splat, n, box, state, record, visits, grads):
         sum_log_long, sum_log_short = sum_log_long + select(visible, slopes[2], 0), sum_log_short + select(visible, slopes[3], 0)
         sum_angle = sum_angle + select(visible, slopes[4], 0)
         sum_red, sum_green, sum_blue = fma(weight, d_red, sum_red), fma(weight, d_green, sum_green), fma(weight, d_blue, sum_blue)
-    grads[layout.SUM], grads[layout.GRAD_U], grads[layout.GRAD_V] = total(sum_1), total(sum_u) / shape[3], total(sum_v) / shape[4]
-    grads[layout.GRAD_LOG_LONG], grads[layout.GRAD_LOG_SHORT], grads[layout.GRAD_ANGLE] = total(sum_log_long), total(sum_log_short), total(sum_angle)
-    grads[layout.GRAD_RED], grads[layout.GRAD_GREEN], grads[layout.GRAD_BLUE] = total(sum_red), total(sum_green), total(sum_blue)
+    sum_u, sum_v = sum_u * (1 / shape[3]), sum_v * (1 / shape[4])
+    write_sums((sum_1, sum_u, sum_v, sum_log_long, sum_log_short, sum_angle, sum_red, sum_green), sum_blue, grads)

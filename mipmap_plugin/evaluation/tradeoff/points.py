@@ -18,7 +18,19 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.measure import BASE, FILTERS, RESIZED, Baseline, Kind, RenderView, base_in_viewer, baselines, warm_stopwatch, warm_up
+from mipmap_plugin.evaluation.measure import (
+    BASE,
+    FILTERS,
+    RESIZED,
+    Baseline,
+    Kind,
+    RenderView,
+    adapt_alone,
+    base_in_viewer,
+    baselines,
+    warm_stopwatch,
+    warm_up,
+)  # fmt: skip
 from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.filters import SCREEN_FILTERS
@@ -166,7 +178,8 @@ def _run(
     runs, ends = [], []
     for repeat in range(plan.repeats):
         settings: dict[str, Any] = {"seed": plan.seed + repeat} | ({} if steps is None else {"steps": steps})
-        runs.append(adapted := model.adapt(scale, recipe=recipe, viewer=plan.viewer, cameras=truth.adapt_on, observe=observe, **settings))
+        adapted = adapt_alone(model, scale, recipe=recipe, viewer=plan.viewer, cameras=truth.adapt_on, observe=observe, **settings)
+        runs.append(adapted)
         report = adapted.report
         end = Point(scale, "adapted", _name(recipe, steps), adapted.backend.name, report.gaussians_after, ended_by=report.ended_by)
         ends.append(_measured(replace(end, adapt_seconds=Spread.of([report.seconds["total"]])), _shows(adapted, scale), truth, 1))

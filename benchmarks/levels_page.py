@@ -1,0 +1,70 @@
+"""The tables and the plot of benchmarks/levels.py."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from mipmap_plugin.evaluation.report import markdown
+from mipmap_plugin.evaluation.tradeoff.plot import figure_class
+from mipmap_plugin.formats.atomic import new_file
+
+INTRO = """# A dolly over a ladder of levels
+
+Made by `python benchmarks/levels.py DATA --ladders DIR`: a camera that zooms out continuously from x1 to x1/16, drawn by our renderer as the viewer
+draws; two test views that nothing was adapted to, 49 frames each; dB against the supersampled base of each frame. *levels*: ours. *base*: alone. *one
+file*: the default recipe at x1/4. *splat-transform*: its `--decimate` to the splats of each of our levels, in the same format, at the same zooms.
+*Flicker*: RMS of the change between neighboring frames that the truth does not have, in 8-bit levels; *worst* is of one pair of frames.
+
+![dB over zoom](levels.png)
+"""
+
+COLORS = {"levels": "tab:blue", "base": "tab:gray", "splat-transform": "tab:orange"}
+
+
+def page(results: Sequence[dict[str, Any]]) -> str:
+    """A section for each base and viewer."""
+    return "\n".join([INTRO, *(section(each) for each in results)])
+
+
+def section(result: dict[str, Any]) -> str:
+    films, seconds = result["films"], result["seconds"]
+    head = ["", "worst frame, dB", "mean, dB", "least lead of ours, dB", "flicker, mean", "flicker, worst", "MB", "splats, thousands"]
+    switches = [
+        [f"x{each['zoom']:.3f}", f"{each['step_db']:+.2f}", *(f"{each[key]:.1f}" for key in ("likeness_db", "one_percent_db"))]
+        for each in result["changes"]
+    ]
+    table = markdown(["switch at", "dB, finer - coarser", "PSNR of both levels, dB", "PSNR of a 1 % zoom, dB"], switches)
+    spent = f"{sum(seconds):.0f} s for all levels ({', '.join(f'{each:.0f}' for each in seconds)}), one thread of a busy machine"
+    return f"## {result['base']} in {result['viewer']}\n\n{markdown(head, [row(film, films[0]) for film in films])}\n\n{spent}\n\n{table}\n"
+
+
+def row(film: dict[str, Any], ours: dict[str, Any]) -> list[str]:
+    """`least lead`: at any zoom below x1/2."""
+    quality, flicker = ([frame[key] for frame in film["frames"] if frame[key] is not None] for key in ("psnr_db", "flicker"))
+    leads = [our["psnr_db"] - its["psnr_db"] for our, its in zip(ours["frames"], film["frames"], strict=True) if our["zoom"] < 0.5]
+    lead = "–" if film is ours else f"{min(leads):.1f}"
+    splats = ", ".join(f"{count / 1000:.1f}" for count in film["splats"])
+    numbers = [f"{min(quality):.1f}", f"{fmean(quality):.1f}", lead, f"{fmean(flicker):.2f}", f"{max(flicker):.2f}", f"{film['megabytes']:.1f}"]
+    return [film["name"], *numbers, splats]
+
+
+def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
+    """A plot of dB over zoom for each base and viewer, with our switches."""
+    figure = figure_class()(figsize=(12, 3.6 * ((len(results) + 1) // 2)), layout="constrained")
+    for axes, result in zip(figure.subplots((len(results) + 1) // 2, 2, squeeze=False, sharey=True).flat, results, strict=False):
+        for film in result["films"]:
+            zooms, quality = ([frame[key] for frame in film["frames"]] for key in ("zoom", "psnr_db"))
+            width = 2.4 if film["name"] == "levels" else 1.3
+            axes.plot(zooms, quality, label=film["name"], color=COLORS.get(film["name"], "tab:green"), linewidth=width)
+        for change in result["changes"]:
+            axes.axvline(change["zoom"], color="tab:blue", linewidth=0.6, linestyle=":")
+        axes.set_xscale("log", base=2)
+        axes.invert_xaxis()
+        axes.set(title=f"{result['base']} in {result['viewer']}", xlabel="zoom (dotted: switches)", ylabel="dB against the supersampled base")
+        axes.grid(alpha=0.25)
+        axes.legend(fontsize=8, frameon=False)
+    with new_file(path, overwrite=True) as temporary:
+        figure.savefig(temporary, format="png", dpi=90)

@@ -1,0 +1,84 @@
+"""What the parts of a run have cost so far, and the time that is left.
+
+Steps do not all take the same time: in the warm-up they use fewer views, and at first most views are new, so that their truth has to be made.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+from tqdm import tqdm
+
+from mipmap_plugin import threads
+from mipmap_plugin.adaptation.views import ViewSchedule
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+
+
+@dataclass
+class Costs:
+    """Seconds, by what they were spent on. Work in parallel counts as the time that passed."""
+
+    truths: dict[Camera, float] = field(default_factory=dict)  # of making the truth of each view
+    checks: list[float] = field(default_factory=list)  # of each comparison with the validation views
+
+    def truth(self, view: Camera, make: Callable[[Camera], Tensor]) -> Tensor:
+        """Return the truth of a view; the first time, note how long it took."""
+        began = time.perf_counter()
+        image = make(view)
+        self.truths.setdefault(view, (time.perf_counter() - began) / threads.side_by_side_now())
+        return image
+
+    def check(self, validate: Callable[[], float]) -> float:
+        """Return the result of a validation, and note how long it took."""
+        began = time.perf_counter()
+        result = validate()
+        self.checks.append(time.perf_counter() - began)
+        return result
+
+    def seconds(self) -> float:
+        """All that is noted."""
+        return sum(self.truths.values()) + sum(self.checks)
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """The time that a run will still take, from what its parts have cost so far."""
+
+    schedule: ViewSchedule
+    config: AdaptConfig
+    checked: Callable[[int], bool]  # whether the run is checked after a step
+    first_step: int = 0  # steps that an earlier process has done
+
+    def left(self, step: int, seconds: float, costs: Costs) -> float:
+        """Seconds left after `step`, of which everything since the first step has taken `seconds`; infinity before there is a step."""
+        draws = [self.schedule.draws_before(number) for number in (self.first_step, step, self.config.steps)]
+        if draws[1] == draws[0]:
+            return math.inf
+        a_view = (seconds - costs.seconds()) / (draws[1] - draws[0])
+        new_views = max(0, min(self.schedule.views, draws[2]) - len(costs.truths))
+        checks = sum(map(self.checked, range(step + 1, self.config.steps + 1)))
+        return (draws[2] - draws[1]) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks)
+
+
+def _mean(seconds: Any) -> float:
+    return sum(seconds) / len(seconds) if seconds else 0.0
+
+
+class Bar(tqdm):  # type: ignore[misc]  # tqdm has no types
+    """A progress bar of steps that shows the time left by a forecast, where tqdm would take all steps as equally long."""
+
+    seconds_left = math.inf
+
+    @property
+    def format_dict(self) -> dict[str, Any]:
+        left = "?" if math.isinf(self.seconds_left) else self.format_interval(self.seconds_left)
+        return {**super().format_dict, "left": left}
+
+
+BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}<{left}, {rate_fmt}{postfix}]"

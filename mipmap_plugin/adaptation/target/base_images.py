@@ -1,0 +1,68 @@
+"""The base's own images, from which the pseudo truth is made: each is drawn once for all scales and viewers that a base is adapted to."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.target.image_store import ImageStore
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import SplatModel
+
+# Bytes of the images that are kept for the next scale: 280 of 800 x 800 px, about as many as `default` uses. They stay as long as the wrapped
+# model, so this has to leave room for others on a laptop of 8 GiB.
+LIMIT = 1 << 30
+
+
+class BaseImages:
+    """The images [H, W, 3] of a frozen model by a backend, clamped to 0..1, without gradients."""
+
+    def __init__(self, model: SplatModel, backend: Backend, effects: Effects, limit: int = LIMIT) -> None:
+        """`effects`: how the model is rendered at the scale of its training. `limit`: bytes of the images that are kept."""
+        self.model, self.backend, self.effects = model, backend, effects
+        self._store = ImageStore(limit, model.parameters()["means"])
+        self._activated: Gaussians | None = None
+
+    def __call__(self, view: Camera, fraction: float = 1.0) -> Tensor:
+        """The image of a view of the base scale, or at a fraction of its size; the dilation keeps its size in the world.
+
+        It is clamped, as a display does, before anybody resizes it: unclamped highlights would bleed into their neighbors (-3 dB at x1/8).
+        """
+        return self._store((_facts(view), fraction), lambda: self._render(view, fraction))
+
+    def are_of(self, model: SplatModel, backend: Backend, effects: Effects) -> bool:
+        """Whether these are the images of this model by such a backend."""
+        return self.model is model and (self.backend.name, self.effects) == (backend.name, effects)
+
+    def keep_only(self, views: Iterable[Camera]) -> None:
+        """Forget the images of all other views, so that those of `views` find room."""
+        facts = {_facts(view) for view in views}
+        self._store.keep_only(lambda key: key[0] in facts)
+
+    @torch.no_grad()
+    def _render(self, view: Camera, fraction: float) -> Tensor:
+        # Resized, not zoomed: the model sees the `zoom` of its training, so that it shows the same splats, only with fewer pixels.
+        factor = fraction / view.zoom  # a view of a band (`over_band`) samples `zoom` times as finely as the base
+        camera = view if factor == 1 else replace(view.resized(max(1, round(view.width * factor)), max(1, round(view.height * factor))), zoom=1.0)
+        effects = replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
+        return self.backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
+
+    def _splats(self, camera: Camera) -> Gaussians:
+        """The splats, activated once if all cameras see the same ones: activation takes a fifth of a small image's time."""
+        if not self.model.traits.same_for_all_views:
+            return self.model.gaussians(camera)  # not kept: views may be rendered in parallel
+        if self._activated is None:
+            self._activated = self.model.gaussians(camera)
+        return self._activated
+
+
+def _facts(view: Camera) -> Hashable:
+    """Everything that an image depends on. Cameras are compared by identity, but each call generates its random views anew."""
+    pose = view.viewmat.numpy().tobytes()
+    return view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose, view.time, view.zoom, view.index

@@ -1,0 +1,88 @@
+"""`levels.json`: what a ladder's files are, when each is to be shown, and how good it then is. For anybody who writes a viewer or a converter."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, sha256, write_json
+from mipmap_plugin.formats.json_file import read_json
+from mipmap_plugin.levels.contents import Contents
+from mipmap_plugin.levels.yardstick import TRUTH
+from mipmap_plugin.wrap import Wrapped
+
+MANIFEST = "levels.json"
+FORMAT = "mipmap_plugin levels 1"
+
+
+def level_name(number: int) -> str:
+    """The file of a level; 0 is the finest, as in other tools."""
+    return f"level_{number}.ply"
+
+
+def refuse_ladder(folder: Path, base: Wrapped, *, overwrite: bool) -> None:
+    """Raise what writing a ladder to `folder` would raise. A folder that is no ladder is never replaced. Raises OutputExists, OutputError."""
+    source = base.model.source
+    refuse_output(folder, overwrite, [] if source is None else [source])
+    if not (folder / MANIFEST).is_file():
+        refuse_to_lose(folder, base.model.folder, MANIFEST)
+
+
+def write_ladder(ladder: Contents, folder: Path, overwrite: bool) -> Path:
+    """Write the levels, a report beside each, and the manifest; the folder appears complete or not at all. Raises OutputExists, OutputError."""
+    refuse_ladder(folder, ladder.base, overwrite=overwrite)
+    with new_folder(folder, overwrite) as temporary:
+        files = [level.adapted.save(temporary / level_name(number)) for number, level in enumerate(ladder.levels)]
+        write_json(temporary / MANIFEST, manifest(ladder, files), overwrite=False)
+    return folder
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a ladder in a folder. Raises SceneError if it is missing or no JSON."""
+    found: dict[str, Any] = read_json(folder / MANIFEST)
+    return found
+
+
+def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
+    """The manifest of a ladder whose levels are in `files`. Zooms and scales are focal lengths in px over that of the base."""
+    first = ladder.levels[0].adapted.report
+    return {
+        "format": FORMAT,
+        "viewer": ladder.request.viewer,
+        "base": first.base,
+        "base_pixel": base_pixel(ladder.base),
+        "levels": [_entry(ladder, number, file) for number, file in enumerate(files)],
+        "switches": [asdict(switch) for switch in ladder.switches],
+        "curve": [asdict(point) for point in ladder.curve],
+        "worst_db": min(point.psnr_db for point in ladder.curve),
+        "mean_db": fmean(point.psnr_db for point in ladder.curve),
+        "measured": TRUTH,
+        "versions": first.versions,
+    }
+
+
+def base_pixel(base: Wrapped) -> float:
+    """The size in world units of a pixel of the base at its median splat, in the closest view."""
+    return float(pixel_size(base.model.parameters()["means"].detach(), base.views()).median())
+
+
+def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:
+    """One level; it is shown from one switch to the next, the finest at every larger zoom and the coarsest at every smaller one."""
+    level, zooms = ladder.levels[number], [switch.zoom for switch in ladder.switches]
+    return {
+        "file": file.name,
+        "scale": level.band.scale,
+        "shown_from": zooms[number] if number < len(zooms) else None,
+        "shown_to": zooms[number - 1] if number else None,
+        "adapted_from": level.adapted.report.settings.band[0] * level.band.scale,
+        "adapted_to": level.adapted.report.settings.band[1] * level.band.scale,
+        "splats": level.splats,
+        "bytes": file.stat().st_size,
+        "sha256": sha256(file),
+        "seconds": level.adapted.report.seconds["total"],
+        "holds": level.adapted.report.returned,
+        "psnr_db": {f"{point.zoom:.4g}": point.psnr_db for point in ladder.curve if point.level == number},
+    }

@@ -1,0 +1,101 @@
+"""What a ladder is to be: for which viewer, from where to where, and in which steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from mipmap_plugin.effects import COMPENSATED, Effects
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.limits import check_scale
+
+# The ratio of neighboring scales: five steps, or eight, from x1 to x1/16. A level that was adapted to its band loses 3 to 4 dB at the ends of an
+# octave where the viewer compensates or hardly dilates, and 8 dB where it dilates by 0.3 px² (lego at x1/4); there half an octave costs 6 dB.
+# With octaves lego in Spark falls to 30.5 dB, with five steps to 31.2.
+WIDE, NARROW = 2**0.8, 2**0.5
+
+# px²: up to this dilation the wide ratio suits viewers without compensation too.
+SMALL_DILATION = 0.1
+
+# The finest ratio that is tried for a bound on the quality.
+FINEST_RATIO = 2**0.25
+
+# A base that the viewer draws as its training did is the first level as it is. It is shown down to this scale: a tenth lower it would be
+# about as wrong as a level at the end of its band.
+BASE_REACH = 0.93
+
+# A level's splats are in proportion to this power of its scale, and all levels below x1 together have this fraction of the base's. At x1/4, an
+# eighth of lego's splats are 2 dB worse at the upper end of an octave than all of them in Spark, and no worse in PlayCanvas.
+POWER, KEPT = 2 / 3, 0.5
+
+# dB: merging may cost this much before the first step, most of which steps regain: of 7 dB on lego at x1/2, all. Of 14 dB, on the demo scene,
+# whose splats are few for its pixels, they regain 4, so that more splats are kept there.
+MERGING_COSTS = 9.0
+
+
+@dataclass(frozen=True)
+class LadderRequest:
+    """The request for a ladder. Raises SettingsError for numbers out of range."""
+
+    viewer: str
+    coarsest: float = 1 / 16  # the zoom down to which levels are made
+    ratio: float | None = None  # of neighboring scales; None: what suits the viewer
+    least_db: float | None = None  # a level that falls below this within its band is made again for a narrower one
+    until_splats: int | None = None  # the first level with at most this many splats is the last
+    recipe: str = "default"
+    settings: Mapping[str, Any] = field(default_factory=dict)  # of AdaptConfig, for all levels
+
+    def __post_init__(self) -> None:
+        check_scale(self.coarsest)
+        if self.coarsest > 1:
+            raise SettingsError(f"coarsest: a ladder begins at x1 and goes down, but x{self.coarsest:g} is finer; give 1/16, for example")
+        if self.ratio is not None and not FINEST_RATIO <= self.ratio <= 4:
+            raise SettingsError(f"ratio: must be from {FINEST_RATIO:.3g} to 4, such as 2, got {self.ratio:g}")
+        if self.until_splats is not None and self.until_splats < 1:
+            raise SettingsError(f"until_splats: must be at least 1, got {self.until_splats}")
+        if taken := {"band", "start", "viewer", "scale", "images"} & self.settings.keys():
+            raise SettingsError(f"{', '.join(sorted(taken))}: set by the ladder for each level; leave out")
+
+    @classmethod
+    def of(cls, viewer: str, **options: Any) -> LadderRequest:
+        """A request of the fields' names; further options are settings of AdaptConfig."""
+        names = {each.name for each in fields(cls)} - {"settings"}
+        settings = {name: value for name, value in options.items() if name not in names}
+        return cls(viewer, **{name: value for name, value in options.items() if name in names}, settings=settings)
+
+    def first_ratio(self, target: Effects) -> float:
+        """The ratio to begin with, for a viewer that draws as `target`."""
+        if self.ratio is not None:
+            return self.ratio
+        return WIDE if target.screen_filter in COMPENSATED or target.eps2d <= SMALL_DILATION else NARROW
+
+    def facts(self) -> dict[str, Any]:
+        """The request as JSON holds it."""
+        return {**vars(self), "settings": dict(self.settings)}
+
+
+@dataclass(frozen=True)
+class Band:
+    """The zooms that a level is shown at, and so is adapted to. A zoom is a focal length over that of the base."""
+
+    scale: float
+    low: float
+    high: float
+    ratio: float  # of this scale to the next
+
+    @classmethod
+    def first(cls, ratio: float, *, as_it_is: bool) -> Band:
+        """The band of x1: up to x1 only, since nothing finer is known. `as_it_is`: of a base that the viewer draws as its training did."""
+        return cls(1.0, BASE_REACH if as_it_is else ratio**-0.5, 1.0, ratio)
+
+    def next(self, ratio: float, coarsest: float) -> Band:
+        """The band below this one; its scale is at least `coarsest`."""
+        scale = max(self.low * ratio**-0.5, coarsest)
+        return Band(scale, scale * ratio**-0.5, self.low, ratio)
+
+    def settings(self) -> dict[str, Any]:
+        """The settings of AdaptConfig for this band."""
+        kept = KEPT * (self.ratio**POWER - 1) * self.scale**POWER  # a geometric series, whose sum is KEPT
+        merging = {"merge_to": min(1.0, kept), "merging_costs": MERGING_COSTS} if self.scale < 1 else {}
+        return {"band": (self.low / self.scale, self.high / self.scale), "resize": "pil-bicubic", **merging}

@@ -1,0 +1,81 @@
+"""The folder of an unfinished ladder: the levels that are ready, so that the same command goes on where it was interrupted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.report import Report, versions
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.formats.atomic import json_text, write_json
+from mipmap_plugin.levels.request import LadderRequest
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.wrap import Wrapped, state_path
+
+REQUEST = "request.json"
+
+
+class LevelStore:
+    """Finished levels of one ladder in a folder; without a folder nothing is kept."""
+
+    def __init__(self, folder: Path | None, base: Wrapped, request: LadderRequest) -> None:
+        """Raises SettingsError for a folder that belongs to another ladder, OutputError if it cannot be written."""
+        self._folder, self._base, self._target = folder, base, base.target(request.viewer)
+        if folder is None:
+            return
+        facts, file = json.loads(json_text(_facts(base, request))), folder / REQUEST
+        if not file.is_file():
+            if folder.exists() and any(folder.iterdir()):
+                raise SettingsError(f"{folder}: unfinished ladders are kept there, but it has other things in it; choose another output")
+            write_json(file, facts, overwrite=True)
+        elif _read(file) != facts:
+            raise SettingsError(f"{folder}: holds levels of another base, viewer or settings; repeat the run with those, or delete it")
+
+    def level(self, name: str, make: Callable[[Path | None], Adapted]) -> Adapted:
+        """The level of that name from the folder, or else the one that `make` returns for the path of the state of its run, kept from now on."""
+        if self._folder is None:
+            return make(None)
+        file = self._folder / f"{name}.ply"
+        if not file.with_name(file.name + REPORT).is_file():
+            make(state_path(file)).save(file, overwrite=True)
+        return self._loaded(file)
+
+    def remove(self) -> None:
+        """Delete the folder, whose levels have been saved elsewhere."""
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _loaded(self, file: Path) -> Adapted:
+        """A level as it is in its file. Every level is read, also one just made, so that a ladder is the same whether it was interrupted or not."""
+        try:
+            report = Report.model_validate(_read(file.with_name(file.name + REPORT)))
+            model = load_model(file).to(self._base.model.parameters()["means"].device)
+        except (ValueError, MipmapPluginError) as error:
+            raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({error}); delete its folder to start anew") from error
+        model.trained = _trained(self._base, self._target)
+        backend, _ = self._base.backend(viewer=report.viewer)
+        return Adapted(model, report, backend, self._target, {str(report.viewer): self._target})
+
+
+def _trained(base: Wrapped, target: Effects) -> Any:
+    return replace(base.trained, screen_filter=target.screen_filter, eps2d=target.eps2d)
+
+
+def _facts(base: Wrapped, request: LadderRequest) -> dict[str, Any]:
+    """Everything that the levels depend on."""
+    poses = [[view.width, view.height, view.fx, view.fy, view.cx, view.cy, *view.viewmat.flatten().tolist()] for view in base.cameras]
+    digest = hashlib.sha256(json.dumps([poses, base.background]).encode()).hexdigest()
+    parameters = base.model.digest or [float(tensor.double().sum()) for tensor in base.model.parameters().values()]
+    return {"base": parameters, "cameras": digest, "trained": str(base.trained), "request": request.facts(), "versions": versions()}
+
+
+def _read(file: Path) -> Any:
+    return json.loads(file.read_text(encoding="utf-8"))

@@ -1,0 +1,58 @@
+"""What a level is measured by: views that no level was adapted to, and what the base shows of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.optimization.validation import WINDOW
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.limits import derived_seed
+from mipmap_plugin.scenes.trajectories import jittered
+from mipmap_plugin.wrap import Wrapped
+
+# Random views; of large images only the middle is used, as for validation.
+VIEWS = 4
+
+# Number of the random draw, apart from those of views that are adapted to and of validation.
+DRAW = 104_729
+
+# The filter that shrinks the base's images, as for the pseudo truth.
+RESIZE = "pil-bicubic"
+
+TRUTH = f"mean PSNR over {VIEWS} random views that no level was adapted to, against the base's own images at x1, shrunk by {RESIZE}"
+
+
+class Yardstick:
+    """Compares levels with the base's own images, shrunk to any zoom."""
+
+    def __init__(self, base: Wrapped, seed: int) -> None:
+        generator = torch.Generator().manual_seed(derived_seed(seed, DRAW))
+        self._views = [view.window(WINDOW, WINDOW) for view in jittered(base.views(), VIEWS, generator)]
+        self._images = {view: base.render(view).image.clamp(0, 1) for view in self._views}
+
+    def psnr(self, level: Adapted, zoom: float) -> float:
+        """Mean PSNR (dB) of a level at a zoom."""
+        return self._mean(lambda camera, truth: _psnr(level.render(camera).image, truth), zoom)
+
+    def psnr_of_base(self, base: Wrapped, viewer: str, zoom: float) -> float:
+        """Mean PSNR (dB) of the base itself, as a viewer draws it at a zoom."""
+        return self._mean(lambda camera, truth: _psnr(base.render(camera, viewer=viewer).image, truth), zoom)
+
+    def likeness(self, one: Adapted, other: Adapted, zoom: float) -> float:
+        """Mean PSNR (dB) between the images of two levels at a zoom."""
+        return self._mean(lambda camera, _: _psnr(one.render(camera).image, other.render(camera).image), zoom)
+
+    def _mean(self, compare: Callable[[Camera, Tensor], float], zoom: float) -> float:
+        cameras = {view: view.zoomed(zoom) for view in self._views}
+        return fmean(compare(camera, resize(self._images[view], camera.size, RESIZE)) for view, camera in cameras.items())
+
+
+def _psnr(one: Tensor, other: Tensor) -> float:
+    return decibel(float((one.clamp(0, 1) - other.clamp(0, 1)).square().mean()))

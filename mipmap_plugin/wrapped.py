@@ -1,0 +1,276 @@
+"""A frozen base model with its cameras, which is rendered, adapted to other scales and made into levels. It never changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypedDict, cast
+
+import torch
+
+from mipmap_plugin import threads
+from mipmap_plugin.adaptation import notebook
+from mipmap_plugin.adaptation.adapted import Adapted as Adapted
+from mipmap_plugin.adaptation.adapted import render_model
+from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
+from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
+from mipmap_plugin.adaptation.start.candidates import FinerLevel
+from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.target.portable import settings_for_several
+from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.backends import choose_backend
+from mipmap_plugin.backends.base import Backend, Needs, Rendered
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import DILATION, Effects
+from mipmap_plugin.errors import BackendUnavailable, SettingsError
+from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.limits import check_image, check_scale
+from mipmap_plugin.models.base import Filtered, Placed, SplatModel, TrainedScale, why_no_viewer
+from mipmap_plugin.models.hosts import Capture
+from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
+from mipmap_plugin.models.outputs import REPORT, parts_of
+from mipmap_plugin.recipes import recipe as make_config
+from mipmap_plugin.scenes import Scene
+from mipmap_plugin.splatting.filters import INTEGRALS, USUAL_EPS2D
+from mipmap_plugin.splatting.viewers import find_viewer, viewers_for
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+class RenderOptions(TypedDict, total=False):
+    """Further options of `Wrapped.render`."""
+
+    viewer: str | None  # render as this viewer does, instead of with a screen filter; without a filter_3D if it does not read it
+    filter_3d: bool  # first smooth every splat to the finest detail that the cameras could resolve (Mip-Splatting's 3D filter)
+    outputs: Sequence[str]  # "depth" and "normals", besides the image (`Rendered`)
+    exposure: bool  # apply the exposure of the photograph that the camera is named after, if exposure.json has it
+
+
+class Wrapped:
+    """A frozen base model with its cameras, ready to be adapted to any scale."""
+
+    def __init__(
+        self, model: SplatModel, cameras: Sequence[Camera], backend: str, trained: TrainedScale, threads: int | None = None
+    ) -> None:
+        self.model, self.cameras, self._backend, self.trained, self.threads = model, list(cameras), backend, trained, threads
+        self.background = trained.background or (0.0, 0.0, 0.0)
+        self.loading_s = 0.0  # seconds that loading the model took
+        self.images: BaseImages | None = None  # of the base, drawn so far for all scales; None: the next call draws all of its own
+
+    def __repr__(self) -> str:
+        return notebook.line("Wrapped", notebook.base_facts(self.model, self.cameras, self.trained))
+
+    def _repr_html_(self) -> str:
+        facts = notebook.base_facts(self.model, self.cameras, self.trained)
+        return notebook.table("Wrapped", facts, lambda camera: self.render(camera).image, self.views()[0])
+
+    def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
+        """How this model is rendered at `scale`, or by the viewer of that name (`splatting.viewers`).
+
+        `screen_filter`: None for the filter of its training, a filter's name, or "scaled" for the training-free filter whose dilation
+        keeps its size in the world. Filters that integrate over the pixel dilate splats in this way too, because a classic model was
+        trained to look right with dilation. Raises SettingsError for an unknown viewer, and for a viewer together with a filter.
+        """
+        trained = self.trained
+        degree = self._needs.sh_degree
+        if viewer is not None:
+            if screen_filter is not None:
+                raise SettingsError(f"viewer {viewer} has a screen filter of its own; leave the screen filter {screen_filter} out")
+            plain = Effects(degree, background=self.background, supersampling=supersampling, near_plane=trained.near_plane)
+            return find_viewer(viewer).effects(plain)
+        if screen_filter in (None, "scaled"):
+            eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
+            return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
+        eps2d = USUAL_EPS2D.get(screen_filter, DILATION)
+        if screen_filter in INTEGRALS and trained.screen_filter == "classic":
+            eps2d = trained.eps2d * scale**2
+        return Effects(degree, screen_filter, eps2d, self.background, supersampling, trained.near_plane)
+
+    def backend(self, *, gradients: bool = False, screen_filter: str | None = None, viewer: str | None = None) -> tuple[Backend, str]:
+        """Return the backend that renders this model, and why it was chosen."""
+        effects = self.effects(screen_filter=screen_filter, viewer=viewer)
+        needs = replace(self._needs, gradients=gradients, screen_filter=effects.screen_filter, settings=effects.settings)
+        return choose_backend(self._backend, needs)
+
+    def lacks(self, screen_filter: str) -> str:
+        """Why this model's backend does not have a screen filter, in a sentence; "" if it does."""
+        try:
+            self.backend(screen_filter=screen_filter)
+        except BackendUnavailable as error:
+            return str(error)
+        return ""
+
+    def render(
+        self,
+        camera: Camera,
+        scale: float = 1.0,
+        screen_filter: str | None = None,
+        supersampling: int = 1,
+        **options: Unpack[RenderOptions],
+    ) -> Rendered:
+        """Render the base model's view of `camera`, which samples `scale` times as finely as the training did.
+
+        `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: see `RenderOptions`. Raises
+        SettingsError.
+        """
+        if unknown := options.keys() - RenderOptions.__annotations__.keys():
+            raise TypeError(f"render() got unknown options: {', '.join(sorted(unknown))}; there are {', '.join(RenderOptions.__annotations__)}")
+        viewer, exposure = options.get("viewer"), options.get("exposure", False)
+        check_scale(scale)
+        check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
+        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(options.get("outputs", ())), exposure=exposure)
+        backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
+        form = self._smoothed if options.get("filter_3d") else None
+        return render_model(self._read_by(viewer), backend, camera, effects, form)
+
+    def _smoothed(self, gaussians: Gaussians) -> Gaussians:
+        """Apply Mip-Splatting's 3D filter. Raises SettingsError without cameras, and for splats that it cannot be applied to."""
+        if not self.cameras:
+            raise SettingsError("the 3D filter is computed from the cameras, and this checkpoint has none; give --cameras")
+        if gaussians.covariances is not None or self.model.traits.filtered:
+            raise SettingsError(f"{self.model.family}: its splats have covariances instead of scales, or a 3D filter already; leave filter_3d out")
+        scales, opacities = smooth_3d(gaussians.scales, gaussians.opacities, filter_3d_of(gaussians.means, self.cameras))
+        return replace(gaussians, scales=scales, opacities=opacities)
+
+    def adapt(
+        self,
+        scale: float,
+        *,
+        recipe: str = "default",
+        viewer: str | None = None,
+        cameras: Sequence[Camera] | None = None,
+        resume: str | Path | None = None,
+        observe: Observer | None = None,
+        images: Scene | None = None,
+        start: FinerLevel | None = None,
+        **settings: Any,
+    ) -> Adapted:
+        """Return a new model for `scale` (target focal length in px over base focal length in px); the base does not change.
+
+        `viewer`: the viewer that the file will be opened in (`splatting.viewers`), or "portable" for all built-in ones at once; by
+        default any viewer that renders as the training did, but without compensation.
+        `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override those of the recipe, by the names
+        of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to continue from if it exists; Ctrl-C writes it
+        and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` is called with the model
+        before the first step and after each step.
+        `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
+        `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
+        Raises SettingsError and BackendUnavailable.
+        """
+        check_scale(scale)
+        model = self._fused if viewer is not None and self.model.traits.filtered else self.model
+        if not model.traits.same_for_all_views and (settings.setdefault("merge_to", 1.0) < 1 or settings.get("most_splats")):
+            reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
+            raise SettingsError(f"{model.family}: {reason}; leave merge_to and most_splats out")
+        if images is not None and self.model.traits.exposures.changed:
+            raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
+        config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
+        if len(targets) > 1:
+            config = make_config(recipe, scale, **(settings_for_several(config) | settings))
+        photographs = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
+        if cameras is None:
+            cameras = photographs.cameras if photographs else self.cameras
+        needs = [replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
+        needs_gradients = config.steps > 0 or config.merge_to < 1 or config.most_splats is not None
+        backend, note = choose_backend(self._backend, *(replace(need, gradients=needs_gradients) for need in needs), self._needs)
+        has_gradients = not any(backend.lacking(need) for need in needs)
+        if config.steps:
+            largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
+            check_image(largest.width, largest.height, self.model.parameters()["means"].device)
+        if start is not None and start.scale <= scale:
+            raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
+        in_viewer = self._read_by(viewer)
+        base_in_viewer = model if in_viewer is self.model else in_viewer
+        if self.images is None or not self.images.are_of(model, backend, self.effects()):
+            self.images = BaseImages(model, backend, self.effects())
+        request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer, start)
+        with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
+            adapted = Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
+        adapted.report.seconds["loading"] = self.loading_s
+        return replace(adapted, cameras=self.views())
+
+    def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Any:
+        """Return a ladder of levels (`levels.ladder.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`."""
+        ladder = import_module("mipmap_plugin.levels.ladder")  # which builds on this class, so that it cannot be imported above
+        return ladder.make_levels(self, ladder.LadderRequest.of(viewer, **options), resume)
+
+    def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
+        """Raise now the error that saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be predicted."""
+        report, source = named(path).with_name(named(path).name + REPORT), self.model.source
+        parts = parts_of(source, self.model.folder)
+        model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
+        model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
+        for file in (report, state_path(path)):
+            refuse_output(file, True, parts, is_file=True)
+        refuse_unwritable(path, 0 if source is None else source.stat().st_size)
+
+    def targets(self, viewer: str | None) -> dict[str, Effects]:
+        """How an adapted file for `viewer` is rendered, by viewer: several for "portable", and one named "" for None.
+
+        Raises SettingsError for a model whose splats no viewer renders.
+        """
+        if viewer is None:
+            return {"": self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)}
+        if reason := why_no_viewer(self.model):
+            raise SettingsError(f"{self.model.family}: {reason}; leave the viewer {viewer} out")
+        return {name: self.effects(viewer=name) for name in viewers_for(viewer)}
+
+    def target(self, viewer: str | None) -> Effects:
+        """How the adapted file is rendered. Raises SettingsError as `targets` does, and for the name of a group of viewers."""
+        if viewer is not None:
+            find_viewer(viewer)
+        return self.targets(viewer)[viewer or ""]
+
+    @cached_property
+    def _fused(self) -> SplatModel:
+        """The base with its 3D filter baked into plain splats, for viewers."""
+        return cast(Filtered, self.model).fused()
+
+    def _read_by(self, viewer: str | None) -> SplatModel:
+        """The base as a viewer reads its file: without its 3D filter if the viewer does not read it."""
+        reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(name).filter_3d for name in viewers_for(viewer))
+        return self.model if reads_all else cast(Filtered, self.model).bare()
+
+    def views(self) -> list[Camera]:
+        """The checkpoint's cameras, or a generated orbit if it came without any."""
+        return self.cameras or choose_views([], self.model.parameters()["means"], AdaptConfig())[0]
+
+    def place(self, scene: Scene) -> Scene:
+        """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""
+        in_frame = placed(self.model, scene)
+        if in_frame is not scene and not self.cameras:
+            self.cameras = list(in_frame.cameras)
+        return in_frame
+
+    @cached_property
+    def _needs(self) -> Needs:
+        """What the base needs of a backend; computed once, because the base never changes."""
+        with torch.no_grad():
+            gaussians = self.model.gaussians(self.any_camera())
+        return Needs.of(gaussians, Effects(gaussians.used_sh_degree(), self.trained.screen_filter), gradients=False)
+
+    def any_camera(self) -> Camera:
+        """One of the cameras, or a camera of one pixel if there are none."""
+        return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
+
+
+def placed(model: SplatModel, scene: Scene) -> Scene:
+    """The scene in the frame that the model was trained in: gsplat and splatfacto transform it. Raises SceneError."""
+    if not model.traits.placed:
+        return scene
+    scene = scene.original()
+    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
+    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
+
+
+def state_path(output: Path) -> Path:
+    """The path of the state of a run whose model is to be saved to `output`."""
+    output = named(output)
+    return output.with_name(output.name + ".resume")

@@ -1,0 +1,52 @@
+"""Memory that the CPU backend uses again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("numba", reason="numba, the extra `cpu`, is not installed")
+
+from mipmap_plugin.backends.cpu_kernels.pool import CACHE_LINE, LARGE, Pool
+
+
+def address(array: np.ndarray) -> int:
+    return array.__array_interface__["data"][0]
+
+
+def test_memory_is_used_again_when_its_array_is_gone():
+    pool = Pool()
+    first = pool.empty((2 * LARGE,), np.uint8)
+    place = address(first)
+    del first
+    assert address(pool.empty((2 * LARGE - 100,), np.uint8)) == place
+
+
+def test_memory_is_not_used_again_while_a_tensor_shows_it():
+    pool = Pool()
+    tensor = torch.from_numpy(pool.empty((LARGE, 2), np.float32))[3:, 1]
+    other = torch.from_numpy(pool.empty((LARGE, 2), np.float32))
+    tensor.fill_(1)
+    other.fill_(2)
+    assert (tensor == 1).all()
+
+
+def test_a_much_larger_block_is_left_for_others():
+    pool = Pool()
+    pool.empty((4 * LARGE,), np.uint8)
+    small = pool.empty((LARGE,), np.uint8)
+    assert len(small) == LARGE
+    assert pool.spare_bytes > 4 * LARGE
+
+
+def test_spare_memory_is_never_more_than_was_in_use_at_once():
+    pool = Pool()
+    for size in range(LARGE, 40 * LARGE, 3 * LARGE):
+        pool.empty((size,), np.uint8)
+    assert pool.spare_bytes <= 38 * LARGE
+
+
+@pytest.mark.parametrize("size", [1, LARGE])
+def test_arrays_begin_at_a_cache_line(size):
+    assert address(Pool().empty((size, 3), np.float32)) % CACHE_LINE == 0

@@ -1,0 +1,73 @@
+"""The time left is told right early, by a clock on which every part of a run has a price."""
+
+import time
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.recipes import recipe
+from mipmap_plugin.wrap import wrap_model
+
+SCALE = 1 / 4
+VIEW, TRUTH, CHECK = 0.003, 0.012, 0.05  # s: as of lego_200 on one thread
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands still until somebody spends time."""
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+
+    def spend(seconds):
+        now[0] += seconds
+
+    return spend
+
+
+def run_and_estimates(clock, monkeypatch, **settings):
+    """The whole run's seconds, and after each step those that have passed and those that were said to be left."""
+    config, student, views, images = recipe("default", SCALE, **settings), tiny.model(3).copy(), tiny.cameras(20, width=8, height=8), {}
+    backend, effects, told = ReferenceBackend(), Effects(1), []
+
+    def truth(view):
+        if view not in images:
+            clock(TRUTH)
+            images[view] = torch.zeros(2, 2, 3)
+        return images[view]
+
+    def render(gaussians, camera):
+        clock(VIEW)
+        return backend.render(gaussians, camera, effects).image
+
+    monkeypatch.setattr(Validation, "steer", lambda self, model: clock(CHECK) or 20.0)
+    monkeypatch.setattr(loop.Bar, "update", lambda bar, *_: told.append((run.watch.seconds, bar.seconds_left)))
+    task = Task(views, SCALE, truth, render, False, Validation([], [], SCALE, truth, render, config.resize))
+    run = Run.start(student, task, config)
+    loop.adapt(run, task, config, on_interrupt=lambda run: None)
+    return run.watch.seconds, told
+
+
+@pytest.mark.parametrize("settings", [dict(steps=40), dict(steps=30, views_per_step=1, check_every=5), dict(steps=30, warm_up=0.0, gathering=1.0)])
+def test_after_a_tenth_of_the_run_the_estimate_is_right_within_thirty_percent(clock, monkeypatch, settings):
+    total, told = run_and_estimates(clock, monkeypatch, **settings)
+    for passed, left in told:
+        if passed > total / 10:
+            assert left == pytest.approx(total - passed, rel=0.3, abs=0.01 * total)
+    assert told[-1][1] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_budget_bounds_the_estimate(clock, monkeypatch):
+    _, told = run_and_estimates(clock, monkeypatch, steps=40, time_budget_s=0.4)
+    assert all(left <= max(0.0, 0.4 - passed) for passed, left in told)
+
+
+def test_truth_and_validation_have_rows_of_their_own_in_the_report():
+    seconds = wrap_model(tiny.model(10), cameras=tiny.cameras(4)).adapt(SCALE, steps=4, extra_views=2).report.seconds
+    assert all(seconds[phase] > 0 for phase in ("pseudo truth", "validation", "optimization"))
+    assert sum(seconds[phase] for phase in seconds.keys() - {"total"}) == pytest.approx(seconds["total"], rel=0.2)

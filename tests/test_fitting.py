@@ -1,0 +1,53 @@
+"""Files of a chosen size: the number of splats that fits, and the zoom that suits it."""
+
+import pytest
+import tiny
+
+from mipmap_plugin import cli, load_model
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.levels.fitting import HEADER, fitting_scale, read_size, splats_within
+from mipmap_plugin.recipes import recipe, scale_of_fraction
+
+
+@pytest.mark.parametrize(("text", "size"), [("20MB", 20_000_000), ("1.5 GB", 1_500_000_000), ("64kib", 65_536), ("4000", 4000)])
+def test_sizes_are_read(text, size):
+    assert read_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["20 parsecs", "", "-3MB", "MB", "0", "1.2.3MB"])
+def test_a_size_that_is_none_is_refused(text):
+    with pytest.raises(SettingsError, match="bytes: must be a size such as 20MB"):
+        read_size(text)
+
+
+@pytest.mark.parametrize("scale", [0.05, 0.2, 0.39, 0.41, 0.6, 0.7])
+def test_the_zoom_of_a_count_is_that_at_which_the_recipe_keeps_it(scale):
+    assert scale_of_fraction(recipe("default", scale).merge_to) == pytest.approx(scale)
+
+
+def test_more_splats_than_the_bases_suit_its_own_scale():
+    assert fitting_scale(200, tiny.model(60)) == 1
+
+
+def test_as_many_splats_as_fit_into_a_file_do_fit(tmp_path):
+    model, size = tiny.model(500), 40_000
+    most = splats_within(model, size, "file.ply")
+    saved = tiny.model(most).save(tmp_path / "file.ply", provenance={"settings": "x" * (HEADER - 2000)})
+    assert saved.stat().st_size <= size < saved.stat().st_size * 500 / most
+    assert splats_within(model, 10**9, "file.ply") == 500
+    with pytest.raises(SettingsError, match="hold no splat"):
+        splats_within(model, HEADER, "file.ply")
+
+
+def test_a_file_of_fewer_splats_at_the_bases_own_scale_is_optimized_as_a_zoom_out():
+    assert recipe("default", 1.0, most_splats=5).rates.means > 0 == recipe("default", 1.0).rates.means
+
+
+def test_the_command_makes_a_file_of_so_many_splats(tmp_path, capsys):
+    base, output = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "small.ply"
+    words = ["adapt", str(base), "--splats", "9", "--output", str(output), "--steps", "1", "--views", "given", "--backend", "reference"]
+    assert cli.main(words) == 0
+    assert len(load_model(output)) <= 9
+    assert "x0.1875" in capsys.readouterr().out  # 9 of 60 splats are those of 0.8 times this scale
+    assert cli.main([*words[:-2], "--bytes", "1 parsec"]) == 2 and "such as 20MB" in capsys.readouterr().err
+    assert cli.main(["adapt", str(base)]) == 2 and "--scale" in capsys.readouterr().err

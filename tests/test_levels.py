@@ -1,0 +1,269 @@
+"""Ladders of levels: bands, starts from finer levels, switches, manifests, and what an interruption leaves."""
+
+import json
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import cli, load_model, wrap_model
+from mipmap_plugin.adaptation.start.candidates import FinerLevel
+from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.views import over_band
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.commands.levels import print_summary
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import OutputExists, SettingsError
+from mipmap_plugin.levels.contents import Contents
+from mipmap_plugin.levels.ladder import make_levels
+from mipmap_plugin.levels.manifest import MANIFEST, write_ladder
+from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, WIDE, Band, LadderRequest
+from mipmap_plugin.levels.switching import crossing, zooms_between
+from mipmap_plugin.recipes import recipe
+from mipmap_plugin.wrap import Interrupted, state_path
+
+BRIEF = dict(steps=1, extra_views=1, validation_views=2, warm_up=0, views_per_step=1)
+
+
+def wrapped(count=12):
+    return wrap_model(tiny.model(count, degree=0), cameras=tiny.cameras(2, width=16, height=12), backend="reference")
+
+
+def request(viewer="antialiased", **options):
+    return LadderRequest.of(viewer, **{"coarsest": 1 / 4, "ratio": 2.0, **BRIEF, **options})
+
+
+# Bands of views
+
+
+def test_views_of_a_band_are_spread_evenly_over_it_in_any_run_of_them():
+    views = over_band(tiny.cameras(40), AdaptConfig(band=(0.5, 2.0)))
+    zooms = sorted(view.zoom for view in views)
+    assert 0.5 < zooms[0] < 0.54 and 1.86 < zooms[-1] < 2
+    gaps = [math.log2(high / low) for low, high in pairwise(zooms)]
+    assert max(gaps) < 3 * 2 / 40
+    for first in (0, 11, 29):
+        assert any(view.zoom < 1 for view in views[first : first + 3]) and any(view.zoom > 1 for view in views[first : first + 3])
+
+
+def test_without_a_band_views_stay_the_same_objects():
+    views = tiny.cameras()
+    assert all(one is other for one, other in zip(over_band(views, AdaptConfig()), views, strict=True))
+
+
+def test_the_truth_of_a_zoomed_view_is_the_bases_own_image():
+    """The base is rendered with its own pixels and dilation, whatever the view's place in the band."""
+    base, view, effects = tiny.model(), tiny.cameras()[0], Effects(sh_degree=1)
+    truth = PseudoTruth(BaseImages(base, ReferenceBackend(), effects), 1 / 2, AdaptConfig(band=(0.5, 1.0)))
+    image = ReferenceBackend().render(base.gaussians(), view, effects).image.clamp(0, 1)
+    torch.testing.assert_close(truth(view.zoomed(0.5)), resize(image, (6, 8), "pil-bicubic"))
+
+
+@pytest.mark.parametrize(
+    ("band", "reason"), [((0.5, 4.0), "a band ends at the base's scale"), ((2.0, 1.0), "must rise"), ((0.0, 1.0), "greater than 0")]
+)
+def test_impossible_bands_are_refused(band, reason):
+    with pytest.raises(SettingsError, match=reason):
+        recipe("default", 1 / 2, band=band)
+
+
+def test_a_band_is_adapted_to():
+    """The report of a run over a band judges it by the band: the base in a viewer, say, is another number there than at one scale."""
+    one, band = (wrapped().adapt(1 / 2, viewer="antialiased", band=band, **BRIEF).report for band in ((1.0, 1.0), (0.5, 2.0)))
+    assert band.settings.band == (0.5, 2.0)
+    assert one.validation["the base as it is"] != band.validation["the base as it is"]
+
+
+# Starts from a finer level
+
+
+def test_a_run_starts_from_a_finer_level_and_keeps_a_fraction_of_the_base():
+    base = wrapped(40)
+    finer = base.adapt(1 / 2, viewer="antialiased", steps=0, most_splats=30, validation_views=2).model
+    adapted = base.adapt(1 / 4, viewer="antialiased", start=FinerLevel(finer, 1 / 2), steps=0, merge_to=0.25, merging_costs=99, validation_views=2)
+    assert len(finer) <= 30 and adapted.report.gaussians_before == 40
+    assert any("merged" in name or "finer level" in name for name in adapted.report.validation)
+    assert 10 <= adapted.report.gaussians_after <= 30
+
+
+def test_a_start_has_to_be_finer():
+    base = wrapped()
+    with pytest.raises(SettingsError, match=r"start: x0.25 is not finer than x0.5; leave it out"):
+        base.adapt(1 / 2, viewer="antialiased", start=FinerLevel(base.model, 1 / 4), **BRIEF)
+
+
+# Counts
+
+
+@pytest.mark.parametrize("most", [1, 7, 30])
+def test_at_most_so_many_splats_are_left_whatever_it_costs(most):
+    adapted = wrapped(40).adapt(1 / 2, viewer="antialiased", most_splats=most, steps=2, extra_views=1, validation_views=2)
+    assert len(adapted.model) <= most
+    assert "the base as it is" not in adapted.report.validation
+
+
+def test_a_count_above_the_bases_changes_nothing():
+    options = dict(viewer="antialiased", steps=0, validation_views=2, merge_to=1.0)
+    one, other = (wrapped().adapt(1 / 2, **options, **more).model.parameters() for more in ({}, {"most_splats": 12}))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+# Bands of a ladder
+
+
+def test_bands_meet_and_end_at_the_coarsest_scale():
+    bands = [Band.first(2.0, as_it_is=False)]
+    while bands[-1].low > 0.08:
+        bands.append(bands[-1].next(2.0, coarsest=0.08))
+    assert [band.scale for band in bands] == pytest.approx([1, 1 / 2, 1 / 4, 1 / 8, 0.08])
+    assert all(finer.low == coarser.high for finer, coarser in pairwise(bands))
+    assert all(band.low < band.scale <= band.high for band in bands)
+
+
+def test_a_base_that_the_viewer_draws_as_its_training_did_stays_as_it_is():
+    ladder = make_levels(wrapped(), request("classic", coarsest=0.6))
+    first = ladder.levels[0].adapted
+    assert "the base as it is" in first.report.returned
+    for name, tensor in wrapped().model.parameters().items():
+        torch.testing.assert_close(first.model.parameters()[name], tensor, rtol=0, atol=0)
+
+
+def test_the_ratio_suits_the_viewer():
+    effects = Effects(sh_degree=1)
+    usual = LadderRequest("spark")
+    assert usual.first_ratio(replace(effects, screen_filter="mip")) == WIDE
+    assert usual.first_ratio(replace(effects, screen_filter="classic", eps2d=0.075)) == WIDE
+    assert usual.first_ratio(replace(effects, screen_filter="classic", eps2d=0.3)) == NARROW
+    assert request(ratio=1.5).first_ratio(effects) == 1.5
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [({"coarsest": 2.0}, "goes down"), ({"ratio": 1.0}, "ratio: must be"), ({"until_splats": 0}, "until_splats"), ({"band": (0.5, 1)}, "band: set")],
+)
+def test_impossible_ladders_are_refused(options, reason):
+    with pytest.raises(SettingsError, match=reason):
+        request(**options)
+
+
+def test_a_group_of_viewers_has_no_ladder():
+    with pytest.raises(SettingsError, match="portable is a group of viewers"):
+        make_levels(wrapped(), request("portable"))
+
+
+# Switches
+
+
+def test_switches_lie_where_both_levels_are_equally_good():
+    zooms = [0.25, 0.354, 0.5]
+    assert crossing(zooms, [30, 33, 36], [36, 33, 30]) == pytest.approx(0.354)
+    assert crossing(zooms, [30, 31, 36], [36, 33, 30]) == pytest.approx(0.354 * (0.5 / 0.354) ** 0.25)
+
+
+def test_of_two_crossings_the_better_is_taken_and_without_one_the_closest_zoom():
+    assert crossing([1, 2, 3, 4], [20, 24, 29, 31], [21, 23, 30, 30]) > 3
+    assert crossing([1, 2, 3], [10, 12, 12], [20, 20, 15]) == 3
+
+
+def test_zooms_include_both_ends():
+    assert zooms_between(0.25, 0.25, 2) == [0.25]
+    assert zooms_between(0.25, 1, 2) == pytest.approx([0.25, 0.5, 1])
+    assert len(zooms_between(0.25, 1.01, 2)) == 4
+
+
+# Ladders
+
+
+def test_levels_of_a_bound_are_made_again_for_narrower_bands():
+    """No level of so few steps is this good, so that every band ends up at the finest ratio."""
+    ladder = make_levels(wrapped(), request(coarsest=0.6, ratio=2.0, least_db=99.0))
+    assert [level.band.scale for level in ladder.levels] == pytest.approx([1, (2 * FINEST_RATIO) ** -0.5])
+    assert [level.band.scale for level in make_levels(wrapped(), request(coarsest=0.6, ratio=2.0)).levels] == pytest.approx([1, 0.6])
+
+
+def test_a_ladder_ends_with_few_enough_splats():
+    ladder = make_levels(wrapped(), request(until_splats=12))
+    assert len(ladder.levels) == 1
+
+
+def test_a_saved_ladder_says_what_it_is(tmp_path):
+    base = wrapped()
+    saved = base.levels("antialiased", coarsest=1 / 2, ratio=2.0, **BRIEF).save(tmp_path / "ladder")
+    manifest = json.loads((saved / MANIFEST).read_text())
+    levels = manifest["levels"]
+    assert [level["scale"] for level in levels] == pytest.approx([1, 1 / 2])
+    for level in levels:
+        model = load_model(saved / level["file"])
+        assert len(model) == level["splats"] and (saved / level["file"]).stat().st_size == level["bytes"] and model.digest == level["sha256"]
+    assert levels[0]["shown_to"] is None and levels[-1]["shown_from"] is None
+    switches = [each["zoom"] for each in manifest["switches"]]
+    assert [level["shown_from"] for level in levels[:-1]] == [level["shown_to"] for level in levels[1:]] == switches
+    assert manifest["worst_db"] == min(point["psnr_db"] for point in manifest["curve"]) and manifest["viewer"] == "antialiased"
+    assert [point["zoom"] for point in manifest["curve"]] == sorted((point["zoom"] for point in manifest["curve"]), reverse=True)
+    with pytest.raises(OutputExists, match="exists already"):
+        write_ladder(Contents(request(), base, [], [], []), saved, overwrite=False)
+
+
+def test_a_folder_that_is_no_ladder_is_never_replaced(tmp_path, capsys):
+    base = tiny.folder(tmp_path / "base")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "one.jpg").write_bytes(b"1")
+    for output in (base, tmp_path / "photos"):
+        words = ["levels", str(base), "--viewer", "antialiased", "--output", str(output), "--overwrite"]
+        assert cli.main(words) == 2
+        assert "choose another" in capsys.readouterr().err
+    assert (tmp_path / "photos" / "one.jpg").exists() and (base / "point_cloud").is_dir()
+
+
+def test_an_interrupted_ladder_goes_on_with_what_is_ready(tmp_path, monkeypatch):
+    whole = make_levels(wrapped(), request(coarsest=1 / 2), resume=tmp_path / "a").save(tmp_path / "whole")
+    base = wrapped()
+    adapt, scales = base.adapt, []
+
+    def interrupted(scale, **options):
+        scales.append(scale)
+        if len(scales) == 2:
+            raise Interrupted("Ctrl-C")
+        return adapt(scale, **options)
+
+    monkeypatch.setattr(base, "adapt", interrupted)
+    with pytest.raises(Interrupted):
+        make_levels(base, request(coarsest=1 / 2), resume=tmp_path / "b")
+    again = make_levels(base, request(coarsest=1 / 2), resume=tmp_path / "b").save(tmp_path / "again")
+    assert scales == pytest.approx([1, 1 / 2, 1 / 2])
+    assert not (tmp_path / "a").exists() and not (tmp_path / "b").exists()
+    for file in whole.glob("*.ply"):
+        assert file.read_bytes() == (again / file.name).read_bytes()
+
+
+def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
+    base = wrapped()
+    monkeypatch.setattr(base, "adapt", lambda *_, **__: (_ for _ in ()).throw(Interrupted("Ctrl-C")))
+    with pytest.raises(Interrupted):
+        make_levels(base, request(), resume=tmp_path / "state")
+    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
+        make_levels(wrapped(), request(coarsest=1 / 8), resume=tmp_path / "state")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "file").write_text("mine")
+    with pytest.raises(SettingsError, match="it has other things in it"):
+        make_levels(wrapped(), request(), resume=tmp_path / "other")
+
+
+def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
+    base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
+    options = ["--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given", "--backend", "reference"]
+    words = ["levels", str(base), "--output", str(tmp_path / "ladder"), "--json", *options]
+    assert cli.main(words) == 0
+    manifest = json.loads(capsys.readouterr().out)
+    assert manifest == json.loads((tmp_path / "ladder" / MANIFEST).read_text())
+    print_summary(tmp_path, manifest)
+    said = capsys.readouterr().out
+    assert "2 levels" in said and "level_1.ply  x0.5, shown up to" in said and "at worst" in said
+    assert not state_path(tmp_path / "ladder").exists()
+    assert cli.main(words) == 2 and "--overwrite" in capsys.readouterr().err

@@ -1,0 +1,65 @@
+"""The dolly benchmark's own parts: exact zooms, whole frames, flicker that only what is wrong makes, and a page from measured films."""
+
+import sys
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
+
+from levels import Dolly, Show, at, changes, film, middle
+from levels_page import page
+
+from mipmap_plugin import wrap_model
+
+
+@pytest.fixture
+def dolly(monkeypatch):
+    """Three frames over a tiny scene."""
+    monkeypatch.setattr("levels.FRAMES", 3)
+    base = wrap_model(tiny.model(12, degree=0), cameras=tiny.cameras(2, width=16, height=12), backend="reference")
+    return Dolly(base, base.cameras)
+
+
+def test_zooms_are_exact_and_frames_hold_the_view():
+    view = tiny.cameras(1, width=33, height=20)[0]
+    for zoom in (1.0, 0.77, 0.1):
+        camera = at(view, zoom)
+        assert camera.fx == pytest.approx(zoom * view.fx) and camera.width % 2 == camera.height % 2 == 0
+        assert camera.width >= zoom * view.width > camera.width - 2
+        offset = zoom * (view.cx - view.width / 2)
+        assert camera.cx - camera.width / 2 == pytest.approx(offset)
+
+
+def test_the_middle_of_a_frame_is_what_the_next_frame_shows():
+    image = torch.arange(6 * 8).view(6, 8, 1).expand(-1, -1, 3).float()
+    assert torch.equal(middle(image, torch.zeros(2, 4, 3)), image[2:4, 2:6])
+
+
+def test_the_base_at_its_own_scale_is_the_truth_and_does_not_flicker(dolly):
+    show = Show("base", [dolly.base.model], [], 1.0)
+    measured = film(dolly, show, "classic", dolly.truths())
+    assert measured.frames[0].psnr_db > 60 and measured.frames[0].flicker is None
+    assert measured.frames[-1].psnr_db < 40 and measured.frames[-1].flicker > 0
+    assert [frame.zoom for frame in measured.frames] == pytest.approx([1, 1 / 4, 1 / 16])
+
+
+def test_files_change_at_their_switches(dolly):
+    coarser = tiny.model(5, degree=0)
+    show = Show("two", [dolly.base.model, coarser], [0.5], 1.0)
+    assert show.file(0.51) is dolly.base.model and show.file(0.49) is coarser
+    (change,) = changes(dolly, show, "classic")
+    assert change.zoom == 0.5 and 0 < change.likeness_db < 60 < change.one_percent_db + 60
+
+
+def test_the_page_compares_films():
+    frames = [{"zoom": zoom, "psnr_db": psnr, "flicker": None if zoom == 1 else 2.0} for zoom, psnr in ((1, 38.0), (0.25, 34.0))]
+    rival = [frame | {"psnr_db": frame["psnr_db"] - 9} for frame in frames]
+    films = [{"name": name, "splats": [1000], "megabytes": 1.0, "frames": each} for name, each in (("levels", frames), ("base", rival))]
+    change = {"zoom": 0.5, "step_db": 0.1, "likeness_db": 30.0, "one_percent_db": 29.0}
+    text = page([{"base": "lego", "viewer": "spark", "films": films, "changes": [change], "seconds": [3.0, 2.0]}])
+    assert "## lego in spark" in text and "5 s for all levels (3, 2)" in text
+    cells = [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line.startswith("| base")]
+    assert cells[0][1:5] == ["base", "25.0", "27.0", "9.0"]
