@@ -105,7 +105,7 @@ def test_one_file_for_every_viewer(tmp_path):
 
 
 def test_an_exchange_format_is_refused_for_its_own_project_only(tmp_path, monkeypatch):
-    monkeypatch.setattr(exchange, "_tool", lambda: ["splat-transform"])
+    monkeypatch.setattr(exchange, "find_tool", lambda: ["splat-transform"])
     base = wrapped(tmp_path)
     base.refuse_output(tmp_path / "small.spz", overwrite=False, viewer="spark")
     with pytest.raises(SettingsError, match="these splats need the filter of their own project"):
