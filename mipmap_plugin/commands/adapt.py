@@ -82,8 +82,9 @@ def adapt(
     requests = _requests(scale or fitting, viewer)
     targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]
     _check(wrapped, requests, targets, settings | size | dict(recipe=recipe, seed=seed), overwrite)
-    models = _adapted(wrapped, requests, targets, settings | size | dict(recipe=recipe, seed=seed, images=images and scene(images)))
-    _save_all(wrapped, models, AdaptationPage(checkpoint, targets, overwrite) if report else None, overwrite, json)
+    page = AdaptationPage(checkpoint, targets, overwrite) if report else None
+    settings |= size | dict(recipe=recipe, seed=seed, images=images and scene(images))
+    _save_all(wrapped, _adapted(wrapped, requests, targets, settings), page, overwrite, json)
 
 
 def _check(
