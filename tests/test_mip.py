@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 
@@ -210,8 +211,8 @@ def test_the_command_line_takes_the_filter(tmp_path, capsys):
     fused = ply_files.write(tmp_path / "fused.ply", plain)
     assert main(["inspect", str(fused), "--screen-filter", "mip"]) == 0
     assert "mip, 0.1 px²" in capsys.readouterr().out
-    assert main(["adapt", str(fused), "--scale", "4", "--screen-filter", "mip", "--steps", "0"]) == 0
-    assert "base mip 0.1 px²; file classic 0.3 px²" in capsys.readouterr().out
+    assert main(["adapt", str(fused), "--scale", "4", "--screen-filter", "mip", "--steps", "0", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["filters"].endswith("base mip 0.1 px²; file classic 0.3 px²")
 
 
 def test_any_model_can_be_rendered_with_a_3d_filter():

@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+from importlib.resources import files
 
 import pytest
 import tiny
@@ -13,6 +14,7 @@ from PIL import Image
 from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists
+from mipmap_plugin.evaluation.metrics import SAME_DB
 from mipmap_plugin.evaluation.shots import Shot
 from mipmap_plugin.formats.images import data_uri
 from mipmap_plugin.pages.gallery import Gallery
@@ -85,6 +87,11 @@ def test_infinite_figures_are_none_in_the_record():
 @pytest.mark.parametrize(("scale", "name"), [(0.25, "×1/4"), (1 / 3, "×1/3"), (4.0, "×4"), (0.3, "×0.3"), (1.0, "×1"), (1.5, "×1.5")])
 def test_scales_are_written_as_people_write_them(scale, name):
     assert zoom_name(scale) == name
+
+
+def test_the_page_knows_the_figure_of_identical_images():
+    script = files("mipmap_plugin.pages").joinpath("dom.js").read_text()
+    assert re.search(r"SAME_DB = (\d+)", script)[1] == f"{SAME_DB:g}"
 
 
 def test_a_page_is_not_overwritten(tmp_path):

@@ -1,5 +1,7 @@
 """Real images as the truth of a zoom-in, for the views that have one."""
 
+import json
+
 import pytest
 import tiny
 import torch
@@ -72,6 +74,6 @@ def test_a_scene_without_training_images_is_refused(tmp_path):
 
 def test_the_command_takes_a_folder_of_images(folder, tmp_path, capsys):
     base = tiny.folder(tmp_path / "base")
-    words = ["adapt", base, "--scale", "2", "--images", folder, "--steps", "1", "--backend", "reference"]
+    words = ["adapt", base, "--scale", "2", "--images", folder, "--steps", "1", "--backend", "reference", "--json"]
     assert main([str(word) for word in words]) == 0
-    assert "3 of them real images" in capsys.readouterr().out
+    assert "3 of them real images" in json.loads(capsys.readouterr().out)[0]["views"]

@@ -111,6 +111,14 @@ function frontChart(scale, { cost, mark, label, unit, points }) {
     const here = [place.x(cost(each).median), place.y(each.psnr_db.median)];
     return i ? [[here[0], place.y(front[i - 1].psnr_db.median)], here] : [here];
   });
+  for (const name of new Set(points.map((each) => `${each.name}, ${each.backend}`))) {
+    const run = points.filter((each) => `${each.name}, ${each.backend}` === name).sort((a, b) => cost(a).median - cost(b).median);
+    if (run.length > 1) svg.append(draw("path", { class: "run", d: path(run.map((each) => [place.x(cost(each).median), place.y(each.psnr_db.median)])) }));
+  }
+  for (const each of front.filter((one) => one.step == null)) {
+    const x = place.x(cost(each).median), late = x > WIDTH * 0.75;
+    svg.append(draw("text", { class: "point-label", x: x + (late ? 4 : -4), y: place.y(each.psnr_db.median) - 9, "text-anchor": late ? "end" : "start" }, each.name));
+  }
   if (corners.length > 1) svg.append(draw("path", { class: "front", d: path(corners) }));
   for (const each of points) {
     const step = each.step == null ? "" : `, step ${each.step}`;

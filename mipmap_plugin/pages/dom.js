@@ -23,7 +23,8 @@ function draw(tag, attributes = {}, ...children) {
   return element;
 }
 
-const decibel = (value) => (value == null ? "–" : `${value.toFixed(2)} dB`);
+const SAME_DB = 120; // of identical images (evaluation/metrics.py)
+const decibel = (value) => (value == null ? "–" : value >= SAME_DB ? "identical" : `${value.toFixed(2)} dB`);
 const digits = (value, count) => (value == null ? "–" : value.toFixed(count));
 /** A scale as people write it: ×1/4, ×4. */
 const zoomName = (scale) => (scale < 1 && Math.abs(1 / scale - Math.round(1 / scale)) < 1e-9 ? `×1/${Math.round(1 / scale)}` : `×${scale}`);

@@ -19,7 +19,7 @@ function rowsSection() {
 
 function tradeoffSection() {
   const scales = record.tradeoffs.map((scale) => [
-    make("p", { class: "note" }, `${zoomName(scale.scale)}, ${scale.truth}. ${scale.sentences.seconds}; ${scale.sentences.frames}.`), tradeoffCharts(scale),
+    make("p", { class: "note" }, `${zoomName(scale.scale)}, ${scale.truth}: ${scale.sentences.seconds}; ${scale.sentences.frames}.`), tradeoffCharts(scale),
   ]);
   return section("tradeoff", "Accuracy and time", ...scales.flat());
 }

@@ -170,7 +170,7 @@ def test_images_and_reports_list_effects():
 
 
 def test_inspect_prints_effects(tmp_path, capsys):
-    assert cli.main(["inspect", str(tiny.folder(tmp_path / "plain"))]) == 0
+    assert cli.main(["inspect", str(tiny.folder(tmp_path / "plain")), "--all"]) == 0
     out = capsys.readouterr().out
     assert all(f"{effect.name}: " in out for effect in explain(Effects(), tiny.gaussians(1)))
     assert "time: off, the scene does not move (saves a pass through a deformation field per image)" in out
