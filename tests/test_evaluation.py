@@ -12,7 +12,7 @@ from PIL import Image
 
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation import measure, protocols
+from mipmap_plugin.evaluation import measure, photographs, protocols
 from mipmap_plugin.evaluation.evaluate import Evaluator, evaluate, means, training_free_rows
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr, ssim
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
@@ -141,6 +141,30 @@ def test_test_views_are_brought_to_the_density_of_the_base(scene):
         assert [view.camera.name for view in views] == ["view_0", "view_1"]
         assert all(view.camera.split == "test" and view.camera.size == (24 * scale, 32 * scale) for view in views)
         assert all(view.photograph.shape == (24, 32, 3) for view in views)
+
+
+def test_photographs_are_kept_in_bytes(scene):
+    camera = next(iter(scene.images))
+    read = scene.image(camera, (0.0, 0.0, 0.0))
+    kept = photographs.packed(read)
+    assert kept.dtype == torch.uint8 and torch.equal(photographs.unpacked(kept), read)
+    every_level = (torch.arange(256).float() / 255).expand(2, 256)[..., None].expand(-1, -1, 3)
+    assert photographs.packed(every_level).dtype == torch.uint8
+
+
+def test_a_photograph_that_bytes_cannot_hold_keeps_its_bits():
+    image = noise(24, 32, 3)
+    assert photographs.packed(image) is image and photographs.unpacked(image) is image
+
+
+def test_beyond_the_limit_photographs_are_read_again(scene, monkeypatch):
+    reads, image = [], type(scene).image
+    monkeypatch.setattr(type(scene), "image", lambda self, camera, background: reads.append(camera) or image(self, camera, background))
+    first, second = [*scene.images][:2]
+    held = photographs.Photographs(scene, (0.0, 0.0, 0.0), most_bytes=24 * 32 * 3)
+    of_first, of_second = held.of(first), held.of(second)
+    assert torch.equal(of_first(), image(scene, first, (0.0, 0.0, 0.0))) and torch.equal(of_second(), image(scene, second, (0.0, 0.0, 0.0)))
+    assert reads == [first, second, second]
 
 
 def test_all_photographs_are_judged_by_where_none_is_a_test_view(scene):

@@ -11,6 +11,7 @@ rounds, and their metrics.py reads those files.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol as TypingProtocol
@@ -21,6 +22,7 @@ from mipmap_plugin.adaptation.target.photographs import at_density_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation.photographs import Photographs
 from mipmap_plugin.formats.images import image_size, pillow_bicubic, read_image
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes import Scene
@@ -84,10 +86,15 @@ class TestView:
     """A test photograph, and its camera at the base scale."""
 
     camera: Camera
-    photograph: Tensor  # [H, W, 3], full resolution
+    source: Tensor | Callable[[], Tensor]  # the photograph, or what returns it
     file: Path
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     distorted: bool = False  # the file had to be undistorted
+
+    @property
+    def photograph(self) -> Tensor:
+        """[H, W, 3], full resolution; unpacked or read anew at each call."""
+        return self.source() if callable(self.source) else self.source
 
     def truth(self, scale: float, protocol: Protocol) -> Tensor:
         """[h, w, 3] at `scale` times the base scale. Raises SettingsError if the photograph is smaller."""
@@ -96,10 +103,11 @@ class TestView:
             raise SettingsError(f"P4 reads ready-made copies, but those of {self.file.name} have lens distortion; evaluate by P3")
         if protocol.resize is None:
             return protocol.shrunk(read_image(ready_made(self.file, size), self.background), size)
-        if size[0] > self.photograph.shape[0]:
-            original = f"{self.photograph.shape[1]} x {self.photograph.shape[0]}"
+        photograph = self.photograph
+        if size[0] > photograph.shape[0]:
+            original = f"{photograph.shape[1]} x {photograph.shape[0]}"
             raise SettingsError(f"x{scale:g} needs {size[1]} x {size[0]} px, but the photographs have only {original}; evaluate a smaller scale")
-        return protocol.shrunk(self.photograph, size)
+        return protocol.shrunk(photograph, size)
 
 
 def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
@@ -126,9 +134,11 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
     if not cameras:
         raise SettingsError(f"{scene.source}: there are no photographs to compare with")
 
+    photographs = Photographs(scene, background)
+
     def view(camera: Camera) -> TestView:
         file = scene.images[camera]
-        return TestView(at_density_of(camera, base), scene.image(camera, background), file, background, file in scene.lenses)
+        return TestView(at_density_of(camera, base), photographs.of(camera), file, background, file in scene.lenses)
 
     return [view(camera) for camera in cameras]
 
