@@ -45,8 +45,8 @@ SNIPPET = re.compile(r'^--8<-- "([^":]+)(?::(\w+))?"$', re.MULTILINE)
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
 COMMANDS = {each.__name__: each for each in vars(cli).values() if getattr(each, "__module__", "").startswith("mipmap_plugin.commands.")}
-OTHER_PROGRAMS = {"pip", "python", "pytest", "ruff", "mypy", "npm", "mkdocs"}
-OPTIONS_OF_OTHERS = {"--train_test_exp", "--antialiasing"}  # INRIA's
+OTHER_PROGRAMS = {"pip", "python", "pytest", "ruff", "mypy", "npm", "mkdocs", "dask", "sbatch"}
+OPTIONS_OF_OTHERS = {"--train_test_exp", "--antialiasing", "--resources"}  # INRIA's; dask's
 
 
 @dataclass(frozen=True)
@@ -270,6 +270,8 @@ NOT_RUN = {
     "SwinIR_x2.pth": "no network comes along",
     "FILE": "no weights come along",
     "results/garden": "no checkpoint of gsplat comes along",
+    "scenes.txt": "no list comes along",
+    "tcp://scheduler:8786": "no scheduler runs here",
     "outputs/poster/splatfacto/2026-11-01_120000": "no checkpoint of splatfacto comes along",
 }
 FOLDERS = ("CHECKPOINT", "output/bicycle", "lego_200")

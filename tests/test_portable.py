@@ -133,7 +133,7 @@ def test_each_viewer_draws_for_the_gradient(monkeypatch, pair):
 def test_the_mean_square_over_viewers_steers_and_the_worst_chooses():
     cameras, shows = tiny.cameras(2), colored(0.4, 0.1, 0.49)
     judge = Validation(cameras, cameras, 1.0, lambda view: torch.full((*view.size, 3), 0.5), shows[0], "area", shows[1:])
-    model = SimpleNamespace(gaussians=lambda camera: None, parameters=lambda: {"means": torch.zeros(1, 3)})
+    model = SimpleNamespace(gaussians=lambda camera: None, parameters=lambda: {"means": torch.zeros(1, 3)}, traits=Traits())
     assert judge.viewer_psnrs(model, cameras) == pytest.approx([20.0, 7.9588, 40.0], abs=1e-3)
     assert judge.steer(model) == pytest.approx(-10 * math.log10((0.1**2 + 0.4**2 + 0.01**2) / 3), abs=1e-3)
     assert judge.choose({"it": model})[1] == pytest.approx({"it": 7.9588}, abs=1e-3)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import queue
-from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed, wait
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import Any
 
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.worker import Worker, do
+
+Futures = Iterable[Any]  # of the standard library or of dask
 
 
 def in_this_process(jobs: Sequence[Job], threads: int | None = None) -> Generator[Outcome, None, None]:
@@ -39,18 +42,32 @@ def in_workers(jobs: Sequence[Job], count: int, threads: int | None = None) -> G
 
     pool = ThreadPoolExecutor(max(1, len(workers)), "mipmap_plugin-jobs")
     futures = [pool.submit(do_in_free_worker, job) for job in jobs]
-    try:
-        for future in as_completed(futures):
-            yield future.result()
-    finally:
+
+    def stop() -> None:
         pool.shutdown(wait=False, cancel_futures=True)
         for worker in workers:
             worker.stop()
-        try:
-            wait(futures)
-        finally:
-            for worker in workers:
-                worker.close()
+
+    try:
+        for future in with_interrupted(futures, as_completed, stop):
+            yield future.result()
+    finally:
+        stop()
+        for worker in workers:
+            worker.close()
+
+
+def with_interrupted(futures: Futures, as_completed: Callable[[Futures], Futures], stop: Callable[[], None]) -> Generator[Any, None, None]:
+    """Yield the futures as they complete. On Ctrl-C, call `stop`, yield those that it ends too, and raise KeyboardInterrupt then."""
+    pending = list(futures)
+    try:
+        for future in as_completed(list(pending)):
+            pending.remove(future)
+            yield future
+    except KeyboardInterrupt:
+        stop()
+        yield from as_completed([future for future in pending if not future.cancelled()])
+        raise
 
 
 def usable_threads() -> int:

@@ -14,15 +14,15 @@ import uuid
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 
-from distributed import Client, Event, Future, LocalCluster, as_completed, wait
+from distributed import Client, Event, Future, LocalCluster, as_completed
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.jobs.engines import usable_threads
+from mipmap_plugin.jobs.engines import usable_threads, with_interrupted
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.worker import Worker, do
 
-# Seconds between two looks at whether jobs are to stop; to reach a scheduler; for interrupted jobs to save their states.
-PERIOD_S, CONNECT_S, STOP_S = 1.0, 20.0, 120.0
+# Seconds between two looks at whether jobs are to stop; to reach a scheduler.
+PERIOD_S, CONNECT_S = 1.0, 20.0
 
 _mine = threading.local()
 
@@ -40,11 +40,10 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None) -> Gene
         stop = Event(f"stop-{uuid.uuid4().hex}", client=client)
         futures = {client.submit(_task, job, share, stop.name, key=f"adapt-{uuid.uuid4().hex}", pure=False, resources=needs): job for job in jobs}
         try:
-            for future in as_completed(futures):
+            for future in with_interrupted(list(futures), as_completed, stop.set):
                 yield _outcome(future, futures[future])
         finally:
             stop.set()
-            wait(list(futures), timeout=STOP_S)
 
 
 def _task(job: Job, threads: int | None, stop_name: str) -> Outcome:

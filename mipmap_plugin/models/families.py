@@ -125,6 +125,11 @@ def torch_file(*words: str, sure: float = CERTAIN, trouble: str = "") -> Recogni
     return lambda files: Match(sure, f"holds {words[0]}", trouble.format(path=files.path)) if files.words(*words) else None
 
 
+def holds_splats(files: Files) -> Match | None:
+    """Recognize gsplat's checkpoints: torch files whose splats are a dictionary of that name."""
+    return Match(CERTAIN, "holds splats") if files.strings("splats") else None
+
+
 def fudan(files: Files) -> Match | None:
     """Recognize 4D Gaussian Splatting of fudan-zvg."""
     trouble = f"{files.path} is of 4D Gaussian Splatting (fudan-zvg), whose splats have a time of their own, which is not read here"
@@ -145,7 +150,7 @@ BUILT_IN = (
     family("octree", "Octree-GS", anchors("octree"), load=f"{LOADERS}.anchors.octree:load_octree", before=FLAT_OR_FILTERED),
     family("deformable", "Deformable 3D Gaussians", deformable, load=f"{LOADERS}.moving.deformable:load_deformable"),
     family("4dgs", "4D Gaussians", hexplane, load=f"{LOADERS}.moving.hexplane:load_hexplane", before=("deformable", "sc-gs")),
-    family("gsplat", "gsplat", torch_file("splats"), load=f"{LOADERS}.gsplat.model:load_gsplat", before=("splatfacto",), place=GSPLAT),
+    family("gsplat", "gsplat", holds_splats, load=f"{LOADERS}.gsplat.model:load_gsplat", before=("splatfacto",), place=GSPLAT),
     family(
         "splatfacto", "splatfacto (nerfstudio)", torch_file("pipeline", "gauss_params"),
         load=f"{LOADERS}.splatfacto:load_splatfacto", place=SPLATFACTO,

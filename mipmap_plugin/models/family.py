@@ -88,9 +88,19 @@ class Files:
         """Which of these words occur in a torch file's pickle, which is searched as bytes and never unpickled."""
         return {word for word in wanted if word.encode() in self._pickle}
 
+    def strings(self, *wanted: str) -> set[str]:
+        """Which of these are strings of a torch file's pickle, each as a whole: a key of a dictionary, for example."""
+        return {text for text in wanted if any(code + text.encode() in self._pickle for code in _beginnings(text))}
+
     @cached_property
     def _pickle(self) -> bytes:
         return pickle_of(self.path) if self.kind == "torch" else b""
+
+
+def _beginnings(text: str) -> tuple[bytes, bytes, bytes]:
+    """How a string of this length begins in a pickle: BINUNICODE, SHORT_BINUNICODE, and Python 2's SHORT_BINSTRING."""
+    length = len(text.encode())
+    return b"X" + length.to_bytes(4, "little"), b"\x8c" + length.to_bytes(1, "little"), b"U" + length.to_bytes(1, "little")
 
 
 @dataclass(frozen=True)

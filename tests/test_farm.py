@@ -1,0 +1,78 @@
+"""Jobs on dask.distributed: a real scheduler and real worker processes, one of which is killed in the middle of a job."""
+
+import json
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import pytest
+import tiny
+from running import saving_often, wait_until
+
+from mipmap_plugin.cli import main
+from mipmap_plugin.formats.torch_file import load_torch
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.jobs.run import run
+
+pytest.importorskip("distributed")
+
+@pytest.fixture
+def farm(tmp_path, monkeypatch):
+    """Start processes of dask's, a scheduler first; end all of them at the end."""
+    environment = saving_often(tmp_path / "site")
+    file, started = tmp_path / "scheduler.json", []
+
+    def start(kind, *words):
+        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--scheduler-file", str(file), *words]
+        started.append(subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+        return started[-1]
+
+    start.file = file
+    yield start
+    for process in reversed(started):
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.slow
+def test_a_killed_worker_loses_one_job_which_is_resumed(farm, tmp_path):
+    from mipmap_plugin.jobs.farm import on_dask
+
+    farm("scheduler", "--port", "0", "--no-dashboard")
+    address = json.loads(wait_until(lambda: farm.file.exists() and farm.file.read_text()))["address"]
+    settings = {"steps": 300, "seed": 0, "views": "given", "check_every": 5}
+    bases = [tiny.folder(tmp_path / f"base_{seed}", tiny.cameras(3), seed=seed) for seed in range(3)]
+    jobs = [Job(Base(base, backend="reference"), tmp_path / f"{base.name}.ply", 0.5, recipe="paper", settings=settings) for base in bases]
+    with ThreadPoolExecutor(1) as pool:
+        outcomes = pool.submit(lambda: list(on_dask(jobs, address, threads=1)))
+        victim = farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        state = wait_until(lambda: next(iter(tmp_path.glob("*.resume")), None))
+        farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")  # later than the other, which therefore has the first job
+        wait_until(lambda: len(list(tmp_path.glob("*.resume"))) == 2)
+        victim.kill()
+        saved = load_torch(state)
+        outcomes = outcomes.result(timeout=300)
+    assert {outcome.status for outcome in outcomes} == {"done"} and len(outcomes) == 3
+    assert not list(tmp_path.glob("*.resume")) and not list(tmp_path.glob(".*.lock"))
+    [resumed] = [outcome for outcome in outcomes if f"{outcome.job.target}.resume" == str(state)]
+    assert len(saved["curve"]) > 1
+    assert resumed.report["curve"][: len(saved["curve"])] == saved["curve"]  # its seconds too: these steps were not done again
+    again = run(replace(jobs[0], target=tmp_path / "again.ply"), 1)
+    assert again.file.read_bytes() == jobs[0].target.read_bytes()
+
+
+@pytest.mark.slow
+def test_workers_of_this_machine(tmp_path, capsys):
+    bases = [str(tiny.folder(tmp_path / name, tiny.cameras(3))) for name in ("a", "b")] + [str(tmp_path / "nowhere")]
+    words = ["--scale", "1/2", "--backend", "reference", "--views", "given", "--steps", "2", "--dask", "local:2"]
+    assert main(["adapt", *bases, *words]) == 2
+    assert "3 jobs: " in (out := capsys.readouterr().out) and "2 done" in out and "nowhere does not exist" in out
+
+
+@pytest.mark.parametrize("place", ["tcp://127.0.0.1:1", "local:0", "nonsense"])
+def test_a_place_without_a_scheduler_is_said_in_a_sentence(tmp_path, capsys, monkeypatch, place):
+    monkeypatch.setattr("mipmap_plugin.jobs.farm.CONNECT_S", 0.5)
+    assert main(["adapt", str(tmp_path / "a.ply"), "--scale", "4", "--dask", place]) == 2
+    assert f"--dask {place}: no scheduler answers there" in capsys.readouterr().err

@@ -1,0 +1,302 @@
+"""Many checkpoints at many scales: what is skipped, what fails alone, what runs side by side, and what a killed or interrupted run leaves."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import anchor_checkpoints
+import pytest
+import tiny
+from running import saving_often, wait_until
+
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.finished import finished
+from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
+from mipmap_plugin.jobs.run import run as run_job
+from mipmap_plugin.jobs.worker import Worker, do
+from mipmap_plugin.scenes import write_cameras
+from mipmap_plugin.wrap import Wrapped
+
+QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
+NO_STEP = ["--backend", "reference", "--steps", "0"]
+
+
+@pytest.fixture
+def run(capsys):
+    """Call the command line; return (exit code, what it said on stdout, what on stderr)."""
+
+    def call(*words):
+        capsys.readouterr()
+        code = main([str(word) for word in words])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return call
+
+
+@pytest.fixture
+def scenes(tmp_path):
+    """Two model folders, one beside the other."""
+    for seed, name in enumerate(("chair", "lego")):
+        tiny.folder(tmp_path / "output" / name, tiny.cameras(3), seed=seed)
+    return tmp_path / "output"
+
+
+def job_of(tmp_path, **changes):
+    base = tmp_path / "base.ply"
+    if not base.exists():
+        tiny.ply(base)
+        write_cameras(tmp_path / "cameras.json", tiny.cameras(3))
+    settings = {"steps": 0, "seed": 0, "views": "given"}
+    return replace(Job(Base(base, tmp_path / "cameras.json", backend="reference"), tmp_path / "out.ply", 0.5, settings=settings), **changes)
+
+
+# The command
+
+
+def test_a_broken_scene_does_not_stop_the_others(run, scenes):
+    (scenes / "broken.ply").write_text("no splats")
+    code, out, err = run("adapt", scenes / "broken.ply", scenes / "chair", scenes / "lego", "--scale", "1/2", "--scale", "4", *NO_STEP)
+    assert code == 2 and "2 of 6 jobs failed" in err
+    assert "6 jobs: 2 failed, 4 done" in out and "broken.ply" in out
+    assert {path.name for path in scenes.iterdir()} >= {"chair_x0.5", "chair_x4", "lego_x0.5", "lego_x4"}
+
+
+def test_json_says_what_failed_and_why(run, scenes):
+    code, out, _ = run("adapt", scenes / "nowhere", scenes / "lego", "--scale", "4", "--json", *NO_STEP)
+    wrong, right = json.loads(out)
+    assert code == 2
+    assert wrong["outcome"] == "failed" and "nowhere does not exist" in wrong["reason"] and wrong["report"] is None
+    assert right["outcome"] == "done" and right["report"]["scale"] == 4 and Path(right["file"]).is_file()
+
+
+def test_what_is_finished_is_skipped(run, scenes, monkeypatch):
+    command = ["adapt", scenes / "chair", scenes / "lego", "--scale", "1/2", *QUICK]
+    assert run(*command)[0] == 0
+    monkeypatch.setattr(Wrapped, "adapt", lambda *_, **__: pytest.fail("worked in vain"))
+    code, out, _ = run(*command)
+    assert code == 0 and "2 jobs: 2 finished before" in out
+    code, out, _ = run(*command, "--overwrite", "--skip-existing")
+    assert code == 0 and "2 jobs: 2 finished before" in out
+    assert run("adapt", scenes / "chair", "--scale", "1/2", "--skip-existing", *QUICK)[0] == 0
+
+
+def test_other_outputs_are_replaced_only_when_asked(run, scenes):
+    command = ["adapt", str(scenes / "*"), "--scale", "4", *NO_STEP]
+    assert run(*command)[0] == 0
+    code, out, err = run(*command, "--seed", "1")
+    assert code == 2 and "exists already; pass --overwrite" in out and "left out, because an adaptation made them: chair_x4, lego_x4" in err
+    code, out, _ = run(*command, "--seed", "1", "--overwrite")
+    assert code == 0 and "2 jobs: 2 done" in out
+
+
+def test_a_list_file_and_a_folder_for_all(run, scenes, tmp_path):
+    (tmp_path / "scenes.txt").write_text(f"# two scenes\n{scenes / 'chair'}\n\n{scenes}/le*  # a pattern\n")
+    code, out, _ = run("adapt", "--list", tmp_path / "scenes.txt", "--scale", "4", "--output", tmp_path / "new", *NO_STEP)
+    assert code == 0 and "2 jobs: 2 done" in out
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["chair_x4", "lego_x4"]
+
+
+def test_cameras_of_each_scene(run, tmp_path):
+    for name in ("a", "b"):
+        tiny.ply(tmp_path / f"{name}.ply")
+        tiny.scene(tmp_path / "data" / name, train=tiny.cameras(3))
+    code, out, _ = run("adapt", tmp_path / "a.ply", tmp_path / "b.ply", "--scale", "1/2", "--cameras", tmp_path / "data" / "{name}", "--json", *QUICK)
+    assert code == 0 and [each["report"]["views"] for each in json.loads(out)] == ["the 5 given views"] * 2
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ("--scale 4", "there is no checkpoint to adapt"),
+        ("a.ply b.ply", "give --scale"),
+        ("a.ply b.ply --scale 4 --bytes 2MB", "one checkpoint at a time"),
+        ("a.ply b.ply --scale 4 --report", "one checkpoint at a time"),
+        ("a.ply b.ply --scale 4 --steps -1", "setting steps"),
+        ("a.ply b.ply --scale 4 --viewer nobody", "nobody"),
+        ("a.ply b.ply --scale 4 --backend nobody", "there is no 'nobody'"),
+        ("a.ply b.ply --scale 4 --shard 3", "--shard 3: give the part"),
+        ("a.ply b.ply --scale 4 --shard 3/2", "--shard 3/2: there is no such part"),
+        ("a.ply b.ply --scale 4 --jobs 0", "must be at least 1"),
+        ("a.ply b.ply --scale 4 --jobs 2 --dask local:2", "leave one of them out"),
+        ("x/a.ply y/a.ply --scale 4 --output new", "would both be written to"),
+        ("*.spz --scale 4", "no file or folder fits this pattern"),
+        ("--list nowhere.txt --scale 4", "nowhere.txt: No such file"),
+    ],
+)
+def test_what_is_wrong_for_all_is_said_before_any_work(run, tmp_path, monkeypatch, words, reason):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("adapt", *words.split())
+    assert (code, out) == (2, "") and reason in err and err.count("\n") == 1
+
+
+# Lists
+
+
+def test_shards_are_all_jobs_each_once():
+    items = list(range(11))
+    parts = [shard(items, part, 4) for part in range(1, 5)]
+    assert sorted(item for part in parts for item in part) == items and {len(part) for part in parts} == {2, 3}
+    assert shard(items[:2], 4, 4) == []
+    with pytest.raises(SettingsError, match="no such part"):
+        shard(items, 0, 4)
+
+
+def test_a_checkpoint_given_twice_is_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tiny.ply(tmp_path / "a.ply")
+    (tmp_path / "b[1].ply").write_bytes((tmp_path / "a.ply").read_bytes())
+    assert find_checkpoints([Path("a.ply"), tmp_path / "a.ply", Path("*.ply")]) == [Path("a.ply"), Path("b[1].ply")]
+    assert find_checkpoints([Path("b[1].ply")]) == [Path("b[1].ply")]  # a name, though it looks like a pattern
+
+
+def test_a_list_that_is_no_text(tmp_path):
+    (tmp_path / "list").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SettingsError, match="not a text file"):
+        read_list(tmp_path / "list")
+
+
+def test_files_that_adaptations_leave_are_left_out(tmp_path):
+    job = job_of(tmp_path)
+    run_job(job)
+    (tmp_path / "out.ply.resume").write_bytes(b"")
+    kept, left_out = without_outputs(sorted(tmp_path.iterdir()))
+    assert kept == [tmp_path / "base.ply", tmp_path / "cameras.json"]
+    assert {path.name for path in left_out} == {"out.ply", "out.ply.adaptation.json", "out.ply.resume"}
+
+
+# What counts as finished
+
+
+def test_only_the_same_request_is_finished(tmp_path):
+    job = job_of(tmp_path)
+    assert finished(job) is None
+    assert run_job(job).status == "done"
+    file, report = finished(job)
+    assert file == tmp_path / "out.ply" and report["scale"] == 0.5
+    for other in ({"scale": 0.25}, {"viewer": "spark"}, {"recipe": "thorough"}, {"settings": {**job.settings, "seed": 1}}):
+        assert finished(replace(job, **other)) is None
+
+
+def test_another_base_or_another_file_is_not_finished(tmp_path):
+    job = job_of(tmp_path)
+    run_job(job)
+    output = (tmp_path / "out.ply").read_bytes()
+    tiny.ply(tmp_path / "other.ply", seed=1)
+    (tmp_path / "out.ply").write_bytes((tmp_path / "other.ply").read_bytes())  # the report stays
+    assert finished(job) is None
+    (tmp_path / "out.ply").write_bytes(output)
+    assert finished(job) is not None
+    (tmp_path / "base.ply").write_bytes((tmp_path / "other.ply").read_bytes())
+    assert finished(job) is None
+
+
+def test_a_damaged_report_is_not_finished(tmp_path):
+    job = job_of(tmp_path)
+    run_job(job)
+    (tmp_path / "out.ply.adaptation.json").write_text("{")
+    assert finished(job) is None
+
+
+def test_a_file_for_several_viewers_is_recognized(tmp_path):
+    """Whose settings are not quite the recipe's."""
+    job = job_of(tmp_path, viewer="portable", settings={"steps": 0, "views": "given"})
+    assert run_job(job).status == "done"
+    assert finished(job) is not None
+
+
+def test_splats_that_are_not_merged_are_recognized(tmp_path):
+    job = job_of(tmp_path)
+    job = replace(job, base=replace(job.base, checkpoint=anchor_checkpoints.write(tmp_path / "scaffold")), target=tmp_path / "out")
+    assert run_job(job).status == "done"
+    assert finished(job) is not None
+
+
+def test_a_job_that_another_process_finished_meanwhile(tmp_path, monkeypatch):
+    job = job_of(tmp_path)
+    save = Wrapped.refuse_output
+
+    def after_the_other(self, *arguments, **options):
+        monkeypatch.undo()
+        assert run_job(job).status == "done"
+        return save(self, *arguments, **options)
+
+    monkeypatch.setattr(Wrapped, "refuse_output", after_the_other)
+    assert run_job(job).status == "finished before"
+
+
+def test_a_bug_is_an_outcome_with_its_trace(tmp_path, monkeypatch):
+    monkeypatch.setattr(Wrapped, "adapt", lambda *_, **__: 1 / 0)
+    outcome = run_job(job_of(tmp_path))
+    assert outcome.status == "failed" and outcome.reason == "ZeroDivisionError: division by zero" and "Traceback" in outcome.trace
+
+
+def test_out_of_memory_is_one_sentence(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(Wrapped, "adapt", full)
+    assert run_job(job_of(tmp_path)).reason.startswith("out of memory; use a smaller scale")
+
+
+# Workers
+
+
+@pytest.fixture
+def worker():
+    worker = Worker(1)
+    yield worker
+    worker.close()
+
+
+def test_a_job_whose_worker_is_killed_is_done_again(worker, tmp_path):
+    killed = []
+
+    def kill_once():
+        if not killed:
+            killed.append(os.kill(worker._process.pid, signal.SIGKILL))
+
+    outcome = do(job_of(tmp_path), worker, kill_once)
+    assert killed and outcome.status == "done" and (tmp_path / "out.ply").exists()
+    failed = do(job_of(tmp_path), worker, lambda: os.kill(worker._process.pid, signal.SIGKILL))
+    assert failed.status == "failed" and "was killed, perhaps for want of memory" in failed.reason
+    worker.stop()
+    assert do(job_of(tmp_path), worker).status == "interrupted"
+
+
+def test_side_by_side_makes_the_same_bytes_as_one_after_the_other(run, scenes, tmp_path):
+    command = ["adapt", scenes / "chair", scenes / "lego", "--scale", "1/2", *QUICK]
+    for name, words in {"one": [], "two": ["--jobs", "2"]}.items():
+        code, out, err = run(*command, "--output", tmp_path / name, *words)
+        assert code == 0 and "2 jobs: 2 done" in out, err
+    files = sorted(path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*.ply"))
+    assert len(files) == 2
+    assert [(tmp_path / "one" / file).read_bytes() for file in files] == [(tmp_path / "two" / file).read_bytes() for file in files]
+
+
+@pytest.mark.parametrize("engine", [["--jobs", "2"], pytest.param(["--dask", "local:2"], marks=pytest.mark.slow)], ids=["jobs", "dask"])
+def test_ctrl_c_saves_the_state_of_every_running_job(run, scenes, tmp_path, engine):
+    if "--dask" in engine:
+        pytest.importorskip("distributed")
+    words = ["adapt", scenes / "chair", scenes / "lego", "--scale", "1/2", "--scale", "1/4", "--backend", "reference", "--views", "given"]
+    command = [sys.executable, "-m", "mipmap_plugin.cli", *map(str, words), "--steps", "100000", "--recipe", "paper", *engine]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, env=saving_often(tmp_path / "site")
+    )
+    try:
+        wait_until(lambda: len(list(scenes.glob("*.resume"))) == 2 or process.poll() is not None)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        out, err = process.communicate(timeout=300)
+    finally:
+        process.kill()
+    assert process.returncode == 130, err
+    assert "mipmap-plugin: interrupted; run the same command again to go on where it stopped" in err and "Traceback" not in err
+    assert out.strip().endswith("4 jobs: 4 interrupted" if "--dask" in engine else "4 jobs: 2 interrupted, 2 not begun")
+    assert len(list(scenes.glob("*.resume"))) == 2 and not list(scenes.glob(".*.lock"))
