@@ -24,7 +24,7 @@ from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
-from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.splatting.viewers import BUILT_IN, find_viewer, viewers_for
 
 BRIEF = dict(steps=2, extra_views=1, merge_to=1.0, warm_up=0, views_per_step=3, validation_views=2)
