@@ -16,7 +16,7 @@ def plot(report: Report) -> Any:
     except ImportError as error:
         raise SettingsError("plots need matplotlib: pip install 'mipmap-plugin[plot]'") from error
 
-    class Shown(Figure):
+    class Shown(Figure):  # type: ignore[misc, unused-ignore]  # without matplotlib it has no types
         """A figure that a notebook shows without pyplot."""
 
         def _repr_png_(self) -> bytes:
