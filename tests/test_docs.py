@@ -247,7 +247,11 @@ def unresolved(code: str) -> list[str]:
     return absent + [node.id for node in names if isinstance(node.ctx, ast.Load) and node.id not in known]
 
 
-@pytest.mark.parametrize("piece", PYTHON, ids=str)
+# A ladder of levels takes half a minute.
+LONG = [pytest.param(piece, marks=[pytest.mark.slow] if ".levels(" in piece.text else []) for piece in PYTHON]
+
+
+@pytest.mark.parametrize("piece", LONG, ids=str)
 def test_python_runs(piece, tmp_path, monkeypatch):
     """On a scene that adapts in a moment, in place of the reader's."""
     assert unresolved(piece.text) == []

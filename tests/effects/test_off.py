@@ -236,7 +236,7 @@ OPTIONAL = ["mipmap_plugin.backends.geometry"]
 OPTIONAL += ["gsplat", "llvmlite", "lpips", "matplotlib", "numba", "pycolmap", "pytest", "skimage", "spandrel", "torchvision", "triton", "tyro"]
 
 
-@pytest.mark.parametrize(("backend", "needed"), [("reference", []), ("cpu", ["llvmlite", "numba"])])
+@pytest.mark.parametrize(("backend", "needed"), [pytest.param("reference", [], marks=pytest.mark.slow), ("cpu", ["llvmlite", "numba"])])
 def test_adapting_imports_nothing_that_it_does_not_use(tmp_path, backend, needed):
     if needed:
         pytest.importorskip("numba")
