@@ -74,7 +74,8 @@ class Session:
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.views = over_band(self.base_views, config)
         self.views_note += f", {len(real.cameras)} of them real images" if real else ""
-        request.images.keep_only([*self.views, *validation])
+        steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
+        request.images.keep_only([*self.views, *steering, *choosing])
         self.truth = PseudoTruth(request.images, scale, config, real)
         self.detail = DetailLoss(self.truth, scale, config) if scale > 1 and config.compare_at == "both" and config.steps else None
         if self.detail is not None:
@@ -83,7 +84,6 @@ class Session:
         self.state: StateFile | None = None
         truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
         first, *further = [_renderer(self.backend, target) for target in self.extremes.values()]
-        steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
         self.validation = Validation(steering, choosing, scale, truth, first, config.resize, further)
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:

@@ -11,6 +11,7 @@ from typing import Any
 
 from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.outputs import adapted_path
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import JobsFailed, SettingsError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
@@ -160,5 +161,5 @@ def _print(outcomes: Sequence[Outcome], jobs: Sequence[Job], json: bool) -> None
     if json:
         print_facts(facts(sorted_outcomes), json)
         return
-    print(table(sorted_outcomes))
-    print(totals(outcomes, len(jobs)))
+    say(table(sorted_outcomes))
+    say(totals(outcomes, len(jobs)))

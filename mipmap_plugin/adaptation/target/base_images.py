@@ -49,7 +49,8 @@ class BaseImages:
     def _render(self, view: Camera, fraction: float) -> Tensor:
         # Resized, not zoomed: the model sees the `zoom` of its training, so that it shows the same splats, only with fewer pixels.
         factor = fraction / view.zoom  # a view of a band (`over_band`) samples `zoom` times as finely as the base
-        camera = view if factor == 1 else replace(view.resized(max(1, round(view.width * factor)), max(1, round(view.height * factor))), zoom=1.0)
+        size = (view.width, view.height) if factor == 1 else (max(1, round(view.width * factor)), max(1, round(view.height * factor)))
+        camera = view if (factor, view.zoom) == (1, 1) else replace(view.resized(*size), zoom=1.0)
         effects = replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
         return self.backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
 
