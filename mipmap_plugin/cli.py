@@ -20,6 +20,7 @@ from mipmap_plugin.commands.levels import levels
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.freed_memory import keep_freed_memory
 from mipmap_plugin.limits import is_out_of_memory
 
 DESCRIPTION = (
@@ -38,6 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if words == ["--version"]:
         print(f"mipmap-plugin {version('mipmap-plugin')}")
         return 0
+    keep_freed_memory()
     try:
         words, quiet, log = voice.options(words)
         common.WORDS.set(tuple(words))

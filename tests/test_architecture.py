@@ -13,7 +13,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # From the ground up; a module imports only what lies below its own storey, or in its own package.
 STOREYS = [
     {"errors"},
-    {"limits"},
+    {"limits", "pool", "freed_memory"},
     {"registry", "config", "torchvision_absent", "threads", "progress", "screen_filters"},
     {"gaussians", "camera"},
     {"formats"},
@@ -41,7 +41,7 @@ CONFINED = {
     "lpips": ["evaluation/perceptual.py"],
     "matplotlib": ["adaptation/plot.py", "evaluation/tradeoff/plot.py"],
     "numba": ["backends/cpu_kernels/"],
-    "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/"],
+    "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/", "pool.py"],
     "plyfile": ["formats/ply.py"],
     "pycolmap": ["scenes/"],
     "pydantic": ["config.py", "recipes.py", "adaptation/curve.py", "adaptation/report.py", "jobs/finished.py"],

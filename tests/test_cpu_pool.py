@@ -1,4 +1,4 @@
-"""Memory that the CPU backend uses again."""
+"""Memory that is used again."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("numba", reason="numba, the extra `cpu`, is not installed")
-
-from mipmap_plugin.backends.cpu_kernels.pool import CACHE_LINE, LARGE, Pool
+from mipmap_plugin.pool import CACHE_LINE, LARGE, Pool
 
 
 def address(array: np.ndarray) -> int:

@@ -27,6 +27,7 @@ from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts
+from mipmap_plugin.splatting.bands import joined
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 Model = TypeVar("Model", bound="VanillaModel")
@@ -109,8 +110,8 @@ class VanillaModel:
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated: exp, sigmoid, unit quaternions. `camera` is ignored."""
         raw = self._parameters
-        sh = torch.cat([raw["sh0"], raw["shN"]], dim=1)
-        return Gaussians(raw["means"], unit_quaternions(raw["quats"]), raw["scales"].exp(), raw["opacities"].sigmoid(), sh)
+        quats, sh = unit_quaternions(raw["quats"]), joined(raw["sh0"], raw["shN"])
+        return Gaussians(raw["means"], quats, raw["scales"].exp(), raw["opacities"].sigmoid(), sh)
 
     def parameters(self) -> dict[str, Tensor]:
         """The raw parameters by name, without copying them."""

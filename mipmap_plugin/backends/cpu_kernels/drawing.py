@@ -9,11 +9,11 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import compositing, compositing_back, layout, projection, projection_back, rounding, sorting, window_tiles
-from mipmap_plugin.backends.cpu_kernels.pool import empty
 from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL, OVER_WINDOW, Flags, Frame, Limits, Lists, SplatArrays, View
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.pool import empty
 from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, w_end
 
 SAMPLING = {"analytic": OVER_PIXEL, "window": OVER_WINDOW}

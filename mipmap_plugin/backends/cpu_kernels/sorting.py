@@ -13,9 +13,9 @@ from numba import types
 from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
-from mipmap_plugin.backends.cpu_kernels.pool import empty
 from mipmap_plugin.backends.cpu_kernels.records import Lists
 from mipmap_plugin.backends.cpu_kernels.threads import Team
+from mipmap_plugin.pool import empty
 
 # Several per thread, so that no thread waits long for the last run; but each run needs a counter for every tile.
 RUNS_PER_THREAD = 8

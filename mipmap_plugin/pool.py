@@ -32,7 +32,7 @@ class Pool:
         size = math.prod(shape) * np.dtype(dtype).itemsize
         block = self._take(size) if size >= LARGE else _new_block(size)
         start = -block.__array_interface__["data"][0] % CACHE_LINE
-        array = np.frombuffer(memoryview(block)[start : start + size], dtype)
+        array: np.ndarray = np.frombuffer(block.data[start : start + size], dtype)
         if size >= LARGE:
             weakref.finalize(array, self._give_back, block).atexit = False  # all views of the array refer to it
         return array.reshape(shape)

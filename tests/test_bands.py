@@ -1,0 +1,26 @@
+"""Constant and other bands of a color as one tensor."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mipmap_plugin.pool import LARGE
+from mipmap_plugin.splatting.bands import joined
+
+
+@pytest.mark.parametrize("count", [3, LARGE // 4 // 45 + 1], ids=["small", "large"])
+@pytest.mark.parametrize("frozen", [False, True], ids=["all", "shN frozen"])
+def test_values_and_gradients_are_those_of_cat(count, frozen):
+    sh0, shN = torch.rand(count, 1, 3, requires_grad=True), torch.rand(count, 15, 3, requires_grad=not frozen)
+    weights, expected = torch.rand(count, 16, 3), torch.cat([sh0, shN], dim=1)
+    assert torch.equal(joined(sh0, shN), expected)
+    (joined(sh0, shN) * weights).sum().backward()
+    assert torch.equal(sh0.grad, weights[:, :1]) and sh0.grad.is_contiguous()
+    assert shN.grad is None if frozen else torch.equal(shN.grad, weights[:, 1:])
+
+
+def test_two_results_do_not_share_memory():
+    sh0, shN = torch.rand(LARGE // 100, 1, 3), torch.rand(LARGE // 100, 15, 3)
+    first, second = joined(sh0, shN), joined(sh0 + 1, shN)
+    assert torch.equal(first[:, :1], sh0) and torch.equal(second[:, :1], sh0 + 1)
