@@ -39,8 +39,8 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
-    def __getitem__(self, rows: Tensor) -> Gaussians:
-        """The splats at `rows`, a boolean mask [N] or indices."""
+    def __getitem__(self, rows: Tensor | slice) -> Gaussians:
+        """The splats at `rows`, a boolean mask [N], indices or a slice."""
         return self._map(lambda tensor: tensor[rows])
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
