@@ -31,6 +31,7 @@ class Meter:
     def __init__(self) -> None:
         self.phases: dict[str, dict[str, float]] = {}
         self.before = self.peak = 0  # bytes: what Python, torch and the package themselves hold; the peak of the process
+        self.began = 0.0  # when all was imported and the command began, by the clock of `time.perf_counter`
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
@@ -59,7 +60,7 @@ class Meter:
 
     def facts(self) -> dict[str, Any]:
         self._reset_peak()
-        return {"phases": self.phases, "peak": self.peak - self.before}
+        return {"phases": self.phases, "peak": self.peak - self.before, "began": self.began}
 
 
 def watch(meter: Meter) -> None:
@@ -86,7 +87,7 @@ def main() -> int:
 
     meter = Meter()
     watch(meter)
-    meter.before = memory("VmRSS")
+    meter.before, meter.began = memory("VmRSS"), time.perf_counter()
     code = 0
     if command == "load":
         from mipmap_plugin import models

@@ -60,8 +60,9 @@ class Gaussians:
         """The highest SH degree with a non-zero coefficient; bands above it need no evaluation."""
         if len(self) == 0:
             return 0
-        nonzero = self.sh.detach().abs().amax(dim=(0, 2)).nonzero()
-        return math.isqrt(int(nonzero.max())) if len(nonzero) else 0
+        sh = self.sh.detach()
+        bands = range(self.sh_degree, 0, -1)
+        return next((degree for degree in bands if sh[:, degree**2 : (degree + 1) ** 2].count_nonzero()), 0)
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}

@@ -73,6 +73,18 @@ class CpuBackend:
         return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), ranks
 
 
+def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[float, float]) -> tuple[Tensor, Tensor] | None:
+    """What `cpu_kernels.pairing.nearest_along` finds for float32 splats along a curve; None on another device, or without numba."""
+    if means.device.type != "cpu" or means.dtype != torch.float32 or not importlib.util.find_spec("numba"):
+        return None
+    _drawing()  # reports what numba lacks
+    from mipmap_plugin.backends.cpu_kernels import pairing
+
+    arrays = tuple(tensor.contiguous().numpy() for tensor in (means, *further))
+    nearest, least = pairing.nearest_along(arrays, reach, *limits)
+    return torch.from_numpy(nearest), torch.from_numpy(least)
+
+
 def _drawing() -> ModuleType:
     """The kernels. Imported at use, so that without numba this module can report what is missing."""
     try:

@@ -38,9 +38,9 @@ class SurfelModel(VanillaModel):
     family = "2dgs"
     _no_viewer = "its splats are flat (2DGS), which none of the viewers draws"
 
-    def gaussians(self, camera: Camera | None = None) -> Gaussians:
-        """All splats, activated, with third scales of 0. `camera` is ignored."""
-        thick = super().gaussians(camera)
+    def _activated(self, sh: Tensor) -> Gaussians:
+        """All splats, with third scales of 0."""
+        thick = super()._activated(sh)
         return replace(thick, scales=thick.scales * thick.scales.new_tensor([1.0, 1.0, 0.0]))
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:

@@ -20,7 +20,7 @@ from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, w
 from mipmap_plugin.formats.tags import render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
+from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, joined, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
@@ -78,6 +78,7 @@ class VanillaModel:
         self.traits = Traits(same_for_all_views=True, placed=origin.host is not None, no_viewer=self._no_viewer, exposures=origin.exposures)
         self.trained = trained
         self.notes: list[str] = list(notes)
+        self.shares = False  # tensors with another model, so that they are replaced and never changed in place
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians, trained: TrainedScale = TrainedScale()) -> VanillaModel:  # noqa: B008
@@ -108,8 +109,11 @@ class VanillaModel:
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated: exp, sigmoid, unit quaternions. `camera` is ignored."""
+        return self._activated(joined(self._parameters["sh0"], self._parameters["shN"]))
+
+    def _activated(self, sh: Tensor) -> Gaussians:
+        """All splats with the coefficients `sh` [N, K, 3]."""
         raw = self._parameters
-        sh = torch.cat([raw["sh0"], raw["shN"]], dim=1)
         return Gaussians(raw["means"], unit_quaternions(raw["quats"]), raw["scales"].exp(), raw["opacities"].sigmoid(), sh)
 
     def parameters(self) -> dict[str, Tensor]:
@@ -120,6 +124,12 @@ class VanillaModel:
         """An independent model whose parameters are leaves that require gradients; it has no digest, because it may change."""
         leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()}
         return self._with(leaves, replace(self._origin, digest=""))
+
+    def shared(self: Model) -> Model:
+        """A copy that takes no memory until it is reshaped or rebuilt: it shares this model's tensors, which it never changes."""
+        model = self._with(self._parameters, replace(self._origin, digest=""))
+        model.shares = True
+        return model
 
     def to(self: Model, device: torch.device | str) -> Model:
         """A copy on another device, which requires gradients where this one does."""
@@ -135,7 +145,7 @@ class VanillaModel:
         """Use these tensors themselves as leaves, as an optimizer requires. Extra columns are dropped, since rows may differ. Raises ShapeError."""
         _check(parameters)
         leaves = {name: tensor if tensor.is_leaf else tensor.detach() for name, tensor in parameters.items()}
-        self._parameters = {name: leaf.requires_grad_() for name, leaf in leaves.items()}
+        self._parameters, self.shares = {name: leaf.requires_grad_() for name, leaf in leaves.items()}, False
         if self._origin.extras:
             self.notes.append(f"the extra columns {', '.join(self._origin.extras)} are dropped, since splats were added or removed")
             self._origin = replace(self._origin, extras={})
@@ -145,14 +155,20 @@ class VanillaModel:
         return {}
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
-        """Set the scales [N, 3] and opacities [N] that `form` returns, in place, so that an optimizer keeps its leaves. Raises ShapeError."""
-        scales, opacities = form(self.gaussians().detach())
+        """Set the scales [N, 3] and opacities [N] that `form` returns for splats of SH degree 0, on which shapes do not depend.
+
+        In place, so that an optimizer keeps its leaves, unless they are shared. Raises ShapeError.
+        """
+        scales, opacities = form(self._activated(self._parameters["sh0"]).detach())
         for name, values in {"scales": _log(scales), "opacities": _logit(opacities)}.items():
             leaf = self._parameters[name]
             if values.shape != leaf.shape:
                 raise ShapeError(f"{name}: expected shape {list(leaf.shape)}, got {list(values.shape)}")
-            with torch.no_grad():
-                leaf.copy_(values)
+            if self.shares:
+                self._parameters[name] = values
+            else:
+                with torch.no_grad():
+                    leaf.copy_(values)
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
         """Replace the splats by those that `form` returns for them, of any number."""

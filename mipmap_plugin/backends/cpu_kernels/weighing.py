@@ -1,4 +1,4 @@
-"""Blend weights: how much each splat adds to an image, without its colors. One pass, where gradients of the colors need two and nine times the memory."""
+"""Blend weights: how much each splat adds to an image. One pass, where the gradients of the colors need two and nine times the memory."""
 
 # numba redefines calls and operators.
 # mypy: ignore-errors
@@ -14,12 +14,13 @@ from mipmap_plugin.backends.cpu_kernels.memory import load, row_of, store
 from mipmap_plugin.backends.cpu_kernels.planes import TRANSMITTANCE, distances, new_state
 from mipmap_plugin.backends.cpu_kernels.pool import empty
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
-from mipmap_plugin.backends.cpu_kernels.records import Limits
+from mipmap_plugin.backends.cpu_kernels.records import Limits, SplatArrays
 from mipmap_plugin.backends.cpu_kernels.threads import team
-from mipmap_plugin.effects import MIN_ALPHA
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import MIN_ALPHA, Effects
 
 
-def weigh(splats, camera, effects, ranks=None):
+def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None) -> np.ndarray:
     """The sum of each splat's blend weights over the pixels of an image, [N] float32. Arguments: as of `drawing.draw`; not for windows."""
     view = view_of(camera, effects, splats, False)
     limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, 0.0)
