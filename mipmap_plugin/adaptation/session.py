@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from torch import Tensor
@@ -57,6 +57,7 @@ class AdaptationRequest:
     has_gradients: bool  # whether the backend has gradients for this request
     base_in_viewer: SplatModel  # what the viewer reads of the base's own file: the base itself, where the viewer reads all of it
     finer: FinerLevel | None = None  # what the run starts from instead of the base
+    inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
 
 
 class Session:
@@ -68,7 +69,7 @@ class Session:
         self.effects = next(iter(self.targets.values()))
         self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
-        self.finer = request.finer
+        self.finer, self.inputs = request.finer, dict(request.inputs)
         self.seconds, self.peak = {"optimization": 0.0}, PeakMemory(self.base.parameters()["means"].device)
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.views = over_band(self.base_views, config)
@@ -256,6 +257,7 @@ class Session:
             peak_memory_mib=self.peak.mib(),
             curve=curve,
             versions=versions(),
+            inputs=self.inputs,
         )
 
 

@@ -136,7 +136,7 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
             rows = np.empty(min(WRITTEN_TOGETHER, count - start), dtype)
             for name, column in columns.items():
                 rows[name] = column[start : start + WRITTEN_TOGETHER]
-            file.write(memoryview(rows.view(np.uint8)))
+            file.write(rows.tobytes())
         file.flush()
         os.fsync(file.fileno())
     return path
