@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,6 +15,9 @@ from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.limits import check_scale
 
 Item = TypeVar("Item")
+
+# Hexadecimal digits of a hash that tells one set of cameras or photographs from another.
+DIGITS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,3 +111,12 @@ def evenly(views: Sequence[Item], most: int | None) -> list[Item]:
 def every_nth(views: Sequence[Item], most: int) -> Sequence[Item]:
     """Every n-th view, starting with the first, for the smallest n that gives at most `most` views."""
     return views[:: -(-len(views) // most)]
+
+
+def digest_of(cameras: Sequence[Camera]) -> str:
+    """A hash of everything that images depend on, hexadecimal; names are left out."""
+    digest = hashlib.sha256()
+    for view in cameras:
+        facts = (view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.split, view.time, view.zoom, view.index)
+        digest.update(repr(facts).encode() + view.viewmat.numpy().tobytes())
+    return digest.hexdigest()[:DIGITS]

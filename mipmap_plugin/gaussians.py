@@ -39,8 +39,8 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
-    def __getitem__(self, rows: Tensor) -> Gaussians:
-        """The splats at `rows`, a boolean mask [N] or indices."""
+    def __getitem__(self, rows: Tensor | slice) -> Gaussians:
+        """The splats at `rows`, a boolean mask [N], indices or a slice."""
         return self._map(lambda tensor: tensor[rows])
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
@@ -60,8 +60,9 @@ class Gaussians:
         """The highest SH degree with a non-zero coefficient; bands above it need no evaluation."""
         if len(self) == 0:
             return 0
-        nonzero = self.sh.detach().abs().amax(dim=(0, 2)).nonzero()
-        return math.isqrt(int(nonzero.max())) if len(nonzero) else 0
+        sh = self.sh.detach()
+        bands = range(self.sh_degree, 0, -1)
+        return next((degree for degree in bands if sh[:, degree**2 : (degree + 1) ** 2].count_nonzero()), 0)
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}

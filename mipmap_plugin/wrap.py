@@ -11,7 +11,7 @@ from typing import Any
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.backends import device_for
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, digest_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_background
 from mipmap_plugin.models import load_model
@@ -54,11 +54,16 @@ def wrap_model(
         if screen_filter not in USUAL_EPS2D:
             raise SettingsError(f"there is no screen filter {screen_filter!r}; choose from {', '.join(USUAL_EPS2D)}")
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
-    if isinstance(cameras, Scene):
-        cameras = placed(model, cameras).cameras
-    wrapped = Wrapped(model, own_cameras(model) if cameras is None else cameras, backend, trained, threads)
-    wrapped.loading_s = loading_s
+    given = own_cameras(model) if cameras is None else cameras.cameras if isinstance(cameras, Scene) else cameras
+    wrapped = Wrapped(model, placed(model, cameras).cameras if isinstance(cameras, Scene) else given, backend, trained, threads)
+    wrapped.loading_s, wrapped.asked = loading_s, asked_for(given, color, screen_filter)
     return wrapped
+
+
+def asked_for(cameras: Sequence[Camera], background: tuple[float, float, float] | None, screen_filter: str | None) -> dict[str, str]:
+    """What is given beside a checkpoint, as its adaptations record it (`Report.inputs`). `cameras`: before they are placed in the model's frame."""
+    color = "" if background is None else " ".join(f"{channel:g}" for channel in background)
+    return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or ""}
 
 
 def _loaded(path: str | Path, backend: str) -> SplatModel:

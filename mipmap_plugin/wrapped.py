@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, digest_of
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
@@ -62,6 +62,7 @@ class Wrapped:
         self.model, self.cameras, self._backend, self.trained, self.threads = model, list(cameras), backend, trained, threads
         self.background = trained.background or (0.0, 0.0, 0.0)
         self.loading_s = 0.0  # seconds that loading the model took
+        self.asked: dict[str, str] = {}  # what was given beside the checkpoint (`Report.inputs`); "" for what was not
         self.images: BaseImages | None = None  # of the base, drawn so far for all scales; None: the next call draws all of its own
 
     def __repr__(self) -> str:
@@ -174,6 +175,8 @@ class Wrapped:
         config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
         if len(targets) > 1:
             config = make_config(recipe, scale, **(settings_for_several(config) | settings))
+        views = {} if cameras is None else {"views": digest_of(cameras)}
+        inputs = self.asked | views | ({} if images is None else {"photographs": images.digest()})
         photographs = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
         if cameras is None:
             cameras = photographs.cameras if photographs else self.cameras
@@ -190,7 +193,7 @@ class Wrapped:
         base_in_viewer = model if in_viewer is self.model else in_viewer
         if self.images is None or not self.images.are_of(model, backend, self.effects()):
             self.images = BaseImages(model, backend, self.effects())
-        request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer, start)
+        request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs)
         with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
             adapted = Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
         adapted.report.seconds["loading"] = self.loading_s

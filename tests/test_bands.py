@@ -24,3 +24,9 @@ def test_two_results_do_not_share_memory():
     sh0, shN = torch.rand(LARGE // 100, 1, 3), torch.rand(LARGE // 100, 15, 3)
     first, second = joined(sh0, shN), joined(sh0 + 1, shN)
     assert torch.equal(first[:, :1], sh0) and torch.equal(second[:, :1], sh0 + 1)
+
+
+def test_parts_of_one_tensor_are_joined_without_a_copy():
+    whole = torch.rand(5, 4, 3)
+    assert joined(whole[:, :1], whole[:, 1:]).data_ptr() == whole.data_ptr()
+    assert torch.equal(joined(whole[:, 1:2], whole[:, :3]), torch.cat([whole[:, 1:2], whole[:, :3]], dim=1))

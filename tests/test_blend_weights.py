@@ -1,13 +1,15 @@
 """Blend weights: how many pixels each splat fills, from any backend."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tiny import cameras, model
 
-from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import USUAL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.harmonics import C0
 
@@ -43,3 +45,26 @@ def test_what_lies_behind_the_camera_has_none():
     behind = splats.means + 2 * (view.center.float() - splats.means)
     hidden = Gaussians(behind, splats.quats, splats.scales, splats.opacities, splats.sh)
     assert blend_weights(hidden, [view], ReferenceBackend(), Effects(1)).abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [Effects(0), Effects(0, "analytic"), Effects(0, settings=replace(USUAL, min_variance=1.0))],
+    ids=["classic", "analytic", "culled"],
+)
+def test_one_pass_finds_the_same_weights_as_gradients(effects):
+    pytest.importorskip("numba")
+    splats, views, backend = model(300).gaussians().detach(), cameras(3), get_backend("cpu")
+    gray = replace(splats, sh=torch.zeros_like(splats.sh[:, :1]))
+    for view in views:
+        expected = _color_gradient(gray, view, backend, effects)
+        torch.testing.assert_close(backend.blend_weights(gray, view, effects), expected, rtol=1e-4, atol=1e-5)
+        assert expected.max() > 1
+
+
+def test_weights_over_windows_are_found_from_gradients():
+    pytest.importorskip("numba")
+    splats, views = model(60).gaussians().detach(), cameras(2)
+    assert get_backend("cpu").blend_weights(splats, views[0], Effects(1, "window")) is None
+    windows, pixels = (blend_weights(splats, views, get_backend("cpu"), Effects(1, name)).sum() for name in ("window", "classic"))
+    assert 0.5 * pixels < windows < pixels

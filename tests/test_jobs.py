@@ -14,11 +14,12 @@ import tiny
 from running import saving_often, wait_until
 
 from mipmap_plugin.cli import main
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
+from mipmap_plugin.jobs.parcel import do_parcel, pack, unpack
 from mipmap_plugin.jobs.run import run as run_job
 from mipmap_plugin.jobs.worker import Worker, do
 from mipmap_plugin.scenes import write_cameras
@@ -196,6 +197,53 @@ def test_another_base_or_another_file_is_not_finished(tmp_path):
     assert finished(job) is not None
     (tmp_path / "base.ply").write_bytes((tmp_path / "other.ply").read_bytes())
     assert finished(job) is None
+
+
+def test_other_cameras_background_or_photographs_are_not_finished(tmp_path):
+    job = job_of(tmp_path, images=tiny.scene(tmp_path / "scene", train=tiny.cameras(3), count=30), scale=2.0)
+    assert run_job(job).status == "done" and finished(job) is not None
+    for changed in ({"background": "white"}, {"screen_filter": "mip"}, {"cameras": None}):
+        assert finished(replace(job, base=replace(job.base, **changed))) is None
+    assert finished(replace(job, images=None)) is None
+    photograph = next((tmp_path / "scene").rglob("*.png"))
+    content = photograph.read_bytes()
+    photograph.write_bytes(content + b"0")
+    assert finished(job) is None
+    photograph.write_bytes(content)
+    write_cameras(tmp_path / "cameras.json", tiny.cameras(4), overwrite=True)
+    assert finished(job) is None
+    write_cameras(tmp_path / "cameras.json", tiny.cameras(3), overwrite=True)
+    assert finished(job) is not None
+
+
+def test_a_job_that_travels_makes_the_same_bytes(tmp_path):
+    scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(3), count=30)
+    here = job_of(tmp_path, images=scene, scale=2.0, skip_finished=False)
+    assert run_job(here).status == "done"
+    away = replace(here, target=tmp_path / "away" / "new.ply")
+    parcel = pack(away)
+    for place in (tmp_path / "base.ply", tmp_path / "cameras.json", scene):
+        place.rename(place.with_name(f"gone_{place.name}"))
+    delivery = do_parcel(parcel, run_job)
+    outcome = unpack(delivery, away)
+    assert (outcome.status, outcome.file, outcome.job) == ("done", away.target, away)
+    assert away.target.read_bytes() == here.target.read_bytes()
+    assert {path.name for path in away.target.parent.iterdir()} == {"new.ply", "new.ply.adaptation.json"}
+    with pytest.raises(OutputExists):
+        unpack(delivery, away)
+    failed = unpack(do_parcel(replace(parcel, job=replace(parcel.job, viewer="nobody")), run_job), away)
+    assert failed.status == "failed" and "nobody" in failed.reason
+
+
+@pytest.mark.parametrize("suffix", ["", ".ply"])
+def test_a_model_folder_travels(tmp_path, suffix):
+    folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
+    job = Job(Base(folder, backend="reference"), tmp_path / f"here{suffix}", 0.5, settings={"steps": 0, "seed": 0, "views": "given"})
+    assert run_job(job).status == "done"
+    away = replace(job, target=tmp_path / f"away{suffix}")
+    assert unpack(do_parcel(pack(away), run_job), away).status == "done"
+    here, there = (path.read_bytes() if suffix else next(path.rglob("*.ply")).read_bytes() for path in (job.target, away.target))
+    assert here == there and finished(away) is not None
 
 
 def test_a_damaged_report_is_not_finished(tmp_path):

@@ -17,7 +17,8 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import inria_folder, load_model
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.vanilla import MIN_SCALE, OPACITY_MARGIN, VanillaModel, load_vanilla
+from mipmap_plugin.models.raw import MIN_SCALE, OPACITY_MARGIN
+from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 PROVENANCE = {"scale": 0.25, "settings": {"steps": 500}}

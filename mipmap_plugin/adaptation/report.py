@@ -40,6 +40,7 @@ class Report(BaseModel):
     peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without a GPU
     curve: list[CurvePoint]
     versions: dict[str, str]
+    inputs: dict[str, str] = {}  # what was given beside the checkpoint: hashes of cameras and photographs, background, screen filter
 
     def psnr_before(self) -> float | None:
         """PSNR (dB) of the base on views that nothing was adapted to; None if it was not measured."""
@@ -50,8 +51,9 @@ class Report(BaseModel):
         return next((psnr for state, psnr in self.validation.items() if self.returned.startswith(state)), None)
 
     def provenance(self) -> dict[str, Any]:
-        """Return what the file's header records: viewer, base, scale, settings, versions. Nothing in it depends on the clock."""
-        return {"scale": self.scale, "viewer": self.viewer, "base": self.base, "settings": self.settings.model_dump(), "versions": self.versions}
+        """Return what the file's header records: viewer, base, scale, inputs, settings, versions. Nothing in it depends on the clock."""
+        made_from = {"scale": self.scale, "viewer": self.viewer, "base": self.base, "inputs": self.inputs}
+        return made_from | {"settings": self.settings.model_dump(), "versions": self.versions}
 
 
 class PeakMemory:

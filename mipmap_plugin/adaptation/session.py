@@ -8,9 +8,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import cast
 
 from torch import Tensor
 
@@ -58,6 +57,7 @@ class AdaptationRequest:
     has_gradients: bool  # whether the backend has gradients for this request
     base_in_viewer: SplatModel  # what the viewer reads of the base's own file: the base itself, where the viewer reads all of it
     finer: FinerLevel | None = None  # what the run starts from instead of the base
+    inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
 
 
 class Session:
@@ -69,7 +69,7 @@ class Session:
         self.effects = next(iter(self.targets.values()))
         self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
-        self.finer = request.finer
+        self.finer, self.inputs = request.finer, dict(request.inputs)
         self.seconds, self.peak = {"optimization": 0.0}, PeakMemory(self.base.parameters()["means"].device)
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.views = over_band(self.base_views, config)
@@ -108,7 +108,7 @@ class Session:
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())
             warm_up_backend(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0)
-        as_it_is = self._for_target(self._base_in_viewer)
+        as_it_is = self._for_target(self._base_in_viewer, shared=True)
         student, start = StartSearch(self._start_problem()).best()
         initial = student.copy()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
@@ -123,10 +123,11 @@ class Session:
     def _start_problem(self) -> StartProblem:
         has_blend_weights = self.has_gradients and self.base.traits.same_for_all_views
         from_base = StartProblem(
-            self.copy_of_base, self.base_views, self.scale, self.base_effects, self.start_target, self.config, self.backend, has_blend_weights,
-            self.steer, self.phase,
+            lambda: self._for_target(self.base, shared=True), self.base_views, self.scale, self.base_effects, self.start_target, self.config,
+            self.backend, has_blend_weights, self.steer, self.phase,
         )  # fmt: skip
-        return from_base if self.finer is None else from_base.from_level(self.finer, lambda: self._for_target(cast(FinerLevel, self.finer).model))
+        finer = self.finer
+        return from_base if finer is None else from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
 
     def _run_states(self, run: Run, initial: SplatModel) -> dict[str, SplatModel]:
         """The best and the last state of a run, where they differ from the start (the `initial` model) and from each other."""
@@ -155,7 +156,8 @@ class Session:
             note, psnrs = f", not validated: at this scale one pixel of the base is more than {WINDOW} px wide", {}
         report = self._report(states[best], curve, ended_by, f"{best}{note}", psnrs)
         used_views = [*self.views, *self.validation.steering, *self.validation.choosing]
-        return Adapted(states[best], report, self.backend, self.effects, self.targets, self.state, used_views)
+        model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
+        return Adapted(model, report, self.backend, self.effects, self.targets, self.state, used_views)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
@@ -189,9 +191,9 @@ class Session:
         """A copy of the base that is rendered with the target's screen filter."""
         return self._for_target(self.base)
 
-    def _for_target(self, model: SplatModel) -> SplatModel:
-        """A copy of a model that is rendered with the target's screen filter."""
-        model = model.copy()
+    def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
+        """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
+        model = getattr(model, "shared", model.copy)() if shared else model.copy()
         model.trained = replace(model.trained, screen_filter=self.effects.screen_filter, eps2d=self.effects.eps2d)
         return model
 
@@ -255,6 +257,7 @@ class Session:
             peak_memory_mib=self.peak.mib(),
             curve=curve,
             versions=versions(),
+            inputs=self.inputs,
         )
 
 

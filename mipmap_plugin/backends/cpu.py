@@ -48,15 +48,41 @@ class CpuBackend:
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if numba is missing or the request is not supported."""
-        reasons = self.lacking(Needs.of(gaussians, effects, gradients=True))
-        if reasons:
+        tensors, ranks = self._prepared(gaussians, camera, effects)
+        image, alpha = _Draw.apply(camera, effects, ranks, *tensors)  # type: ignore[no-untyped-call]  # torch's
+        return Rendered(image, alpha)
+
+    @torch.no_grad()
+    def blend_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor | None:
+        """The sum of each splat's blend weights over the image, [N]; None for a screen filter over windows. Raises BackendUnavailable."""
+        if effects.screen_filter == "window":
+            return None
+        tensors, ranks = self._prepared(gaussians, camera, effects)
+        _drawing()  # reports what numba lacks
+        from mipmap_plugin.backends.cpu_kernels import drawing, weighing
+
+        return torch.from_numpy(weighing.weigh(drawing.as_arrays(*tensors), camera, effects, ranks))
+
+    def _prepared(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[tuple[Any, ...], Any]:
+        """The tensors of the splats, packed as a viewer's file does, and their ranks, where they are sorted by buckets. Raises BackendUnavailable."""
+        if reasons := self.lacking(Needs.of(gaussians, effects, gradients=True)):
             raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
         packing = effects.settings.packing
         g = gaussians if packing is None else packed(gaussians, camera, packing)
         ranks = buckets.ranks(gaussians, camera).numpy() if effects.settings.bucketed else None
-        tensors = g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances
-        image, alpha = _Draw.apply(camera, effects, ranks, *tensors)  # type: ignore[no-untyped-call]  # torch's
-        return Rendered(image, alpha)
+        return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), ranks
+
+
+def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[float, float]) -> tuple[Tensor, Tensor] | None:
+    """What `cpu_kernels.pairing.nearest_along` finds for float32 splats along a curve; None on another device, or without numba."""
+    if means.device.type != "cpu" or means.dtype != torch.float32 or not importlib.util.find_spec("numba"):
+        return None
+    _drawing()  # reports what numba lacks
+    from mipmap_plugin.backends.cpu_kernels import pairing
+
+    arrays = tuple(tensor.contiguous().numpy() for tensor in (means, *further))
+    nearest, least = pairing.nearest_along(arrays, reach, *limits)
+    return torch.from_numpy(nearest), torch.from_numpy(least)
 
 
 def _drawing() -> ModuleType:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from mipmap_plugin.commands.common import print_facts, summary
 from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
+from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
     from mipmap_plugin.effects import Effect
@@ -41,12 +42,16 @@ def inspect(
     from mipmap_plugin.models.vanilla import VanillaModel
     from mipmap_plugin.wrap import wrap_model
 
-    model = load_model(checkpoint, iteration=iteration)
+    with announced(f"reading {checkpoint.name}"):
+        model = load_model(checkpoint, iteration=iteration)
     wrapped = wrap_model(model, screen_filter=screen_filter)
     view = wrapped.views()[0]
     gaussians = model.gaussians(view)
-    health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
+    with announced("examining"):
+        health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
     effects = explain(wrapped.effects(), gaussians, effects_of(model))
+    with announced("drawing as viewers do"):
+        differences = viewer_differences(wrapped) if viewers else "not requested"
     facts = {
         "verdict": _verdict(checkpoint, health),
         "file": str(model.source),
@@ -57,7 +62,7 @@ def inspect(
         "cameras": summary(wrapped.cameras),
         "effects": [str(effect) for effect in effects if effect.on or all or json] + _off(effects, shown=all or json),
         "health": health.sentences() or ["nothing found"],
-        "viewers": viewer_differences(wrapped) if viewers else "not requested",
+        "viewers": differences,
         "notes": model.notes,
     }
     print_facts(facts, json)

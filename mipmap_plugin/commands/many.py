@@ -30,6 +30,8 @@ class Many:
     """How many to adapt at the same time, in processes that share the threads."""
     dask: str | None = None
     """Adapt on the workers of dask.distributed: tcp://HOST:8786 for a scheduler, local:4 for four workers of this machine."""
+    send_files: bool = False
+    """With --dask: send checkpoints and get files back, also where workers see this disk; by default only where one does not."""
     shard: str | None = None
     """Do a part of the jobs only, such as 3/50: every fiftieth, from the third on."""
     skip_existing: bool = False
@@ -152,7 +154,7 @@ def _engine(many: Many, jobs: Sequence[Job], threads: int | None) -> Generator[O
         from mipmap_plugin.jobs.farm import on_dask
     except ModuleNotFoundError as error:
         raise SettingsError(f"--dask needs dask.distributed ({error}); pip install 'mipmap-plugin[farm]'") from None
-    return on_dask(jobs, many.dask, threads)
+    return on_dask(jobs, many.dask, threads, send_files=many.send_files)
 
 
 def _print(outcomes: Sequence[Outcome], jobs: Sequence[Job], json: bool) -> None:

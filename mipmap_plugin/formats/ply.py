@@ -20,6 +20,9 @@ from mipmap_plugin.formats.magic import read_head
 # Bytes. The header of splats of SH degree 3 has 1.5 kB; without a limit, a file without `end_header` would be searched to its end.
 MAX_HEADER = 128 * 1024
 
+# Rows that are written at a time, so that a file is never in memory as a whole: 16 MB for splats of SH degree 3.
+WRITTEN_TOGETHER = 1 << 16
+
 BYTE_ORDER = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 TYPES = {
@@ -122,14 +125,18 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     """
     path = Path(path)
     dtype = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
-    rows = np.empty(len(next(iter(columns.values()))), dtype)
-    for name, column in columns.items():
-        rows[name] = column
-    data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=[_one_ascii_line(text) for text in comments])
-    if len(data.header) >= MAX_HEADER:
-        raise SettingsError(f"{path}: comments and provenance take {len(data.header):,} bytes, but a PLY header holds {MAX_HEADER:,}; shorten them")
+    count = len(next(iter(columns.values())))
+    declared = PlyElement.describe(np.broadcast_to(np.zeros((), dtype), (count,)), "vertex")
+    header = PlyData([declared], byte_order="<", comments=[_one_ascii_line(text) for text in comments]).header + "\n"
+    if len(header) >= MAX_HEADER:
+        raise SettingsError(f"{path}: comments and provenance take {len(header):,} bytes, but a PLY header holds {MAX_HEADER:,}; shorten them")
     with new_file(path, overwrite) as temporary, temporary.open("xb") as file:
-        data.write(file)
+        file.write(header.encode("ascii"))
+        for start in range(0, count, WRITTEN_TOGETHER):
+            rows = np.empty(min(WRITTEN_TOGETHER, count - start), dtype)
+            for name, column in columns.items():
+                rows[name] = column[start : start + WRITTEN_TOGETHER]
+            file.write(rows.tobytes())
         file.flush()
         os.fsync(file.fileno())
     return path

@@ -22,6 +22,20 @@ class Base:
     backend: str = "auto"
     screen_filter: str | None = None
 
+    def asked(self) -> dict[str, str]:
+        """What is given beside the checkpoint, as its adaptations record it, without loading it. Raises CheckpointError, SceneError."""
+        from mipmap_plugin.models import detect
+        from mipmap_plugin.models.inria_folder import read_options
+        from mipmap_plugin.scenes import load_scene, model_cameras
+        from mipmap_plugin.wrap import asked_for
+
+        if self.cameras is not None:
+            cameras = load_scene(self.cameras, read_options(self.checkpoint)[0]).cameras
+        else:
+            folder = detect(self.checkpoint).folder
+            cameras = tuple(model_cameras(folder, read_options(folder)[0]))
+        return asked_for(cameras, COLORS[self.background], self.screen_filter)
+
     def load(self, threads: int | None = None) -> Wrapped:
         """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
         from mipmap_plugin.backends import BACKENDS

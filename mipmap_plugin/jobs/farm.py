@@ -1,4 +1,4 @@
-"""Jobs on dask.distributed, for more than one machine. Paths are sent, not files: all machines must see the same file system.
+"""Jobs on dask.distributed, for more than one machine. Paths are sent where all machines see the same file system, and else the files themselves.
 
 A task of dask is one job, which a worker process of ours does (`worker`): so it can be interrupted, and a job that takes all memory ends
 without its dask worker. If a dask worker dies, the scheduler gives its job to another one, which continues from the state on disk.
@@ -7,46 +7,71 @@ without its dask worker. If a dask worker dies, the scheduler gives its job to a
 from __future__ import annotations
 
 import logging
+import os
 import re
 import signal
 import threading
 import uuid
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 from distributed import Client, Event, Future, LocalCluster, as_completed
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.jobs.engines import usable_threads, with_interrupted
+from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.jobs.parcel import Delivery, Parcel, do_parcel, pack, unpack
 from mipmap_plugin.jobs.worker import Worker, do
 
 # Seconds between two looks at whether jobs are to stop; to reach a scheduler.
 PERIOD_S, CONNECT_S = 1.0, 20.0
 
+# Jobs whose files are sent at a time.
+SENT_PER_WORKER = 2
+
 _mine = threading.local()
 
 
-def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None) -> Generator[Outcome, None, None]:
+def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send_files: bool = False) -> Generator[Outcome, None, None]:
     """Do the jobs on the workers of the scheduler at `place` (tcp://host:8786), or on n new ones here (local:n); yield each outcome.
 
-    `threads`: of each job; of all jobs together for local:n. If any worker declares GPUs (`--resources GPU=1`), each job takes one.
+    `threads`: of each job; of all jobs together for local:n. `send_files`: send checkpoints and get back what was made of them, also where workers
+    see them; otherwise that is done if some worker does not see the first checkpoint. If any worker declares GPUs (`--resources GPU=1`), each job
+    takes one.
     Ctrl-C lets every running job save its state, and begins no other. Raises SettingsError for a place where there is no scheduler.
     """
     with _connected(place) as client:
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         needs = {"GPU": 1} if any("GPU" in worker.get("resources", {}) for worker in workers) else None
         share = max(1, (threads or usable_threads()) // len(workers)) if place.startswith("local:") else threads
+        send_files = send_files or (bool(jobs) and not all(client.run(os.path.exists, str(jobs[0].base.checkpoint)).values()))
         stop = Event(f"stop-{uuid.uuid4().hex}", client=client)
-        futures = {client.submit(_task, job, share, stop.name, key=f"adapt-{uuid.uuid4().hex}", pure=False, resources=needs): job for job in jobs}
+
+        def submit(job: Job) -> Future[Outcome | Delivery]:
+            sent = client.scatter(pack(job), hash=False) if send_files else job
+            return client.submit(_task, sent, share, stop.name, key=f"adapt-{uuid.uuid4().hex}", pure=False, resources=needs)
+
+        together = SENT_PER_WORKER * max(1, len(workers)) if send_files else max(1, len(jobs))
         try:
-            for future in with_interrupted(list(futures), as_completed, stop.set):
-                yield _outcome(future, futures[future])
+            for first in range(0, len(jobs), together):  # files that are sent wait in the workers' memory, so that not all are sent at once
+                done, todo = _finished_before(jobs[first : first + together]) if send_files else ([], jobs)
+                yield from done
+                futures = {submit(job): job for job in todo}
+                for future in with_interrupted(list(futures), as_completed, stop.set):
+                    yield _outcome(future, futures[future])
         finally:
             stop.set()
 
 
-def _task(job: Job, threads: int | None, stop_name: str) -> Outcome:
+def _finished_before(jobs: Sequence[Job]) -> tuple[list[Outcome], list[Job]]:
+    """The outcomes of the jobs that need not be done, which a worker cannot know that does not see this disk; and the other jobs."""
+    found = [(job, finished(job) if job.skip_finished else None) for job in jobs]
+    return [Outcome(job, "finished before", *made) for job, made in found if made], [job for job, made in found if not made]
+
+
+def _task(sent: Job | Parcel, threads: int | None, stop_name: str) -> Outcome | Delivery:
     """What a dask worker does: it lets a worker of ours do the job, and tells that when to stop."""
     stop = Event(stop_name)
     worker: Worker | None = getattr(_mine, "worker", None)
@@ -59,14 +84,19 @@ def _task(job: Job, threads: int | None, stop_name: str) -> Outcome:
                 worker.stop()
                 return
 
-    return Outcome(job, "interrupted", reason="interrupted") if stop.is_set() else do(job, worker, watch)
+    if stop.is_set():
+        return Outcome(sent.job if isinstance(sent, Parcel) else sent, "interrupted", reason="interrupted")
+    return do_parcel(sent, lambda job: do(job, worker, watch)) if isinstance(sent, Parcel) else do(sent, worker, watch)
 
 
-def _outcome(future: Future[Outcome], job: Job) -> Outcome:
-    """The outcome of a task, also where dask gave it up."""
+def _outcome(future: Future[Outcome | Delivery], job: Job) -> Outcome:
+    """The outcome of a task, also where dask gave it up; what came back is written."""
     if future.status == "finished":
-        outcome: Outcome = future.result()
-        return outcome
+        result: Outcome | Delivery = future.result()
+        try:
+            return unpack(result, job) if isinstance(result, Delivery) else replace(result, job=job)
+        except (MipmapPluginError, OSError) as refusal:
+            return Outcome(job, "failed", reason=str(refusal))
     error = future.exception() if future.status == "error" else None
     reason = f"{type(error).__name__}: {error}" if error else "the connection to the scheduler was lost"
     return Outcome(job, "failed", reason=reason)

@@ -1,4 +1,4 @@
-"""Outputs that need not be made again: they were made from the same base, for the same scale and viewer, with the same settings."""
+"""Outputs that need not be made again: they were made from the same files, for the same scale and viewer, with the same settings."""
 
 from __future__ import annotations
 
@@ -20,17 +20,16 @@ from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import detect
 from mipmap_plugin.models.outputs import REPORT
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.splatting.viewers import viewers_for
 
 
 def finished(job: Job) -> tuple[Path, dict[str, Any]] | None:
-    """The checkpoint that the job would make, and its report, if they are there already; None if not.
-
-    Provenance has no cameras, photographs or background: outputs that differ in these alone count as the same.
-    """
+    """The checkpoint that the job would make, and its report, if they are there already; None if not."""
     for file, report in _outputs(job.target):
         provenance = _in_header(file) or report
-        if _is_requested(provenance, job) and provenance.get("base") == _digest(job, provenance.get("base")):
+        same = _is_requested(provenance, job) and provenance.get("inputs") == _inputs(job)
+        if same and provenance.get("base") == _digest(job, provenance.get("base")):
             return file, report
     return None
 
@@ -71,6 +70,11 @@ def _is_requested(provenance: dict[str, Any], job: Job) -> bool:
     if "merge_to" not in job.settings and settings.merge_to == 1:  # splats of this family are not merged
         expected = expected.model_copy(update={"merge_to": 1.0})
     return (provenance.get("scale"), provenance.get("viewer"), settings) == (job.scale, job.viewer, expected)
+
+
+def _inputs(job: Job) -> dict[str, str]:
+    """What is given beside the checkpoint: a hash of the cameras, the background, the screen filter, and a hash of the photographs."""
+    return job.base.asked() | ({} if job.images is None else {"photographs": load_scene(job.images).digest()})
 
 
 def _digest(job: Job, wanted: Any) -> str:

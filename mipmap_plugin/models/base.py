@@ -102,7 +102,10 @@ class SplatModel(Protocol):
 
 
 class Rebuilt(SplatModel, Protocol):
-    """A model with the trait `same_for_all_views`."""
+    """A model with the trait `same_for_all_views`.
+
+    Optional: `shared()`, a copy that shares tensors and is never changed in place, and `shares`, whether the model is one. It saves memory.
+    """
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
         """Replace the splats by those that `form` returns for them. Only called on a copy."""

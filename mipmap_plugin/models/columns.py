@@ -42,31 +42,33 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
         raise CheckpointError(f"{path} has {len(rest)} f_rest columns, which fit no SH degree: 0, 9, 24, 45 or 72 do; export it again")
     bands = len(rest) // 3
     basis_major = tuple(rest[c * bands + j] for j in range(bands) for c in range(3))  # the file is channel-major
+    sh = stacked(columns, (*DC, *basis_major)).unflatten(1, (1 + bands, 3))  # one tensor: joined without a copy
     return {
         "means": stacked(columns, POSITION),
         "scales": stacked(columns, SCALE),
         "quats": stacked(columns, QUATERNION),
         "opacities": stacked(columns, ("opacity",))[:, 0],
-        "sh0": stacked(columns, DC)[:, None],
-        "shN": stacked(columns, basis_major).unflatten(1, (bands, 3)),
+        "sh0": sh[:, :1],
+        "shN": sh[:, 1:],
     }
 
 
 def to_columns(parameters: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
-    """The columns that 3DGS writes, all f4, in its order."""
+    """The columns that 3DGS writes, all f4, in its order: views of the parameters, not copies."""
     raw = {name: tensor.detach().to("cpu", torch.float32) for name, tensor in parameters.items()}
     count, bands = raw["shN"].shape[:2]
     rest = tuple(f"f_rest_{i}" for i in range(3 * bands))
     blocks = {
         POSITION: raw["means"],
-        NORMAL: torch.zeros(count, 3),
+        NORMAL: torch.zeros(1, 3).expand(count, 3),
         DC: raw["sh0"][:, 0],
-        rest: raw["shN"].transpose(1, 2).flatten(1),
         ("opacity",): raw["opacities"][:, None],
         SCALE: raw["scales"],
         QUATERNION: raw["quats"],
     }
-    return {name: block[:, i].numpy() for names, block in blocks.items() for i, name in enumerate(names)}
+    named = {name: block[:, i].numpy() for names, block in blocks.items() for i, name in enumerate(names)}
+    named |= {f"f_rest_{c * bands + j}": raw["shN"][:, j, c].numpy() for c in range(3) for j in range(bands)}
+    return {name: named[name] for name in (*POSITION, *NORMAL, *DC, *rest, "opacity", *SCALE, *QUATERNION)}
 
 
 def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

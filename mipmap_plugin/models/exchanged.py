@@ -12,7 +12,8 @@ from mipmap_plugin.formats.splat_transform import EXCHANGE, as_ply
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.family import Files
-from mipmap_plugin.models.vanilla import OPACITY_MARGIN, VanillaModel, read_vanilla
+from mipmap_plugin.models.raw import OPACITY_MARGIN
+from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 
 
 def load_exchanged(path: str | Path, *, iteration: int | None = None) -> VanillaModel:

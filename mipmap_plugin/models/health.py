@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
+import torch
 from torch import Tensor
 
 from mipmap_plugin.models.base import SplatModel
@@ -32,6 +34,9 @@ STRAYS = 0.01
 
 # No scene has larger positions, lengths or colors, and products of several of them, as in gradients, overflow float32.
 LARGEST = 1e12
+
+# Rows that are examined together, so that there is no second copy of all.
+CHUNK = 1 << 17
 
 # With fewer splats than this, the distribution of a parameter is not judged.
 MIN_DISTRIBUTION = 100
@@ -91,8 +96,8 @@ def examine(model: SplatModel) -> Health:
     extent = _extent(raw["means"])
     return Health(
         splats=len(scales),
-        nan={name: _rows(tensor.isnan()) for name, tensor in raw.items()},
-        infinite={name: _rows(tensor.isinf()) for name, tensor in raw.items()},
+        nan={name: _rows_where(torch.isnan, tensor) for name, tensor in raw.items()},
+        infinite={name: _rows_where(torch.isinf, tensor) for name, tensor in raw.items()},
         zero_quaternions=int((raw["quats"] == 0).all(1).sum()),
         extent=extent,
         huge=_rows(scales > extent) if extent > 0 else 0,
@@ -115,8 +120,14 @@ def _invalid(raw: dict[str, Tensor], scales: Tensor, opacities: Tensor) -> Tenso
     """Which splats are invalid, [N] bool. Valid are a logit of infinity (opacity 1), a log scale of -infinity (length 0), any quaternion norm."""
     valid = raw["quats"].isfinite().all(1) & opacities.isfinite()
     for values in (raw["means"], scales, raw["sh0"], raw["shN"]):
-        valid &= (values.abs() <= LARGEST).flatten(1).all(1)  # False for NaN
+        for rows, part in zip(valid.split(CHUNK), values.split(CHUNK), strict=True):
+            rows &= (part.abs() <= LARGEST).flatten(1).all(1)  # False for NaN
     return ~valid
+
+
+def _rows_where(test: Callable[[Tensor], Tensor], values: Tensor) -> int:
+    """The number of rows with a value for which `test` is True."""
+    return sum(_rows(test(part)) for part in values.split(CHUNK))
 
 
 def _rows(marked: Tensor) -> int:

@@ -19,6 +19,9 @@ PARTS = ("point_cloud", "deform", "ckpts", "nerfstudio_models")
 
 REPORT = ".adaptation.json"
 
+# Rows that are checked together, so that there is no second copy of all.
+CHUNK = 1 << 17
+
 # Finite numbers that in float32 activate as an infinite logit and logarithm do: to an opacity of 1 or 0, and a length of almost 0.
 LOGIT, LOG_SCALE = 80.0, -87.0
 
@@ -62,13 +65,18 @@ def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
         if name in cleaned:
             cleaned[name] = cleaned[name].nan_to_num(nan=torch.nan, posinf=high, neginf=low)
     for name, value in {**cleaned, "lengths": cleaned["scales"].exp()}.items():
-        wrong = ~value.isfinite() if name in ("opacities", "quats") else ~(value.abs() <= most)  # True for NaN
-        if rows := int(wrong.flatten(1).any(1).sum() if wrong.dim() > 1 else wrong.sum()):
+        if rows := sum(_wrong_rows(part, torch.inf if name in ("opacities", "quats") else most) for part in value.split(CHUNK)):
             raise SettingsError(
                 f"{rows:,} of {len(value):,} rows hold a NaN, an infinity or more than {most:g} in {name}, so nothing is saved;"
                 " adapt less boldly, or to another scale"
             )
     return cleaned
+
+
+def _wrong_rows(values: Tensor, most: float) -> int:
+    """The number of rows with a NaN, an infinity or a number above `most`."""
+    right = values.isfinite() if most == torch.inf else values.abs() <= most  # False for NaN
+    return len(values) - int(right.flatten(1).all(1).sum() if right.dim() > 1 else right.sum())
 
 
 def _belongs(name: str, source: str) -> bool:

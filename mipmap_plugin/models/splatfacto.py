@@ -22,7 +22,8 @@ from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.places import SPLATFACTO
-from mipmap_plugin.models.vanilla import OPACITY_MARGIN, Origin, VanillaModel, without_invalid
+from mipmap_plugin.models.raw import OPACITY_MARGIN
+from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_invalid
 from mipmap_plugin.splatting.harmonics import C0
 
 PLACE, FILE = SPLATFACTO

@@ -20,7 +20,8 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import SCALE, to_parameters
 from mipmap_plugin.models.detect import detect_as
-from mipmap_plugin.models.vanilla import MIN_SCALE, VanillaModel, read_splats
+from mipmap_plugin.models.raw import MIN_SCALE
+from mipmap_plugin.models.vanilla import VanillaModel, read_splats
 from mipmap_plugin.splatting.rotations import quaternion_product
 
 # Stands for the log of a third scale of 0; files do not contain it.
@@ -38,9 +39,9 @@ class SurfelModel(VanillaModel):
     family = "2dgs"
     _no_viewer = "its splats are flat (2DGS), which none of the viewers draws"
 
-    def gaussians(self, camera: Camera | None = None) -> Gaussians:
-        """All splats, activated, with third scales of 0. `camera` is ignored."""
-        thick = super().gaussians(camera)
+    def _activated(self, sh: Tensor) -> Gaussians:
+        """All splats, with third scales of 0."""
+        thick = super()._activated(sh)
         return replace(thick, scales=thick.scales * thick.scales.new_tensor([1.0, 1.0, 0.0]))
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:

@@ -20,23 +20,18 @@ from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, w
 from mipmap_plugin.formats.tags import render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, to_columns, to_parameters
+from mipmap_plugin.models.columns import extra_columns, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
 from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts
+from mipmap_plugin.models.raw import check, log, logit, moved, raw_parameters
 from mipmap_plugin.splatting.bands import joined
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 Model = TypeVar("Model", bound="VanillaModel")
-
-# World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so it can be optimized.
-MIN_SCALE = 1e-18
-
-# Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
-OPACITY_MARGIN = 1e-6
 
 # A fused file of Mip-Splatting has the columns of 3DGS; only its usual name tells it apart.
 FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting trained it, say so (--screen-filter mip)"
@@ -70,7 +65,7 @@ class VanillaModel:
         self, parameters: dict[str, Tensor], trained: TrainedScale = TrainedScale(), origin: Origin = Origin(), notes: Iterable[str] = ()  # noqa: B008
     ) -> None:
         """A model over these tensors, which are not copied. Raises ShapeError."""
-        _check(parameters)
+        check(parameters)
         self._parameters = dict(parameters)
         self._origin = origin
         if origin.host:
@@ -79,13 +74,14 @@ class VanillaModel:
         self.traits = Traits(same_for_all_views=True, placed=origin.host is not None, no_viewer=self._no_viewer, exposures=origin.exposures)
         self.trained = trained
         self.notes: list[str] = list(notes)
+        self.shares = False  # tensors with another model, so that they are replaced and never changed in place
 
     @classmethod
     def from_gaussians(cls, gaussians: Gaussians, trained: TrainedScale = TrainedScale()) -> VanillaModel:  # noqa: B008
         """A model whose activated splats are `gaussians`, with scales and opacities clamped by `MIN_SCALE` and `OPACITY_MARGIN`."""
         if gaussians.covariances is not None:
             raise SettingsError("Gaussians with covariances cannot be stored as 3DGS parameters; give quaternions and scales")
-        return cls(_raw(gaussians), trained)
+        return cls(raw_parameters(gaussians), trained)
 
     @property
     def sh_degree(self) -> int:
@@ -109,9 +105,12 @@ class VanillaModel:
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated: exp, sigmoid, unit quaternions. `camera` is ignored."""
+        return self._activated(joined(self._parameters["sh0"], self._parameters["shN"]))
+
+    def _activated(self, sh: Tensor) -> Gaussians:
+        """All splats with the coefficients `sh` [N, K, 3]."""
         raw = self._parameters
-        quats, sh = unit_quaternions(raw["quats"]), joined(raw["sh0"], raw["shN"])
-        return Gaussians(raw["means"], quats, raw["scales"].exp(), raw["opacities"].sigmoid(), sh)
+        return Gaussians(raw["means"], unit_quaternions(raw["quats"]), raw["scales"].exp(), raw["opacities"].sigmoid(), sh)
 
     def parameters(self) -> dict[str, Tensor]:
         """The raw parameters by name, without copying them."""
@@ -122,9 +121,15 @@ class VanillaModel:
         leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()}
         return self._with(leaves, replace(self._origin, digest=""))
 
+    def shared(self: Model) -> Model:
+        """A copy that takes no memory until it is reshaped or rebuilt: it shares this model's tensors, which it never changes."""
+        model = self._with(self._parameters, replace(self._origin, digest=""))
+        model.shares = True
+        return model
+
     def to(self: Model, device: torch.device | str) -> Model:
         """A copy on another device, which requires gradients where this one does."""
-        return self._with({name: _moved(tensor, device) for name, tensor in self._parameters.items()})
+        return self._with({name: moved(tensor, device) for name, tensor in self._parameters.items()})
 
     def keep_rows(self: Model, keep: Tensor) -> Model:
         """A new model of the rows where `keep` [N] is True, extra columns included."""
@@ -134,9 +139,9 @@ class VanillaModel:
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
         """Use these tensors themselves as leaves, as an optimizer requires. Extra columns are dropped, since rows may differ. Raises ShapeError."""
-        _check(parameters)
+        check(parameters)
         leaves = {name: tensor if tensor.is_leaf else tensor.detach() for name, tensor in parameters.items()}
-        self._parameters = {name: leaf.requires_grad_() for name, leaf in leaves.items()}
+        self._parameters, self.shares = {name: leaf.requires_grad_() for name, leaf in leaves.items()}, False
         if self._origin.extras:
             self.notes.append(f"the extra columns {', '.join(self._origin.extras)} are dropped, since splats were added or removed")
             self._origin = replace(self._origin, extras={})
@@ -146,21 +151,27 @@ class VanillaModel:
         return {}
 
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera] = ()) -> None:
-        """Set the scales [N, 3] and opacities [N] that `form` returns, in place, so that an optimizer keeps its leaves. Raises ShapeError."""
-        scales, opacities = form(self.gaussians().detach())
-        for name, values in {"scales": _log(scales), "opacities": _logit(opacities)}.items():
+        """Set the scales [N, 3] and opacities [N] that `form` returns for splats of SH degree 0, on which shapes do not depend.
+
+        In place, so that an optimizer keeps its leaves, unless they are shared. Raises ShapeError.
+        """
+        scales, opacities = form(self._activated(self._parameters["sh0"]).detach())
+        for name, values in {"scales": log(scales), "opacities": logit(opacities)}.items():
             leaf = self._parameters[name]
             if values.shape != leaf.shape:
                 raise ShapeError(f"{name}: expected shape {list(leaf.shape)}, got {list(values.shape)}")
-            with torch.no_grad():
-                leaf.copy_(values)
+            if self.shares:
+                self._parameters[name] = values
+            else:
+                with torch.no_grad():
+                    leaf.copy_(values)
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
         """Replace the splats by those that `form` returns for them, of any number."""
         before = self.gaussians().detach()
         after = form(before)
         if after is not before:
-            self.replace_parameters(_raw(after))
+            self.replace_parameters(raw_parameters(after))
 
     def save(
         self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False, companions: Callable[[Path], Any] = lambda ply: None
@@ -267,35 +278,3 @@ def without_invalid(model: Model) -> Model:
     reasons = health.non_finite() or [f"they were not finite once activated, or above {LARGEST:g}"]
     model.notes.append("found while loading: " + "; ".join(reasons))
     return model
-
-
-def _check(parameters: dict[str, Tensor]) -> None:
-    if set(parameters) != {"means", "scales", "quats", "opacities", "sh0", "shN"}:
-        raise ShapeError(f"parameters: expected means, scales, quats, opacities, sh0 and shN, got {', '.join(parameters)}")
-    n = len(parameters["means"])
-    bands = parameters["shN"].shape[1] if parameters["shN"].dim() == 3 else 0
-    expected = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, bands, 3)}
-    for name, shape in expected.items():
-        if tuple(parameters[name].shape) != shape:
-            raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(parameters[name].shape)}")
-    if 3 * bands not in SH_DEGREES:
-        raise ShapeError(f"shN: {bands} coefficients fit no SH degree; 0, 3, 8, 15 or 24 do")
-
-
-def _raw(gaussians: Gaussians) -> dict[str, Tensor]:
-    """The raw parameters of splats, as copies."""
-    g = gaussians.detach()
-    named = {"means": g.means, "scales": _log(g.scales), "quats": g.quats, "opacities": _logit(g.opacities)}
-    return {name: tensor.clone() for name, tensor in {**named, "sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}.items()}
-
-
-def _log(scales: Tensor) -> Tensor:
-    return scales.detach().clamp_min(MIN_SCALE).log()
-
-
-def _logit(opacities: Tensor) -> Tensor:
-    return opacities.detach().logit(eps=OPACITY_MARGIN)
-
-
-def _moved(tensor: Tensor, device: torch.device | str) -> Tensor:
-    return tensor.detach().to(device, copy=True).requires_grad_(tensor.requires_grad)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import DIGITS, Camera, digest_of
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.formats.images import image_size, is_file, read_image
 from mipmap_plugin.scenes.lenses import Lens
@@ -28,6 +29,11 @@ class Scene:
     applied: Tensor | None = None  # [4, 4] float64, transform that nerfstudio applied to COLMAP's world before it wrote the file
     applied_scale: float = 1.0  # and its scale
     lenses: dict[Path, Lens] = field(default_factory=dict)  # of photographs that have to be undistorted
+
+    def digest(self) -> str:
+        """A hash of the cameras and of the photographs: of their names and sizes in bytes, not of what they show."""
+        sizes = [(path.name, path.stat().st_size) for path in self.images.values()]
+        return hashlib.sha256(f"{digest_of(self.cameras)} {sizes}".encode()).hexdigest()[:DIGITS]
 
     def split(self, name: str) -> list[Camera]:
         """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""

@@ -18,6 +18,9 @@ from mipmap_plugin.splatting.harmonics import C0
 # Sine of half the angle below which a rotation's axis is undefined.
 LEAST_TURN = 1e-6
 
+# Splats that are packed together, so that there is no copy of all in float64.
+CHUNK = 1 << 17
+
 
 def packed(gaussians: Gaussians, camera: Camera, packing: Packing) -> Gaussians:
     """`gaussians` after `packing`; `camera` matters for means that are stored relative to it. Covariances are not packed.
@@ -25,19 +28,26 @@ def packed(gaussians: Gaussians, camera: Camera, packing: Packing) -> Gaussians:
     Computed in float64, so that every backend rounds the same way.
     """
     with torch.no_grad():
-        exact = gaussians.to(dtype=torch.float64)
-        opacities = exact.opacities
-        for step in packing.opacity:
-            opacities = _stepped(opacities, step, packing.downwards)
-        rounded = {"opacities": opacities, "sh": _harmonics(exact.sh, packing)}
-        if packing.log_scales is not None:
-            rounded["scales"] = _scales(exact.scales, *packing.log_scales)
-        if packing.quats is not None:
-            rounded["quats"] = _quaternions(exact.quats, _octahedral if packing.quats == "octahedral" else _stereographic)
-        if packing.half_means:
-            eye = camera.center.to(exact.means)
-            rounded["means"] = (exact.means.half().double() - eye).half().double() + eye
+        parts = [_rounded(gaussians[start : start + CHUNK], camera, packing) for start in range(0, max(1, len(gaussians)), CHUNK)]
+        rounded = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     return replace(gaussians, **{name: _straight_through(getattr(gaussians, name), value) for name, value in rounded.items()})
+
+
+def _rounded(gaussians: Gaussians, camera: Camera, packing: Packing) -> dict[str, Tensor]:
+    """What packing changes, by the names of the tensors of `gaussians` and in their dtype."""
+    exact = gaussians.to(dtype=torch.float64)
+    opacities = exact.opacities
+    for step in packing.opacity:
+        opacities = _stepped(opacities, step, packing.downwards)
+    rounded = {"opacities": opacities, "sh": _harmonics(exact.sh, packing)}
+    if packing.log_scales is not None:
+        rounded["scales"] = _scales(exact.scales, *packing.log_scales)
+    if packing.quats is not None:
+        rounded["quats"] = _quaternions(exact.quats, _octahedral if packing.quats == "octahedral" else _stereographic)
+    if packing.half_means:
+        eye = camera.center.to(exact.means)
+        rounded["means"] = (exact.means.half().double() - eye).half().double() + eye
+    return {name: value.to(gaussians.means) for name, value in rounded.items()}
 
 
 def round_to(values: Tensor, steps: Tensor) -> Tensor:

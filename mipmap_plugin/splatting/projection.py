@@ -23,10 +23,24 @@ class Projected:
     xy: Tensor  # [N] px²
     yy: Tensor  # [N] px²
     det: Tensor  # [N] px⁴, never negative
+    to_image: Tensor | None = None  # [N, 2, 3] px per world unit: the derivative of the projection at each center, where `project` computed it
+
+    def with_axes(self, axes: Tensor) -> Projected:
+        """What `project` returns for splats at the same places with other `axes` [N, 3, 3] (`axes_of`)."""
+        assert self.to_image is not None
+        return Projected(self.means2d, self.depths, *_from_factors(self.to_image @ axes), self.to_image)
 
 
-def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: float = FRUSTUM_MARGIN) -> Projected:
-    """Project splats to the image plane. The values of splats nearer than `near` are finite but meaningless."""
+def axes_of(quats: Tensor, scales: Tensor) -> Tensor:
+    """The axes of splats as columns [N, 3, 3], in world units, from quaternions wxyz [N, 4] and scales [N, 3]."""
+    return rotations(quats) * scales[:, None, :]
+
+
+def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: float = FRUSTUM_MARGIN, axes: Tensor | None = None) -> Projected:
+    """Project splats to the image plane. The values of splats nearer than `near` are finite but meaningless.
+
+    `axes` [N, 3, 3]: those of the splats, if they are known (`axes_of`), a third of the time.
+    """
     viewmat = camera.viewmat.to(gaussians.means)
     in_camera = camera.to_camera(gaussians.means)
     depths = in_camera[:, 2]
@@ -36,10 +50,10 @@ def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: fl
     means2d = slopes * focal + slopes.new_tensor([camera.cx, camera.cy])
     to_image = _jacobian(slopes, safe, camera, frozen_beyond) @ viewmat[:3, :3]
     if gaussians.covariances is not None:
-        xx, xy, yy, det = _from_covariances(to_image, gaussians.covariances)
+        shapes = _from_covariances(to_image, gaussians.covariances)
     else:
-        xx, xy, yy, det = _from_factors(to_image @ (rotations(gaussians.quats) * gaussians.scales[:, None, :]))
-    return Projected(means2d, depths, xx, xy, yy, det)
+        shapes = _from_factors(to_image @ (axes_of(gaussians.quats, gaussians.scales) if axes is None else axes))
+    return Projected(means2d, depths, *shapes, to_image)
 
 
 def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: float) -> Tensor:

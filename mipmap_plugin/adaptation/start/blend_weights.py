@@ -21,18 +21,26 @@ def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backen
     """The blend weight of each splat, summed over the pixels of a view and averaged over `views`: [N] in pixels; 0 for an invisible splat.
 
     An image is linear in the splats' colors, so that the weights are the gradient of the image's sum with respect to the colors. Works
-    with any backend that has gradients.
+    with any backend that has gradients, and faster with one that computes them itself (`Backend.blend_weights`).
     """
     plain = replace(effects, sh_degree=0, settings=effects.settings.without_color_rounding())
+    weigh = getattr(backend, "blend_weights", None)
 
-    @torch.enable_grad()
-    def color_gradient(view: Camera) -> Tensor:
-        color = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_()
-        backend.render(replace(gaussians, sh=color), view, plain).image.sum().backward()
-        assert color.grad is not None
-        return color.grad
+    def weights(view: Camera) -> Tensor:
+        gray = replace(gaussians, sh=torch.zeros_like(gaussians.sh[:, :1]))
+        known: Tensor | None = None if weigh is None else weigh(gray, view, plain)
+        return _color_gradient(gray, view, backend, plain) if known is None else known
 
-    total, *gradients = side_by_side(color_gradient, views, max_threads(gaussians.means, views[0]))
-    for gradient in gradients:
-        total += gradient
-    return total[:, 0].mean(dim=1) / (C0 * len(views))
+    total, *further = side_by_side(weights, views, max_threads(gaussians.means, views[0]))
+    for each in further:
+        total += each
+    return total / len(views)
+
+
+@torch.enable_grad()
+def _color_gradient(gray: Gaussians, view: Camera, backend: Backend, effects: Effects) -> Tensor:
+    """The sum of each splat's blend weights over a view, [N], by the gradient of the colors of `gray` splats."""
+    color = gray.sh.clone().requires_grad_()
+    backend.render(replace(gray, sh=color), view, effects).image.sum().backward()
+    assert color.grad is not None
+    return color.grad[:, 0].mean(dim=1) / C0

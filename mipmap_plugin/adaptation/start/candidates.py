@@ -13,7 +13,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, filter_suffices, pixel_size
 from mipmap_plugin.adaptation.start.matching import matched_opacities
-from mipmap_plugin.adaptation.start.merging import merge, merge_down
+from mipmap_plugin.adaptation.start.merging import Rounds, merge, merge_down
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -37,7 +37,7 @@ class FinerLevel:
 class StartProblem:
     """The request for a start: the base, the target, and what measures the candidates."""
 
-    base: Callable[[], SplatModel]  # makes a copy of the base that is rendered with the target's screen filter
+    base: Callable[[], SplatModel]  # makes a copy of the base that is rendered with the target's screen filter; it may share the base's tensors
     views: Sequence[Camera]  # at the base scale
     scale: float
     base_effects: Effects  # how the base is rendered
@@ -68,13 +68,17 @@ class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
     def __init__(self, problem: StartProblem) -> None:
-        self._problem, self._weight_views = problem, evenly(problem.views, WEIGHT_VIEWS)
+        self._problem, self._weight_views, self._rounds = problem, evenly(problem.views, WEIGHT_VIEWS), Rounds()
         unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
         self._matches_weights = problem.has_blend_weights and problem.scale <= 1 and not unchanged
 
     @torch.no_grad()
     def best(self) -> tuple[SplatModel, str]:
-        """Return the model to begin with, and its name."""
+        """Return the model to begin with, which shares no tensors, and its name."""
+        model, name = self._best()
+        return (model.copy() if getattr(model, "shares", False) else model), name
+
+    def _best(self) -> tuple[SplatModel, str]:
         problem, config, base = self._problem, self._problem.config, self._problem.base()
         too_many = config.most_splats is not None and len(base.parameters()["means"]) > config.most_splats
         if not (config.closed_form or config.merge_to < 1 or too_many):
@@ -113,7 +117,7 @@ class StartSearch:
 
         def merged(gaussians: Gaussians) -> Gaussians:
             if most is None:
-                splats, new_weights = merge(gaussians, pixel_of(gaussians.means), weights, fraction)
+                splats, new_weights = merge(gaussians, pixel_of(gaussians.means), weights, fraction, self._rounds)
             else:
                 splats, new_weights = merge_down(gaussians, pixel_of, weights, most)
             merged_weights.append(new_weights)

@@ -37,7 +37,7 @@ from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.filters import INTEGRALS, SQUARE_VARIANCE, compensates, footprint, widening
-from mipmap_plugin.splatting.projection import Projected, project
+from mipmap_plugin.splatting.projection import Projected, axes_of, project
 
 # Target pixels: the minimum scale of an axis. At 1/50 of the classic dilation's width it is invisible, and its logarithm is finite.
 MIN_AXIS = 0.01
@@ -51,6 +51,9 @@ CULL_MARGIN = 2.0
 
 # Number of views from which the distance and the area of a splat are computed; more views make no difference at this accuracy.
 MAX_VIEWS = 12
+
+# Splats that a processor computes together, in bounded memory.
+CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,16 @@ def closed_form(
     """
     if filter_suffices(scale, base, target):
         return gaussians.scales, gaussians.opacities
-    views = every_nth(views, MAX_VIEWS)
+    views, count = every_nth(views, MAX_VIEWS), len(gaussians)
+    size = CHUNK if gaussians.means.device.type == "cpu" else max(1, count)
+    chunks = (gaussians[start : start + size] for start in range(0, max(1, count), size))
+    scales, opacities = zip(*(_form(chunk, views, scale, (base, target), form) for chunk in chunks), strict=True)
+    return torch.cat(scales), torch.cat(opacities)
+
+
+def _form(gaussians: Gaussians, views: Sequence[Camera], scale: float, effects: tuple[Effects, Effects], form: FormSettings) -> tuple[Tensor, Tensor]:
+    """`closed_form` of some of the splats; `effects`: of base and target."""
+    base, target = effects
     base_pixel = pixel_size(gaussians.means, views)
     if target.screen_filter == SURFEL:
         return _of_surfels(gaussians, views, scale, (base, target), base_pixel, form)
@@ -178,9 +190,10 @@ def _compensation(gaussians: Gaussians, views: Sequence[Camera], effects: Effect
 def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: float, effects: tuple[Effects, Effects], limit: float) -> Tensor:
     """[N], at most `limit`: the area of an old splat in the base over that of the new one in the target; `effects`: of base and target."""
     base, target = effects
+    new_axes = axes_of(new.quats, new.scales)
 
-    def ratio(camera: Camera, projected: Projected) -> Tensor:
-        new_projected = project(new, camera, target.near_plane)
+    def ratio(_: Camera, projected: Projected) -> Tensor:
+        new_projected = projected.with_axes(new_axes) if new.covariances is None else projected
         return (_det(projected, _filter_variance(base) * scale**2) / _det(new_projected, _filter_variance(target))).sqrt().clamp_max(limit)
 
     return _mean_in_front(old, [view.zoomed(scale) for view in views], base.near_plane, ratio)
@@ -189,8 +202,9 @@ def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: 
 def _mean_in_front(gaussians: Gaussians, views: Sequence[Camera], near: float, quantity: Callable[[Camera, Projected], Tensor]) -> Tensor:
     """[N]: the mean of `quantity(view, projection)` over the views that a splat lies in front of; 1 where there is none."""
     total, count = (torch.zeros_like(gaussians.opacities) for _ in range(2))
+    axes = axes_of(gaussians.quats, gaussians.scales)
     for view in views:
-        projected = project(gaussians, view, near)
+        projected = project(gaussians, view, near, axes=axes)
         in_front = projected.depths > near
         total, count = total + torch.where(in_front, quantity(view, projected), 0.0), count + in_front
     return torch.where(count > 0, total / count.clamp_min(1), 1.0)

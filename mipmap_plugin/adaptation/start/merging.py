@@ -11,10 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from itertools import count as count_from
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.eigen import eigh3
 from mipmap_plugin.splatting.harmonics import C0
@@ -51,25 +53,50 @@ CELL_RANGE = 2**19
 # (shift, mask): each step moves bits apart, until two zeros follow every bit.
 SPREADS = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249))
 
+# Rows whose harmonics are averaged together, so that no second copy of all of them is made.
+CHUNK = 1 << 16
+
 # Opacities stay below 1, whose logit is infinite.
 MAX_OPACITY = 0.999
 
 
-def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float) -> tuple[Gaussians, Tensor]:
+class Rounds:
+    """The pairs of each round, which are searched once for all fractions that the same splats are merged down to."""
+
+    def __init__(self) -> None:
+        self._pairs: list[tuple[Tensor, Tensor]] = []
+        self._generator = torch.Generator().manual_seed(0)
+        self._ended = False
+
+    def of(self, number: int, splats: _Moments) -> tuple[Tensor, Tensor] | None:
+        """The pairs of a round, by rising cost, of which the cheapest are merged; None if there are hardly any. `splats`: those that are left."""
+        if number < len(self._pairs):
+            first, second = self._pairs[number]
+            return first.long(), second.long()
+        if self._ended:
+            return None
+        pairs = splats.pairs(torch.rand(3, generator=self._generator))
+        if len(pairs[0]) < MIN_PAIRS * len(splats.weights):
+            self._ended = True
+            return None
+        self._pairs.append((pairs[0].int(), pairs[1].int()))
+        return pairs
+
+
+def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, rounds: Rounds | None = None) -> tuple[Gaussians, Tensor]:
     """Merge splats down to a `fraction` (0..1) of them; return them and their blend weights.
 
     Merging ends early when hardly any pairs are within `MAX_DISTANCE` and `MAX_COST`. `pixel` [N]: the size of a target pixel at each splat,
-    in world units. `weights` [N]: the blend weight of each splat, in target pixels of a view.
+    in world units. `weights` [N]: the blend weight of each splat, in target pixels of a view. `rounds`: of an earlier call for the same splats.
     """
     splats, target_count = _Moments.of(gaussians, pixel, weights), max(1, math.floor(fraction * len(gaussians)))
-    rows, old_weights = torch.arange(len(gaussians), device=weights.device), splats.weights
-    generator = torch.Generator().manual_seed(0)
-    while (surplus := len(splats.weights) - target_count) > 0:
-        first, second = splats.pairs(torch.rand(3, generator=generator))
-        if len(first) < MIN_PAIRS * len(splats.weights):
+    rows, old_weights, rounds = torch.arange(len(gaussians), device=weights.device), splats.weights, rounds or Rounds()
+    for number in count_from():
+        surplus = len(splats.weights) - target_count
+        if surplus <= 0 or (pairs := rounds.of(number, splats)) is None:
             break
-        count = min(surplus, math.ceil(MERGED_PER_ROUND * len(first)))
-        splats, new_rows = splats.merged(first[:count], second[:count])
+        merged = min(surplus, math.ceil(MERGED_PER_ROUND * len(pairs[0])))
+        splats, new_rows = splats.merged(pairs[0][:merged], pairs[1][:merged])
         rows = new_rows[rows]
     return splats.gaussians(gaussians, rows, old_weights), splats.weights
 
@@ -117,19 +144,9 @@ class _Moments:
         means, shapes, color, weights, pixel = (
             tensor[order] for tensor in (self.means, self.covariances, self.color, self.weights, self.pixel)
         )
-        least, nearest = torch.full_like(weights, torch.inf), torch.zeros_like(order)
+        found = nearest_along(means, shapes, color, weights, pixel, reach=NEIGHBORS, limits=(MAX_DISTANCE**2, MAX_COST))
+        nearest, least = found or _nearest_along(means, shapes, color, weights, pixel)
         position = torch.arange(len(order), device=order.device)
-        for step in range(1, min(NEIGHBORS + 1, len(order))):
-            one, other = slice(None, -step), slice(step, None)
-            square = (means[one] - means[other]).square().sum(1)
-            square = square + (shapes[one] - shapes[other]).flatten(1).norm(dim=1).to(square)
-            distance = square / (pixel[one] * pixel[other]) + (color[one] - color[other]).square().sum(1)  # squared
-            cost = distance * weights[one] * (weights[other] / (weights[one] + weights[other]))
-            cost = torch.where((distance < MAX_DISTANCE**2) & (cost < MAX_COST), cost, torch.inf)
-            for here, there in ((one, other), (other, one)):
-                nearer = cost < least[here]
-                nearest[here] = torch.where(nearer, position[there], nearest[here])
-                least[here] = torch.where(nearer, cost, least[here])
         first = ((nearest[nearest] == position) & (position < nearest) & least.isfinite()).nonzero()[:, 0]
         first = first[least[first].argsort(stable=True)]
         return order[first], order[nearest[first]]
@@ -161,19 +178,41 @@ class _Moments:
             return before
         origin = torch.zeros_like(rows[:count]).index_copy_(0, rows, torch.arange(len(rows), device=rows.device))
 
-        def replaced(old: Tensor, values: Tensor) -> Tensor:
-            return old[origin].masked_scatter(is_merged.view(-1, *[1] * (old.dim() - 1)), values.to(old))
+        merged = is_merged.nonzero()[:, 0]
 
-        variances, directions = eigh3(self.covariances[is_merged])
+        def replaced(old: Tensor, values: Tensor) -> Tensor:
+            return old[origin].index_copy_(0, merged, values.to(old))
+
+        variances, directions = eigh3(self.covariances[merged])
         directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
-        opacities = -torch.expm1(-self.depth[is_merged] / _surface(self.covariances[is_merged]))
-        fraction = (old_weights / self.weights[rows])[:, None, None]
-        sh = torch.zeros_like(before.sh[:count]).index_add_(0, rows, fraction * before.sh)
+        opacities = -torch.expm1(-self.depth[merged] / _surface(self.covariances[merged]))
+        sh = torch.zeros_like(before.sh[:count])
+        for part in torch.arange(len(rows), device=rows.device).split(CHUNK):  # the harmonics are most of the memory
+            fraction = old_weights[part] / self.weights[rows[part]]  # 1 for a splat that was not merged
+            sh.index_add_(0, rows[part], fraction[:, None, None] * before.sh[part])
         return replace(
-            before, means=replaced(before.means, self.means[is_merged]), quats=replaced(before.quats, quaternions(directions)),
-            scales=replaced(before.scales, variances.clamp_min(0).sqrt()), sh=replaced(before.sh, sh[is_merged]),
+            before, means=replaced(before.means, self.means[merged]), quats=replaced(before.quats, quaternions(directions)),
+            scales=replaced(before.scales, variances.clamp_min(0).sqrt()), sh=sh,
             opacities=replaced(before.opacities, opacities.clamp_max(MAX_OPACITY)),
         )  # fmt: skip
+
+
+def _nearest_along(means: Tensor, shapes: Tensor, color: Tensor, weights: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """What `nearest_along` returns, on any device."""
+    position = torch.arange(len(weights), device=weights.device)
+    least, nearest = torch.full_like(weights, torch.inf), torch.zeros_like(position)
+    for step in range(1, min(NEIGHBORS + 1, len(position))):
+        one, other = slice(None, -step), slice(step, None)
+        square = (means[one] - means[other]).square().sum(1)
+        square = square + (shapes[one] - shapes[other]).flatten(1).norm(dim=1).to(square)
+        distance = square / (pixel[one] * pixel[other]) + (color[one] - color[other]).square().sum(1)  # squared
+        cost = distance * weights[one] * (weights[other] / (weights[one] + weights[other]))
+        cost = torch.where((distance < MAX_DISTANCE**2) & (cost < MAX_COST), cost, torch.inf)
+        for here, there in ((one, other), (other, one)):
+            nearer = cost < least[here]
+            nearest[here] = torch.where(nearer, position[there], nearest[here])
+            least[here] = torch.where(nearer, cost, least[here])
+    return nearest, least
 
 
 def _surface(covariances: Tensor) -> Tensor:

@@ -29,7 +29,8 @@ from mipmap_plugin.models.columns import QUATERNION
 from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.inria_folder import write_folder
 from mipmap_plugin.models.outputs import finite, refuse_parts
-from mipmap_plugin.models.vanilla import MIN_SCALE, VanillaModel
+from mipmap_plugin.models.raw import MIN_SCALE
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 # Views sampled for the opacities of anchors, and for reshaping: the networks vary slowly with the direction.

@@ -1,0 +1,109 @@
+"""Blend weights: how much each splat adds to an image. One pass, where the gradients of the colors need two and nine times the memory."""
+
+# numba redefines calls and operators.
+# mypy: ignore-errors
+
+import numpy as np
+
+from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout, projection, sorting
+from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
+from mipmap_plugin.backends.cpu_kernels.compositing import BATCH, find_patches, init_tile, log_alpha, new_patches, tile_box, unfinished_patches
+from mipmap_plugin.backends.cpu_kernels.drawing import flags_of, view_of
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, broadcast, fma, lowest_bit, minimum, select, total
+from mipmap_plugin.backends.cpu_kernels.memory import load, row_of, store
+from mipmap_plugin.backends.cpu_kernels.planes import TRANSMITTANCE, distances, new_state
+from mipmap_plugin.backends.cpu_kernels.pool import empty
+from mipmap_plugin.backends.cpu_kernels.powers import exp2
+from mipmap_plugin.backends.cpu_kernels.records import Limits, SplatArrays
+from mipmap_plugin.backends.cpu_kernels.threads import team
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import MIN_ALPHA, Effects
+
+
+def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None) -> np.ndarray:
+    """The sum of each splat's blend weights over the pixels of an image, [N] float32. Arguments: as of `drawing.draw`; not for windows."""
+    view = view_of(camera, effects, splats, False)
+    limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, 0.0)
+    count, (height, width) = len(splats.means), camera.size
+    table, depths, counts, slots = empty(count, layout.SPLAT_FIELDS), empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
+    threads, flags = team(count + width * height), flags_of(view, splats)
+    threads.share(projection.project, count, flags, view, splats, table, depths, counts)
+    np.cumsum(counts, out=slots[1:])
+    lists = sorting.tile_lists(table, depths if ranks is None else ranks, slots, width, height, threads)
+    by_pair, by_splat = empty(len(lists.members)), empty(count)
+    threads.share(weigh_tiles, len(lists.starts) - 1, flags.integrated, limits, table, lists, (width, height), by_pair)
+    threads.share(sum_pairs, count, slots, by_pair, by_splat)
+    return by_splat
+
+
+@kernel
+def weigh_tiles(start, stop, integrated, limits, table, lists, size, by_pair):
+    """Write the weight of each pair of the tiles start..stop to its slot. integrated: as of `compositing.composite`."""
+    sorting.sort(start, stop, lists)
+    starts, members, slots, _ = lists
+    width, height = size
+    state, patches = new_state(), new_patches()
+    for tile in range(start, stop):
+        box, first = tile_box(tile, width, height), starts[tile]
+        length = starts[tile + 1] - first
+        for at in range(first, first + length):
+            by_pair[slots[at]] = 0
+        init_tile(box, length, state)
+        for begin in range(0, length, BATCH):
+            unfinished = unfinished_patches(state)
+            if unfinished == 0:
+                break
+            end = min(begin + BATCH, length)
+            find_patches(table, members, first + begin, first + end, box, unfinished, patches)
+            for n in range(begin, end):
+                splat = row_of(table, members[first + n])
+                if integrated is not None:
+                    by_pair[slots[first + n]] = weigh_integral(splat, limits, patches[n - begin], box, state)
+                elif splat[layout.GATE] > 0:
+                    by_pair[slots[first + n]] = weigh_splat(splat, limits, patches[n - begin], box, state)
+
+
+@kernel
+def sum_pairs(start, stop, slots, by_pair, by_splat):
+    """Add up the pairs of the splats start..stop."""
+    for i in range(start, stop):
+        weight = np.float32(0)
+        for slot in range(slots[i], slots[i + 1]):
+            weight += by_pair[slot]
+        by_splat[i] = weight
+
+
+@inner
+def weigh_splat(splat, limits, patches, box, state):
+    """Blend a splat into `patches`; returns the sum of its weights (as `compositing.draw_splat`)."""
+    weights = broadcast(0)
+    while patches != 0:
+        patch = lowest_bit(patches)
+        patches &= patches - 1
+        power = log_alpha(splat, *distances(splat, patch, box))
+        alpha = fma(exp2(power), splat[layout.GAIN], 0 - splat[layout.OFFSET])
+        weights = weights + blended(alpha, power >= LOG_MIN_ALPHA, limits, patch * WIDTH, state)
+    return total(weights)
+
+
+@inner
+def weigh_integral(splat, limits, patches, box, state):
+    """As `weigh_splat`, for a splat that is integrated over pixels."""
+    weights = broadcast(0)
+    while patches != 0:
+        patch = lowest_bit(patches)
+        patches &= patches - 1
+        alpha = integrals.alpha(splat, *distances(splat, patch, box))
+        weights = weights + blended(alpha, alpha >= MIN_ALPHA, limits, patch * WIDTH, state)
+    return total(weights)
+
+
+@inner
+def blended(alpha, bright, limits, at, state):
+    """The weights in the patch at `at`, whose transmittances are updated as in `planes.blend`."""
+    max_alpha, min_transmittance, _ = limits
+    alpha, before = select(bright, minimum(alpha, max_alpha), 0), load(state, TRANSMITTANCE + at)
+    after = before * (1 - alpha)
+    is_open = after >= min_transmittance
+    store(state, TRANSMITTANCE + at, select(is_open, after, minimum(before, 0 - before)))
+    return select(is_open, before * alpha, 0)

@@ -1,0 +1,101 @@
+"""A job with its files, for a worker that does not see this machine's disk, and the files that come back."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mipmap_plugin.formats.atomic import named, new_file, refuse_output, together
+from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.models import detect
+from mipmap_plugin.models.outputs import parts_of
+
+# Folders of an unpacked parcel.
+BASE, CAMERAS, IMAGES, OUTPUT = Path("base"), Path("cameras"), Path("images"), Path("output")
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """A job whose paths are relative to the folder that its files are unpacked in."""
+
+    job: Job
+    files: bytes  # a tar archive
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """The outcome of a job that was sent, and the files that it wrote."""
+
+    outcome: Outcome
+    files: bytes
+
+
+def pack(job: Job) -> Parcel:
+    """Pack the checkpoint of a job, its cameras and its photographs. Raises CheckpointError, OSError."""
+    base = job.base
+    checkpoint = detect(base.checkpoint)
+    place = base.checkpoint if base.checkpoint.is_dir() else base.checkpoint.parent
+    parts = [part for part in dict.fromkeys(parts_of(checkpoint.path, checkpoint.folder)) if part.is_relative_to(place)]
+    members = {BASE / part.relative_to(place): part for part in parts}
+    members |= {} if base.cameras is None else _scene(base.cameras, CAMERAS)
+    members |= {} if job.images is None else _scene(job.images, IMAGES)
+    sent = replace(
+        base, checkpoint=BASE if base.checkpoint.is_dir() else BASE / base.checkpoint.name, cameras=base.cameras and _packed(base.cameras, CAMERAS)
+    )
+    target = OUTPUT / named(job.target).name
+    return Parcel(replace(job, base=sent, target=target, images=job.images and _packed(job.images, IMAGES)), _archive(members))
+
+
+def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
+    """Do the job of a parcel in a folder of its own, which is removed at the end."""
+    with tempfile.TemporaryDirectory(prefix="mipmap_plugin-") as folder:
+        place, job = Path(folder), parcel.job
+        with tarfile.open(fileobj=io.BytesIO(parcel.files)) as archive:
+            archive.extractall(place, filter="data")
+        (place / OUTPUT).mkdir()
+        base = replace(job.base, checkpoint=place / job.base.checkpoint, cameras=job.base.cameras and place / job.base.cameras)
+        outcome = do(replace(job, base=base, target=place / job.target, images=job.images and place / job.images))
+        written = [file for file in (place / OUTPUT).rglob("*") if file.is_file()] if outcome.status == "done" else []
+        file = outcome.file and outcome.file.relative_to(place / OUTPUT)
+        reason = outcome.reason.replace(f"{place}/", "")
+        return Delivery(replace(outcome, job=job, file=file, reason=reason), _archive({each.relative_to(place / OUTPUT): each for each in written}))
+
+
+def unpack(delivery: Delivery, job: Job) -> Outcome:
+    """Write what came back to where the job was to write it, atomically. Raises OutputExists, OutputError."""
+    outcome, place = replace(delivery.outcome, job=job), named(job.target).parent
+    if outcome.status != "done":
+        return outcome
+    refuse_output(job.target, job.overwrite)
+    with together(job.target), tarfile.open(fileobj=io.BytesIO(delivery.files)) as archive:
+        for member in archive.getmembers():
+            content = archive.extractfile(member)
+            assert content is not None
+            with new_file(place / member.name, job.overwrite) as temporary:
+                temporary.write_bytes(content.read())
+    return replace(outcome, file=outcome.file and place / outcome.file)
+
+
+def _scene(path: Path, folder: Path) -> dict[Path, Path]:
+    """The files of a scene, by their names in the archive: a file, a model folder's cameras, or the folder with its photographs."""
+    if path.is_file():
+        return {folder / path.name: path}
+    if (path / "cameras.json").is_file():
+        return {folder / "cameras.json": path / "cameras.json"}
+    return {folder / file.relative_to(path): file for file in path.rglob("*") if file.is_file()}
+
+
+def _packed(path: Path, folder: Path) -> Path:
+    return folder / path.name if path.is_file() else folder
+
+
+def _archive(members: Mapping[Path, Path]) -> bytes:
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w") as archive:
+        for name, file in members.items():
+            archive.add(file, name.as_posix(), recursive=False)
+    return stream.getvalue()

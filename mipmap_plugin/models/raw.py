@@ -1,0 +1,52 @@
+"""The raw parameters of splats, as 3DGS trains them: logarithms of scales, logits of opacities."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.errors import ShapeError
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.columns import SH_DEGREES
+
+# World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so it can be optimized.
+MIN_SCALE = 1e-18
+
+# Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
+OPACITY_MARGIN = 1e-6
+
+
+def check(parameters: dict[str, Tensor]) -> None:
+    """Raise ShapeError unless the parameters are those of 3DGS, in shapes that fit together."""
+    if set(parameters) != {"means", "scales", "quats", "opacities", "sh0", "shN"}:
+        raise ShapeError(f"parameters: expected means, scales, quats, opacities, sh0 and shN, got {', '.join(parameters)}")
+    n = len(parameters["means"])
+    bands = parameters["shN"].shape[1] if parameters["shN"].dim() == 3 else 0
+    expected = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, bands, 3)}
+    for name, shape in expected.items():
+        if tuple(parameters[name].shape) != shape:
+            raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(parameters[name].shape)}")
+    if 3 * bands not in SH_DEGREES:
+        raise ShapeError(f"shN: {bands} coefficients fit no SH degree; 0, 3, 8, 15 or 24 do")
+
+
+def raw_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
+    """The raw parameters of splats, as copies."""
+    g = gaussians.detach()
+    named = {"means": g.means, "scales": log(g.scales), "quats": g.quats, "opacities": logit(g.opacities)}
+    return {name: tensor.clone() for name, tensor in {**named, "sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}.items()}
+
+
+def log(scales: Tensor) -> Tensor:
+    """Raw scales, finite for a scale of 0 too."""
+    return scales.detach().clamp_min(MIN_SCALE).log()
+
+
+def logit(opacities: Tensor) -> Tensor:
+    """Raw opacities, finite for 0 and 1 too."""
+    return opacities.detach().logit(eps=OPACITY_MARGIN)
+
+
+def moved(tensor: Tensor, device: torch.device | str) -> Tensor:
+    """A copy on another device, which requires a gradient where this tensor does."""
+    return tensor.detach().to(device, copy=True).requires_grad_(tensor.requires_grad)
