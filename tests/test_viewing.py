@@ -7,6 +7,9 @@ import sys
 import threading
 from dataclasses import replace
 
+import anchor_checkpoints
+import mip_checkpoints
+import moving
 import pytest
 import tiny
 import torch
@@ -15,10 +18,11 @@ from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.cli import main
 from mipmap_plugin.commands.view import _free, has_display
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SceneError, SettingsError
+from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.viewing import adapting
 from mipmap_plugin.viewing.adapting import Adapter, Live, Progress, Wish
-from mipmap_plugin.viewing.around import NEAR, PIXELS, views_for_screen
+from mipmap_plugin.viewing.around import BASE_PIXELS, NEAR, PIXELS, views_for_screen
 from mipmap_plugin.viewing.controls import figures, words
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
 from mipmap_plugin.viewing.page import NO_VISER, _check_address
@@ -139,6 +143,18 @@ def test_the_supersampled_base_is_the_mean_of_the_look_that_was_trained(base, sc
     assert torch.allclose(image, resize(fine, small.size, "box"))
 
 
+@pytest.mark.parametrize("write", [anchor_checkpoints.write, moving.write_deformable, mip_checkpoints.folder], ids=["anchors", "moving", "filtered"])
+def test_every_kind_of_family_is_drawn(tmp_path, write, screen):
+    write(tmp_path / "base")
+    base = wrap_model(tmp_path / "base", cameras=tiny.cameras(4), backend="reference")
+    stage = Stage(base, [File("base", base)], Supersampled("supersampled", base))
+    for look in (Look("base"), Look("supersampled"), Look("base", pixel=2)):
+        picture = stage.draw(look, screen)
+        assert picture.image.shape == (*SIZE, 3) and picture.splats[0] <= picture.splats[1] > 0
+    if not why_no_viewer(base.model):
+        assert torch.equal(stage.draw(Look("base", viewer="classic"), screen).image, base.render(screen, viewer="classic").image.clamp(0, 1))
+
+
 def test_sources_of_the_same_name_are_told_apart(stage, base):
     assert [stage.add(File("base", base)) for _ in range(2)] == ["base (2)", "base (3)"]
 
@@ -165,9 +181,11 @@ def test_a_ladder_shows_the_level_of_the_zoom(tmp_path, base, screen):
     assert torch.equal(levels.render(Request(screen, 0.5)), alone.render(Request(screen, 0.5)))
 
 
-def test_an_empty_ladder_is_refused(tmp_path, base):
-    with pytest.raises(SettingsError, match="lists no levels"):
-        open_source(ladder(tmp_path, ()), base, "reference")
+@pytest.mark.parametrize("text", ['{"levels": []}', "[]", '{"levels": [{"file": "level_0.ply"}]}', '{"levels": [{"file": "a", "shown_from": "b"}]}'])
+def test_a_damaged_ladder_is_refused(tmp_path, base, text):
+    (tmp_path / "levels.json").write_text(text)
+    with pytest.raises(SceneError, match="lists no levels, or is damaged"):
+        open_source(tmp_path, base, "reference")
 
 
 def test_an_adapted_file_is_shown_on_the_background_of_the_base(tmp_path, screen):
@@ -206,7 +224,7 @@ def ended(adapter, wish):
     return adapter.progress
 
 
-def test_views_lie_around_the_screen_and_cover_it_but_are_not_its_own(base):
+def test_views_lie_around_the_screen_and_show_its_splats_but_are_not_its_own(base):
     screen = base.cameras[0].resized(1600, 1200).zoomed(1 / 2)
     views = views_for_screen(base, screen, torch.zeros(3, dtype=torch.float64), 1 / 2)
     near = views[:NEAR]
@@ -215,14 +233,16 @@ def test_views_lie_around_the_screen_and_cover_it_but_are_not_its_own(base):
     assert all(float(view.center.norm()) == pytest.approx(float(screen.center.norm())) for view in near)
     shown = [view.zoomed(1 / 2) for view in near]
     assert all(view.width * view.height <= 1.01 * PIXELS and view.fx == pytest.approx(screen.fx, rel=0.01) for view in shown)
-    assert min(screen.cx - view.cx for view in shown) < 1 and max(screen.cx - view.cx + view.width for view in shown) > 0.95 * screen.width
+    assert all(view.width * view.height <= 1.01 * BASE_PIXELS for view in near)
+    assert all(inside(base.model.parameters()["means"], view).sum() > 2 for view in shown) and len({view.cx for view in shown}) > NEAR / 2
     assert views[NEAR:] and all(torch.equal(view.viewmat, base.cameras[number].viewmat) for number, view in enumerate(views[NEAR:]))
 
 
-def test_at_zoom_in_views_of_the_scene_have_no_more_pixels_than_the_screen(base):
-    screen = base.cameras[0].zoomed(4).window(64, 48)
-    views = views_for_screen(base, screen, torch.zeros(3, dtype=torch.float64), 4.0)
-    assert max(view.zoomed(4).width for view in views) <= 64 + 4
+def test_of_large_views_of_the_scene_the_middle_is_adapted_to(base):
+    screen = base.cameras[0].zoomed(40)
+    views = views_for_screen(base, screen, torch.zeros(3, dtype=torch.float64), 40.0)
+    own = [view.zoomed(40) for view in views[NEAR:]]
+    assert all(0.8 * PIXELS < view.width * view.height <= PIXELS and abs(view.cx - view.width / 2) < 40 for view in own)
 
 
 def test_a_run_shows_its_states_and_stopped_it_returns_the_best_and_the_base_stays(base, monkeypatch):

@@ -26,6 +26,9 @@ MEASURED_EVERY_S, PATIENCE_S = 0.7, 1.5
 # px: the screen's picture is measured on at most this many, around its middle.
 MEASURED_PIXELS = 200_000
 
+# Fewer than usual, because somebody is waiting.
+VALIDATION_VIEWS = 10
+
 # A zoom that differs from x1 by less is x1.
 SAME_ZOOM = 0.03
 
@@ -58,6 +61,7 @@ class Progress:
     running: bool = False
     step: int = 0
     curve: tuple[tuple[float, float], ...] = ()  # seconds of adapting, dB of the screen's picture against the supersampled base
+    base_db: float | None = None  # of the base as the viewer draws it; None: not measured yet
     adapted: Adapted | None = None
     trouble: str = ""  # why there is none, in a sentence
 
@@ -67,7 +71,7 @@ class Adapter:
 
     def __init__(self, base: Wrapped, reference: Supersampled, changed: Callable[[], None] = lambda: None) -> None:
         """`changed` is called, in the thread of the run, whenever `progress` is new."""
-        self._base, self._reference, self._changed = base, reference, changed
+        self._base, self._reference, self._shown, self._changed = base, reference, File("base", base), changed
         self.progress = Progress()
         self._thread: threading.Thread | None = None
         self._warm = set[str | None]()  # the viewers that were adapted for before
@@ -118,9 +122,9 @@ class Adapter:
 
     def _adapt(self, wish: Wish) -> Adapted:
         views = views_for_screen(self._base, wish.screen, torch.tensor(wish.look_at, dtype=torch.float64), wish.scale)
-        options: dict[str, Any] = {"recipe": wish.recipe, "viewer": wish.viewer, "views": "given"}
+        options: dict[str, Any] = {"recipe": wish.recipe, "viewer": wish.viewer, "views": "given", "validation_views": VALIDATION_VIEWS}
         if wish.viewer not in self._warm:  # one step, so that the time to compile kernels for this viewer is not that of the run
-            self._base.adapt(wish.scale, cameras=views[:1], steps=1, validation_views=2, **options)
+            self._base.adapt(wish.scale, cameras=views[:1], steps=1, **options)
             self._warm.add(wish.viewer)
         return self._base.adapt(wish.scale, cameras=views, observe=self._observer(wish), time_budget_s=wish.seconds, **options)
 
@@ -128,16 +132,16 @@ class Adapter:
         """Looks at the run after each step: answers who waits for a picture, and now and then measures that of the screen."""
         side = math.sqrt(min(1.0, MEASURED_PIXELS / (wish.screen.width * wish.screen.height)))
         judged = wish.screen.window(max(1, int(side * wish.screen.width)), max(1, int(side * wish.screen.height)))
-        truth = self._reference.render(Request(judged, wish.zoom)).clamp(0, 1)
-        measured = -math.inf
+        request = Request(judged, wish.zoom, wish.viewer)
+        truth, measured = self._reference.render(request).clamp(0, 1), -math.inf
+        self._set(base_db=psnr(self._shown.render(request), truth))
 
         @torch.no_grad()
         def observe(step: int, seconds: float, render: Callable[[Camera], Tensor]) -> bool:
             nonlocal measured
             self._answer_with(render)
             if step == 0 or time.monotonic() - measured > MEASURED_EVERY_S:
-                psnr = decibel(float((render(judged).clamp(0, 1) - truth).square().mean()))
-                self._set(step=step, curve=(*self.progress.curve, (seconds, psnr)))
+                self._set(step=step, curve=(*self.progress.curve, (seconds, psnr(render(judged), truth))))
                 measured = time.monotonic()
             return self._stopping.is_set()
 
@@ -157,6 +161,11 @@ class Adapter:
     def _set(self, **changes: object) -> None:
         self.progress = replace(self.progress, **changes)  # type: ignore[arg-type]  # mypy does not check these names
         self._changed()
+
+
+def psnr(image: Tensor, truth: Tensor) -> float:
+    """PSNR (dB) of an image as a display shows it."""
+    return decibel(float((image.clamp(0, 1) - truth).square().mean()))
 
 
 class Live:

@@ -26,7 +26,7 @@ PIXELS = ("1", "2", "4", "8")
 
 CURVE = "dB of this picture against the supersampled base, over seconds"
 
-LEAST_S, USUAL_S, MOST_S = 1.0, 20.0, 3600.0
+LEAST_S, USUAL_S, MOST_S = 1.0, 30.0, 3600.0
 
 
 class Controls:
@@ -53,9 +53,10 @@ class Controls:
             self.stop = gui.add_button("Stop", disabled=True)
             self.save = gui.add_button("Save", disabled=True, hint="what was adapted last, beside the checkpoint")
             self.told = gui.add_markdown("")
-            series = ({"label": "s"}, {"label": "dB", "stroke": "#2563eb", "width": 2.0})
+            base = {"label": "base", "stroke": "#888888", "width": 1.0, "dash": (6.0, 4.0), "points": {"show": False}}
+            series = ({"label": "s"}, {"label": "adapted", "stroke": "#2563eb", "width": 2.0}, base)
             scales = {"x": {"time": False}}
-            self._curve = gui.add_uplot(_columns([(0.0, 0.0)]), series, title=CURVE, scales=scales, aspect=1.6, visible=False)
+            self._curve = gui.add_uplot(_columns(Progress(curve=((0.0, 0.0),))), series, title=CURVE, scales=scales, aspect=1.6, visible=False)
 
     def look(self) -> Look:
         """What the page is set to."""
@@ -84,12 +85,14 @@ class Controls:
         self.save.disabled = progress.adapted is None
         self.told.content = words(progress)
         if len(progress.curve) > 1:  # one point is no curve
-            self._curve.data, self._curve.visible = _columns(progress.curve), True
+            self._curve.data, self._curve.visible = _columns(progress), True
 
 
-def _columns(curve: Sequence[tuple[float, float]]) -> tuple[Any, ...]:
-    """Seconds and dB, each as NumPy's."""
-    return tuple(torch.tensor(column, dtype=torch.float64).numpy() for column in zip(*curve, strict=True))
+def _columns(progress: Progress) -> tuple[Any, ...]:
+    """Seconds, dB of the run and dB of the base, each as NumPy's."""
+    seconds, psnrs = zip(*progress.curve, strict=True)
+    base = [progress.base_db or 0.0] * len(seconds)
+    return tuple(torch.tensor(column, dtype=torch.float64).numpy() for column in (seconds, psnrs, base))
 
 
 def figures(picture: Picture) -> str:

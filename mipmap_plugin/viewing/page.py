@@ -143,8 +143,8 @@ class Page:
     def _draw(self, client: Any, look: Look, screen: Camera, coarse: float) -> None:
         try:
             picture = self._stage.draw(look, screen, coarse)
-        except MipmapPluginError as error:
-            self._controls.figures.content = str(error)
+        except (MipmapPluginError, MemoryError) as error:
+            self._controls.figures.content = str(error) or "out of memory; enlarge pixels, or make the window smaller"
             return
         self._pace.learn(picture.drawn.width * picture.drawn.height, picture.seconds)
         client.scene.set_background_image(_bytes(picture.image), format="png" if coarse == 1 else "jpeg", jpeg_quality=QUALITY)

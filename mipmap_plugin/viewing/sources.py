@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.adapted import Adapted, render_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SceneError
 from mipmap_plugin.levels.manifest import MANIFEST, read_manifest
 from mipmap_plugin.viewing.screen import inside
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -119,14 +119,22 @@ def coarser(effects: Effects, factor: float) -> Effects:
 
 
 def open_source(path: Path, base: Wrapped, backend: str) -> Source:
-    """An adapted file, or the folder of a ladder of levels. Raises CheckpointError, SceneError, and SettingsError for an empty ladder."""
+    """An adapted file, or the folder of a ladder of levels. Raises CheckpointError, and SceneError for a damaged ladder."""
     if not (path / MANIFEST).is_file():
         return File(path.resolve().name, _wrapped(path, base, backend))
-    entries = read_manifest(path).get("levels") or []
-    if not entries:
-        raise SettingsError(f"{path / MANIFEST}: lists no levels; make the ladder again with `mipmap-plugin levels`")
-    files = [File(f"{path.resolve().name}, {entry['file']}", _wrapped(path / entry["file"], base, backend)) for entry in entries]
-    return Levels(path.resolve().name, [(entry["shown_from"] or 0.0, file) for entry, file in zip(entries, files, strict=True)])
+    name = path.resolve().name
+    return Levels(name, [(least, File(f"{name}, {file}", _wrapped(path / file, base, backend))) for least, file in _levels(path)])
+
+
+def _levels(folder: Path) -> list[tuple[float, str]]:
+    """The zoom down to which each level of a ladder is shown, and its file."""
+    try:
+        found = [(float(entry["shown_from"] or 0.0), str(entry["file"])) for entry in read_manifest(folder)["levels"]]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        found = []
+    if not found:
+        raise SceneError(f"{folder / MANIFEST}: lists no levels, or is damaged; make the ladder again with `mipmap-plugin levels`")
+    return found
 
 
 def of_adapted(name: str, adapted: Adapted, base: Wrapped) -> File:
