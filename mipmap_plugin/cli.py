@@ -19,6 +19,7 @@ from mipmap_plugin.commands.inspect import inspect
 from mipmap_plugin.commands.levels import levels
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
+from mipmap_plugin.commands.view import view
 from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.freed_memory import keep_freed_memory
 from mipmap_plugin.limits import is_out_of_memory
@@ -29,7 +30,7 @@ DESCRIPTION = (
 )
 
 app = tyro.extras.SubcommandApp()
-for command in (inspect, adapt, levels, render, evaluate, tradeoff, backends, demo):
+for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends, demo):
     app.command(command)
 
 

@@ -112,7 +112,7 @@ class RenderSettings:
         packing = None if self.packing is None else replace(self.packing, color=None, bands=())
         return replace(self, max_color=None, color_steps=None, packing=packing, picture_step=None)
 
-    def finer(self, n: int) -> RenderSettings:
+    def finer(self, n: float) -> RenderSettings:
         """These settings for an image with n times as many pixels along each axis: areas in px² are scaled by n²."""
         areas = {name: getattr(self, name) * n**2 for name in ("min_variance", "min_contribution", "least_spread")}
         return replace(self, **areas, max_half_axis=self.max_half_axis * n) if self.culls or self.max_half_axis < math.inf else self

@@ -129,7 +129,7 @@ class Wrapped:
         effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(options.get("outputs", ())), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
-        return render_model(self._read_by(viewer), backend, camera, effects, form)
+        return render_model(self.read_by(viewer), backend, camera, effects, form)
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
         """Apply Mip-Splatting's 3D filter. Raises SettingsError without cameras, and for splats that it cannot be applied to."""
@@ -160,7 +160,7 @@ class Wrapped:
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override those of the recipe, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to continue from if it exists; Ctrl-C writes it
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` is called with the model
-        before the first step and after each step.
+        before the first step and after each step; the run ends where it returns True.
         `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
         `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
         Raises SettingsError and BackendUnavailable.
@@ -189,7 +189,7 @@ class Wrapped:
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
         if start is not None and start.scale <= scale:
             raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
-        in_viewer = self._read_by(viewer)
+        in_viewer = self.read_by(viewer)
         base_in_viewer = model if in_viewer is self.model else in_viewer
         if self.images is None or not self.images.are_of(model, backend, self.effects()):
             self.images = BaseImages(model, backend, self.effects())
@@ -236,7 +236,7 @@ class Wrapped:
         """The base with its 3D filter baked into plain splats, for viewers."""
         return cast(Filtered, self.model).fused()
 
-    def _read_by(self, viewer: str | None) -> SplatModel:
+    def read_by(self, viewer: str | None) -> SplatModel:
         """The base as a viewer reads its file: without its 3D filter if the viewer does not read it."""
         reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(name).filter_3d for name in viewers_for(viewer))
         return self.model if reads_all else cast(Filtered, self.model).bare()

@@ -27,6 +27,7 @@ STOREYS = [
     {"levels"},
     {"evaluation", "models.conformance"},
     {"pages", "jobs"},
+    {"viewing"},
     {"demo"},
     {"commands"},
     {"cli"},
@@ -53,6 +54,7 @@ CONFINED = {
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
     "typing_extensions": ["wrapped.py"],
+    "viser": ["viewing/page.py"],
 }
 
 MAX_FILE, MAX_FUNCTION = 300, 60  # lines
@@ -154,7 +156,7 @@ def test_outside_libraries_stay_in_their_modules(path):
 
 def test_importing_the_package_loads_nothing_optional():
     optional = ["numba", "llvmlite", "gsplat", "triton", "matplotlib", "pycolmap", "pytest", "skimage", "tyro"]
-    optional += ["distributed", "spandrel", "safetensors", "lpips", "torchvision"]
+    optional += ["distributed", "spandrel", "safetensors", "lpips", "torchvision", "viser"]
     code = f"import sys, mipmap_plugin; print([name for name in {optional} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"

@@ -186,7 +186,7 @@ def test_a_wrong_command_is_found(parse):
 
 
 def test_there_are_commands_to_check():
-    assert len(COMMANDS) == 8 and {shlex.split(call.text)[1] for call in CALLS} >= set(COMMANDS)
+    assert len(COMMANDS) == 9 and {shlex.split(call.text)[1] for call in CALLS} >= set(COMMANDS)
 
 
 def options() -> set[str]:
@@ -267,6 +267,7 @@ def test_a_wrong_name_is_found():
 # What runs, on the scene that comes along
 
 NOT_RUN = {
+    "view": "serves a page until Ctrl-C; tests/browser/test_live_view.py",
     "demo": "run by .ci/run and tests/test_demo.py",
     "--full": "several minutes; tests/hard has it",
     "NAME": "stands for a name",

@@ -38,8 +38,9 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.progress import announced
 
-# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> None. Its time is not counted.
-Observer = Callable[[int, float, Callable[[Camera], Tensor]], None]
+# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> True to end the run with this
+# step, and anything else to go on. Its time is not counted.
+Observer = Callable[[int, float, Callable[[Camera], Tensor]], object]
 
 
 # A zoom-in is validated against the base's own image, whatever it is adapted to.
@@ -174,10 +175,9 @@ class Session:
             self.seconds["total"] += self.seconds["upsampling"]
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
 
-        def after_step(run: Run) -> None:
+        def after_step(run: Run) -> object:
             keeper.save_if_due(run)
-            if observe is not None:
-                observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
+            return observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
 
         ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
         self.state = keeper.remaining_file()

@@ -29,19 +29,22 @@ INVISIBLE_ERROR = (0.5 / 255) ** 2
 # Number of checks during the warm-up, while the rates rise.
 CHECKS_IN_WARM_UP = 10
 
+# What ends a run whose observer returns True.
+STOPPED = "its observer"
 
-def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], None] = lambda run: None) -> str:
+
+def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], object] = lambda run: None) -> str:
     """Optimize `run.student` in place until its steps, budget, target or patience end the run; return which of them did.
 
     `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise. `observe` is called before the first
-    step and after each step; its time is not counted.
+    step and after each step; its time is not counted, and the run ends if it returns True.
     """
     order, cameras = ViewSchedule(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
     forecast, began = Forecast(order, config, lambda step: is_checked(step, config), run.step), run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
     with bar, interruptible() as interrupted:
-        observe(run)
-        while (reason := reason_to_stop(run.curve, run.watch.seconds, config)) is None and run.step < config.steps:
+        reason = STOPPED if observe(run) is True else reason_to_stop(run.curve, run.watch.seconds, config)
+        while reason is None and run.step < config.steps:
             with run.watch:
                 _step(run, task, config, order(run.step, run.progress(config)), cameras)
                 if is_checked(run.step, config):
@@ -50,7 +53,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             bar.update()
             if run.curve[-1].step == run.step:
                 bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
-            observe(run)
+            reason = STOPPED if observe(run) is True else reason_to_stop(run.curve, run.watch.seconds, config)
             if interrupted():
                 on_interrupt(run)
         with run.watch:

@@ -1,0 +1,119 @@
+"""`mipmap-plugin view`."""
+
+from __future__ import annotations
+
+import os
+import sys
+import webbrowser
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from mipmap_plugin.commands.common import wrap
+from mipmap_plugin.commands.outputs import adapted_path
+from mipmap_plugin.commands.types import Background, Checkpoint, ScreenFilter
+from mipmap_plugin.commands.voice import say
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.progress import announced
+
+if TYPE_CHECKING:
+    from mipmap_plugin.viewing.page import Page, PageSettings
+    from mipmap_plugin.wrap import Wrapped
+
+# The variables that say where windows are shown; elsewhere than on Linux there is a display.
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+
+
+def view(
+    checkpoint: Checkpoint,
+    adapted: tyro.conf.Positional[tuple[Path, ...]] = (),
+    viewer: str | None = None,
+    output: Path | None = None,
+    cameras: Path | None = None,
+    background: Background | None = None,
+    screen_filter: ScreenFilter | None = None,
+    backend: str = "auto",
+    threads: int | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    browser: bool = True,
+) -> None:
+    """Show a checkpoint in the browser at any zoom, beside adapted files and levels, and adapt it for what is on the screen.
+
+    Args:
+        checkpoint: A PLY or a model folder: the base.
+        adapted: Files adapted from it, and folders of levels, to switch to.
+        viewer: Viewer whose drawing is shown first: classic, spark, playcanvas (or supersplat), ... An unknown name lists all viewers.
+        output: Folder for what the page's button saves; by default beside the checkpoint. Nothing is overwritten.
+        cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
+        background: Of the scene; by default that of the checkpoint, or else black.
+        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
+        backend: Name of a backend; auto chooses the fastest one that can serve the request.
+        threads: Maximum number of processor threads; by default as many as torch finds.
+        host: Address that the page is served at. Whoever reaches it can use the page; the default is this machine alone.
+        port: Port of the page; where it is taken, the next free one.
+        browser: Also open the page, where there is a display.
+    """
+    from mipmap_plugin import threads as all_threads
+    from mipmap_plugin.viewing.page import PageSettings
+
+    if not 0 <= port <= 65535:
+        raise SettingsError(f"port: must be from 0 to 65535, got {port}")
+    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    if viewer is not None:
+        wrapped.target(viewer)  # raises before any work
+    with all_threads.limited(threads, shared=False):
+        name = checkpoint.resolve().name
+        page = _page(wrapped, adapted, backend, PageSettings(host, port, name, *_choices(wrapped, viewer), _free(checkpoint, output)))
+        try:
+            say(f"{page.address} shows {name}; Ctrl-C ends it")
+            if browser and has_display():
+                webbrowser.open(page.address)
+            page.run()
+        except KeyboardInterrupt:
+            say("ended")
+        finally:
+            page.close()
+
+
+def _page(wrapped: Wrapped, adapted: tuple[Path, ...], backend: str, settings: PageSettings) -> Page:
+    from mipmap_plugin.viewing.page import Page
+    from mipmap_plugin.viewing.sources import File, Supersampled, open_source
+    from mipmap_plugin.viewing.stage import Stage
+
+    others = []
+    for path in adapted:
+        with announced(f"reading {path.name}"):
+            others.append(open_source(path, wrapped, backend))
+    base = File("base", wrapped)
+    return Page(Stage(wrapped, [base, *others], Supersampled("base, supersampled", wrapped)), base, settings)
+
+
+def _choices(wrapped: Wrapped, viewer: str | None) -> tuple[list[str | None], list[str]]:
+    """The viewers and the recipes that the page offers, what is asked for first."""
+    from mipmap_plugin.models.base import why_no_viewer
+    from mipmap_plugin.recipes import RECIPES
+    from mipmap_plugin.splatting.viewers import VIEWERS, viewers_for
+
+    single = [] if why_no_viewer(wrapped.model) else [name for name in VIEWERS.names() if viewers_for(name) == (name,)]
+    return list(dict.fromkeys((viewer, None, *single))), list(dict.fromkeys(("default", *RECIPES.names())))
+
+
+def _free(checkpoint: Path, output: Path | None) -> Callable[[float, str | None], Path]:
+    """A function that names the file of an adaptation by its scale and viewer, with a number where there is such a file already."""
+
+    def path(scale: float, viewer: str | None) -> Path:
+        usual = adapted_path(checkpoint, None, scale, viewer, several=False)
+        head, made_for, suffix = usual.name.rpartition(f"_x{scale:g}{f'_{viewer}' if viewer else ''}")
+        names = (f"{head}{made_for}{f'_{number}' if number > 1 else ''}{suffix}" for number in count(1))
+        return next(each for each in (Path(output or usual.parent, name) for name in names) if not os.path.lexists(each))
+
+    return path
+
+
+def has_display() -> bool:
+    """Whether there is a display that a browser can open a window on."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in DISPLAYS)

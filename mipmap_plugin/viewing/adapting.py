@@ -1,0 +1,189 @@
+"""Adapts for what is on a screen in a thread of its own, shows each state on request, and can be stopped."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.viewing.around import views_for_screen
+from mipmap_plugin.viewing.sources import File, Request, Supersampled
+from mipmap_plugin.wrap import Wrapped
+
+# Seconds between two points of the curve, and that somebody waits for the picture of a run that may just be doing something else.
+MEASURED_EVERY_S, PATIENCE_S = 0.7, 1.5
+
+# px: the screen's picture is measured on at most this many, around its middle.
+MEASURED_PIXELS = 200_000
+
+# Fewer than usual, because somebody is waiting.
+VALIDATION_VIEWS = 10
+
+# A zoom that differs from x1 by less is x1.
+SAME_ZOOM = 0.03
+
+# Seconds that a run may take to end when the program does.
+GRACE_S = 10.0
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What to adapt for."""
+
+    screen: Camera  # of the new scale
+    look_at: tuple[float, ...]  # the point that the eye turns around, world units
+    zoom: float  # of the screen, relative to the training
+    viewer: str | None
+    seconds: float  # at most
+    recipe: str = "default"
+
+    @property
+    def scale(self) -> float:
+        """The scale of the file: the zoom, rounded."""
+        return 1.0 if abs(math.log(self.zoom)) < SAME_ZOOM else float(f"{self.zoom:.3g}")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is."""
+
+    wish: Wish | None = None  # None: nothing was adapted yet
+    running: bool = False
+    step: int = 0
+    curve: tuple[tuple[float, float], ...] = ()  # seconds of adapting, dB of the screen's picture against the supersampled base
+    base_db: float | None = None  # of the base as the viewer draws it; None: not measured yet
+    adapted: Adapted | None = None
+    trouble: str = ""  # why there is none, in a sentence
+
+
+class Adapter:
+    """One run at a time. The base never changes."""
+
+    def __init__(self, base: Wrapped, reference: Supersampled, changed: Callable[[], None] = lambda: None) -> None:
+        """`changed` is called, in the thread of the run, whenever `progress` is new."""
+        self._base, self._reference, self._shown, self._changed = base, reference, File("base", base), changed
+        self.progress = Progress()
+        self._thread: threading.Thread | None = None
+        self._warm = set[str | None]()  # the viewers that were adapted for before
+        self._stopping = threading.Event()
+        self._asked: Camera | None = None  # whose picture somebody waits for
+        self._answer: Tensor | None = None
+        self._talk = threading.Condition()  # guards these two
+
+    def start(self, wish: Wish, then: Callable[[], None] = lambda: None) -> None:
+        """Begin a run, and call `then` in its thread when it has ended. Raises SettingsError while one is running."""
+        if self.progress.running:
+            raise SettingsError("an adaptation is running; stop it first")
+        self._stopping.clear()
+        self._answer = None
+        self.progress = Progress(wish, running=True)
+        self._thread = threading.Thread(target=self._run, args=(wish, then), name="adapting", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the run after its next step; what it then returns is the best of its states, as always."""
+        self._stopping.set()
+
+    def close(self) -> None:
+        """End the run, and wait for it for a while."""
+        self.stop()
+        if self._thread is not None:
+            self._thread.join(GRACE_S)
+
+    def picture(self, camera: Camera) -> Tensor | None:
+        """What a camera of the new scale sees of the run's state, [H, W, 3]; the last such picture while no step is taken, None before any."""
+        with self._talk:
+            self._asked = camera
+            self._talk.wait_for(lambda: self._asked is not camera or not self.progress.running, PATIENCE_S)
+            return self._answer
+
+    def _run(self, wish: Wish, then: Callable[[], None]) -> None:
+        try:
+            self._set(adapted=self._adapt(wish), running=False)
+        except (MipmapPluginError, MemoryError) as error:
+            self._set(trouble=str(error) or "out of memory", running=False)
+        except Exception as error:
+            self._set(trouble=f"{type(error).__name__}: {error}", running=False)
+            raise
+        finally:
+            with self._talk:
+                self._talk.notify_all()
+            then()
+
+    def _adapt(self, wish: Wish) -> Adapted:
+        views = views_for_screen(self._base, wish.screen, torch.tensor(wish.look_at, dtype=torch.float64), wish.scale)
+        options: dict[str, Any] = {"recipe": wish.recipe, "viewer": wish.viewer, "views": "given", "validation_views": VALIDATION_VIEWS}
+        if wish.viewer not in self._warm:  # one step, so that the time to compile kernels for this viewer is not that of the run
+            self._base.adapt(wish.scale, cameras=views[:1], steps=1, **options)
+            self._warm.add(wish.viewer)
+        return self._base.adapt(wish.scale, cameras=views, observe=self._observer(wish), time_budget_s=wish.seconds, **options)
+
+    def _observer(self, wish: Wish) -> Callable[[int, float, Callable[[Camera], Tensor]], bool]:
+        """Looks at the run after each step: answers who waits for a picture, and now and then measures that of the screen."""
+        side = math.sqrt(min(1.0, MEASURED_PIXELS / (wish.screen.width * wish.screen.height)))
+        judged = wish.screen.window(max(1, int(side * wish.screen.width)), max(1, int(side * wish.screen.height)))
+        request = Request(judged, wish.zoom, wish.viewer)
+        truth, measured = self._reference.render(request).clamp(0, 1), -math.inf
+        self._set(base_db=psnr(self._shown.render(request), truth))
+
+        @torch.no_grad()
+        def observe(step: int, seconds: float, render: Callable[[Camera], Tensor]) -> bool:
+            nonlocal measured
+            self._answer_with(render)
+            if step == 0 or time.monotonic() - measured > MEASURED_EVERY_S:
+                self._set(step=step, curve=(*self.progress.curve, (seconds, psnr(render(judged), truth))))
+                measured = time.monotonic()
+            return self._stopping.is_set()
+
+        return observe
+
+    def _answer_with(self, render: Callable[[Camera], Tensor]) -> None:
+        camera = self._asked
+        if camera is None:
+            return
+        answer = render(camera)
+        with self._talk:
+            self._answer = answer
+            if self._asked is camera:
+                self._asked = None
+            self._talk.notify_all()
+
+    def _set(self, **changes: object) -> None:
+        self.progress = replace(self.progress, **changes)  # type: ignore[arg-type]  # mypy does not check these names
+        self._changed()
+
+
+def psnr(image: Tensor, truth: Tensor) -> float:
+    """PSNR (dB) of an image as a display shows it."""
+    return decibel(float((image.clamp(0, 1) - truth).square().mean()))
+
+
+class Live:
+    """The state of a run, as something that can be shown; the base while there is none."""
+
+    name = "adapting"
+
+    def __init__(self, adapter: Adapter, base: File) -> None:
+        self._adapter, self._base = adapter, base
+
+    def render(self, request: Request) -> Tensor:
+        """The picture, [H, W, 3], as the viewer draws it that the run is for."""
+        image = self._adapter.picture(request.camera) if self._adapter.progress.running else None
+        return image if image is not None and image.shape[:2] == request.camera.size else self._base.render(request)
+
+    def shown(self, zoom: float) -> str:
+        """The step."""
+        return f"adapting, step {self._adapter.progress.step}"
+
+    def splats(self, request: Request) -> None:
+        """Not known while a run changes them."""

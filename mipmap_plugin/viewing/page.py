@@ -1,0 +1,262 @@
+"""The live view in a browser (extra `view`): viser serves the page, and this draws what its cameras see."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.viewing.adapting import Adapter, Live, Wish
+from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, Controls
+from mipmap_plugin.viewing.pace import STILL_S, Pace
+from mipmap_plugin.viewing.screen import Pose, pose_of, up_of, zoomed_by_distance, zoomed_by_lens
+from mipmap_plugin.viewing.sources import File, of_adapted
+from mipmap_plugin.viewing.stage import Look, Stage, smaller
+
+NO_VISER = "the live view needs viser: pip install 'mipmap-plugin[view]'"
+
+# Of JPEG, while the camera moves; pictures that stay are PNGs, whose pixels are exact.
+QUALITY = 80
+
+# Seconds between two looks at what has changed, if nothing tells of a change; and after which the slider of zooms, once a hand has left
+# it, follows the picture again.
+PERIOD_S, HANDS_OFF_S = 0.05, 1.0
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """What the page offers, and where it is served."""
+
+    host: str
+    port: int  # the first that is tried
+    title: str
+    viewers: Sequence[str | None]  # the chosen one first
+    recipes: Sequence[str]
+    output: Callable[[float, str | None], Path]  # scale and viewer of an adapted file -> a path that is free
+
+
+@dataclass
+class _Seen:
+    """What a browser shows."""
+
+    view: tuple[Pose, int, int]  # with the width and height of its canvas, px
+    look: Look
+    version: int
+    since: float  # when the camera last moved
+    whole: bool  # the picture has all its pixels
+
+
+class Page:
+    """The page of one scene. Raises SettingsError without viser, or for an address that cannot be served."""
+
+    def __init__(self, stage: Stage, base: File, settings: PageSettings) -> None:
+        """`base`: the base, which is shown while a run has no state yet."""
+        self._stage, self._settings, self._pace = stage, settings, Pace()
+        self._changed, self._version = threading.Event(), 0
+        self._sliding, self._slid = threading.Lock(), 0.0  # one movement of the slider after the other; when the last one was
+        self._seen: dict[int, _Seen] = {}
+        self.adapter = Adapter(stage.base, stage.reference, self._progressed)
+        self._live = stage.add(Live(self.adapter, base))
+        self._views = {view.name or f"view {number}": view for number, view in enumerate(stage.base.views())}
+        self._server = _server(settings.host, settings.port)
+        self._prepare()
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"http://{self._settings.host}:{self._server.get_port()}"
+
+    def run(self) -> None:
+        """Draw until Ctrl-C."""
+        while True:
+            self._changed.wait(PERIOD_S)
+            self._changed.clear()
+            for number, client in self._server.get_clients().items():
+                self._serve(number, client)
+
+    def close(self) -> None:
+        """End a run that is adapting, and the server."""
+        self.adapter.close()
+        with _without_words():
+            self._server.stop()
+
+    def _prepare(self) -> None:
+        """Fill the panel, and say where a browser's camera begins."""
+        server, settings = self._server, self._settings
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        server.gui.set_panel_label(settings.title)
+        server.gui.main_panel.dock_right()  # beside the picture, not on it
+        viewers = [viewer or AS_TRAINED for viewer in settings.viewers]
+        self._controls = Controls(server.gui, self._names(), viewers, list(self._views), settings.recipes)
+        first = self._pose(next(iter(self._views.values())))
+        server.scene.set_up_direction(up_of(list(self._views.values())))
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.fov = first.position, first.look_at, first.fov
+        server.on_client_connect(self._connected)
+        controls = self._controls
+        for element in (controls.source, controls.against, controls.viewer, controls.pixel):
+            element.on_update(lambda _: self._changed.set())
+        controls.zoom.on_update(self._zoom)
+        controls.view.on_update(self._go)
+        controls.adapt.on_click(self._adapt)
+        controls.stop.on_click(self._stop)
+        controls.save.on_click(self._save)
+
+    def _names(self) -> list[str]:
+        """What can be shown now."""
+        return [name for name in self._stage.sources if name != self._live or self.adapter.progress.running]
+
+    def _connected(self, client: Any) -> None:
+        client.camera.max_orbit_distance = float("inf")
+        client.camera.on_update(lambda _: self._changed.set())
+        self._changed.set()
+
+    def _pose(self, view: Camera) -> Pose:
+        return pose_of(view, self._stage.sampling.of(view).depth)
+
+    def _serve(self, number: int, client: Any) -> None:
+        """Draw what a browser's camera sees, if that is something new: coarsely while it moves, in full once it is still."""
+        view, look, now, seen = _view(client), self._controls.look(), time.monotonic(), self._seen.get(number)
+        moved = seen is None or seen.view != view
+        version = self._version
+        if seen is not None and not moved and seen.whole and (seen.look, seen.version) == (look, version):
+            return
+        since = now if seen is None or moved else seen.since
+        pose, width, height = view
+        coarse = self._pace.fraction(width * height // look.pixel**2) if now - since < STILL_S else 1.0
+        if seen is not None and not moved and coarse < 1 and (seen.look, seen.version) == (look, version):
+            return
+        self._seen[number] = _Seen(view, look, version, since, coarse == 1)
+        self._draw(client, look, pose.camera(width, height), coarse)
+
+    def _draw(self, client: Any, look: Look, screen: Camera, coarse: float) -> None:
+        try:
+            picture = self._stage.draw(look, screen, coarse)
+        except (MipmapPluginError, MemoryError) as error:
+            self._controls.figures.content = str(error) or "out of memory; enlarge pixels, or make the window smaller"
+            return
+        self._pace.learn(picture.drawn.width * picture.drawn.height, picture.seconds)
+        client.scene.set_background_image(_bytes(picture.image), format="png" if coarse == 1 else "jpeg", jpeg_quality=QUALITY)
+        if coarse == 1:
+            self._controls.tell_picture(picture, follow=time.monotonic() - self._slid > HANDS_OFF_S)
+
+    def _zoom(self, event: Any) -> None:
+        """Move the camera whose slider was moved by hand."""
+        if event.client is None:
+            return
+        with self._sliding:
+            self._slid = time.monotonic()
+            pose, width, height = _view(event.client)
+            look, zoom = self._controls.look(), 2.0**self._controls.zoom.value
+            screen = smaller(pose.camera(width, height), 1 / look.pixel)
+            if self._controls.by.value == DISTANCE:
+                _move(event.client, zoomed_by_distance(pose, zoom, self._stage.sampling, screen.size))
+            else:
+                _move(event.client, zoomed_by_lens(pose, zoom / self._stage.sampling.of(screen).zoom))
+
+    def _go(self, event: Any) -> None:
+        """Move the camera to a view of the scene."""
+        if event.client is not None:
+            _move(event.client, self._pose(self._views[self._controls.view.value]))
+
+    def _adapt(self, event: Any) -> None:
+        """Adapt for what is on the screen of the browser whose button was pressed."""
+        if event.client is None or self.adapter.progress.running:
+            return
+        (pose, width, height), look = _view(event.client), self._controls.look()
+        screen = smaller(pose.camera(width, height), 1 / look.pixel)
+        zoom = self._stage.sampling.of(screen).zoom
+        wish = Wish(screen, pose.look_at, zoom, look.viewer, self._controls.seconds.value, self._controls.recipe.value)
+        self.adapter.start(wish, self._ended)
+        self._controls.offer(self._names(), self._live)
+        self._progressed()
+
+    def _stop(self, _: Any) -> None:
+        self.adapter.stop()
+        self._controls.told.content = "stopping after the next step ..."
+
+    def _progressed(self) -> None:
+        """In the thread of a run: there is something new to tell and to draw."""
+        self._controls.tell_progress(self.adapter.progress)
+        self._version += 1
+        self._changed.set()
+
+    def _ended(self) -> None:
+        """In the thread of a run: show what it returned, or else the base."""
+        progress = self.adapter.progress
+        shown = self._names()[0]
+        if progress.adapted is not None and progress.wish is not None:
+            name = f"adapted ×{progress.wish.scale:g}{f' for {progress.wish.viewer}' if progress.wish.viewer else ''}"
+            shown = self._stage.add(of_adapted(name, progress.adapted, self._stage.base))
+        self._controls.offer(self._names(), shown)
+        self._progressed()
+
+    def _save(self, _: Any) -> None:
+        adapted = self.adapter.progress.adapted
+        if adapted is None:
+            return
+        try:
+            saved = adapted.save(self._settings.output(adapted.report.scale, adapted.report.viewer))
+        except MipmapPluginError as error:
+            self._controls.told.content = str(error)
+        else:
+            self._controls.told.content = f"saved: {saved}"
+            self._controls.save.disabled = True
+
+
+def _server(host: str, port: int) -> Any:
+    """viser's server at the first free port from `port` on. Raises SettingsError."""
+    try:
+        import viser
+    except ImportError as error:
+        raise SettingsError(NO_VISER) from error
+    _check_address(host, port)
+    with _without_words():
+        return viser.ViserServer(host=host, port=port, verbose=False)
+
+
+def _without_words() -> contextlib.AbstractContextManager[Any]:
+    """viser prints that it starts and stops, quiet or not; what is to be said is said by the command."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def _check_address(host: str, port: int) -> None:
+    """Raise SettingsError for an address that cannot be served; viser itself would wait forever. A port that is taken is no such thing."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except (OSError, OverflowError, UnicodeError) as error:
+        if getattr(error, "errno", None) != errno.EADDRINUSE:
+            raise SettingsError(f"nothing can be served at {host}, port {port} ({error}); give --host 127.0.0.1 and a --port above 1023") from error
+
+
+def _view(client: Any) -> tuple[Pose, int, int]:
+    """The pose of a browser's camera, and the width and height of its canvas in px."""
+    camera = client.camera
+    wxyz, position, look_at = (tuple(map(float, each)) for each in (camera.wxyz, camera.position, camera.look_at))
+    return Pose(wxyz, position, look_at, float(camera.fov)), max(1, camera.image_width), max(1, camera.image_height)
+
+
+def _move(client: Any, pose: Pose) -> None:
+    """Move a browser's camera; what is upwards in its picture stays the scene's."""
+    with client.atomic():
+        client.camera.position = pose.position
+        client.camera.look_at = pose.look_at
+        client.camera.fov = pose.fov
+
+
+def _bytes(image: Tensor) -> Any:
+    """An image [H, W, 3] in 0..1 as NumPy's 8 bits."""
+    return (255 * image).round().byte().cpu().numpy()

@@ -1,0 +1,182 @@
+"""The live view in a real browser: it shows the scene, zooms, switches, adapts and saves, and Ctrl-C ends it."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import FLAGS
+from live import WINDOW, LivePage, embedded, missing, serving
+from PIL import Image
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.viewing.screen import Sampling, pose_of
+from mipmap_plugin.wrap import Wrapped
+
+pytestmark = pytest.mark.browser
+
+# dB between a screenshot and what is drawn for it: WebGL puts the picture on the canvas, which may be shifted by parts of a pixel.
+SAME_PICTURE_DB = 25.0
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Wrapped:
+    if lacking := missing():
+        pytest.skip(lacking)
+    return wrap_model(embedded(tmp_path_factory.mktemp("view") / "demo"))
+
+
+@pytest.fixture(scope="module")
+def others(base: Wrapped) -> list[Path]:
+    """A file adapted to x1/4, and a ladder of two levels."""
+    folder = base.model.folder.parent
+    adapted = base.adapt(1 / 4, recipe="instant").save(folder / "quarter.ply")
+    ladder = folder / "ladder"
+    ladder.mkdir()
+    for name in ("level_0.ply", "level_1.ply"):
+        shutil.copy(adapted, ladder / name)
+    levels = [{"file": "level_0.ply", "shown_from": 0.7}, {"file": "level_1.ply", "shown_from": None}]
+    (ladder / "levels.json").write_text(json.dumps({"levels": levels}))
+    return [adapted, ladder]
+
+
+@pytest.fixture(scope="module")
+def page(base: Wrapped, others: list[Path]) -> Iterator[LivePage]:
+    """The page, which all tests use in turn; fails at the end if it had an error or asked for anything from elsewhere."""
+    from playwright.sync_api import sync_playwright
+
+    complaints: list[str] = []
+    with serving([base.model.folder, *others]) as (_, address), sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox", *FLAGS])
+        tab = chromium.new_page(viewport=WINDOW)
+        tab.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+        tab.on("pageerror", lambda error: complaints.append(str(error)))
+        tab.on("request", lambda asked: complaints.append(asked.url) if not asked.url.startswith((address, "data:", "blob:")) else None)
+        yield LivePage(tab, address)
+        chromium.close()
+    assert complaints == []
+
+
+def image(png: bytes) -> torch.Tensor:
+    return torch.from_numpy(np.array(Image.open(io.BytesIO(png)).convert("RGB"), dtype=np.float32) / 255)
+
+
+def expected(base: Wrapped, shown: torch.Tensor, view: int) -> torch.Tensor:
+    """The base as our own backend draws it from a view, in as many pixels."""
+    camera = base.cameras[view]
+    pose = pose_of(camera, Sampling(base.model.parameters()["means"], base.cameras).of(camera).depth)
+    return base.render(pose.camera(shown.shape[1], shown.shape[0])).image
+
+
+def test_the_page_shows_the_scene(page: LivePage, base: Wrapped) -> None:
+    shown = image(page.still())
+    assert psnr(shown, expected(base, shown, 0)) > SAME_PICTURE_DB
+    assert f"{shown.shape[1]} × {shown.shape[0]} px" in page.text() and "12,000 of 12,000 splats" in page.text()
+
+
+def test_a_view_of_the_scene_is_gone_to(page: LivePage, base: Wrapped) -> None:
+    page.choose("Go to view", base.cameras[2].name)
+    shown = image(page.still())
+    assert psnr(shown, expected(base, shown, 2)) > SAME_PICTURE_DB > psnr(shown, expected(base, shown, 0))
+
+
+def test_dragging_orbits(page: LivePage) -> None:
+    before, box = page.still(), page.box()
+    page.page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.page.mouse.down()
+    page.page.mouse.move(box["x"] + box["width"] / 2 + 120, box["y"] + box["height"] / 2, steps=5)
+    page.page.mouse.up()
+    assert page.still() != before
+
+
+def test_keys_fly(page: LivePage) -> None:
+    before, zoom = page.still(), page.zoom()
+    page.page.mouse.click(20, 20)  # the picture, not the panel, hears the keys
+    page.page.keyboard.down("KeyS")
+    page.page.wait_for_timeout(500)
+    page.page.keyboard.up("KeyS")
+    assert page.still() != before and page.zoom() < zoom
+
+
+@pytest.mark.parametrize("by", ["distance", "focal length"])
+def test_the_slider_zooms(page: LivePage, by: str) -> None:
+    before, zoom = page.still(), page.zoom()
+    page.choose("Zoom by", by)
+    page.slide(-10)  # tenths of a power of two
+    assert page.still() != before and page.zoom() == pytest.approx(zoom / 2, rel=0.1)
+    page.slide(10)
+    page.still()
+    assert page.zoom() == pytest.approx(zoom, rel=0.1)
+
+
+def test_what_is_shown_is_switched(page: LivePage) -> None:
+    base = page.still()
+    page.choose("Show", "quarter.ply")
+    page.wait_for("· quarter.ply")
+    adapted = page.still()
+    page.choose("Show", "ladder")
+    page.wait_for("· ladder, level_0.ply")
+    page.choose("Show", "base, supersampled")
+    page.wait_for("· base, supersampled")
+    page.choose("Show", "base")
+    page.choose("Drawn by", "antimatter15")
+    viewer = page.still()
+    page.choose("Drawn by", "as trained")
+    page.choose("Difference from", "quarter.ply")
+    page.wait_for("dB apart")
+    difference = page.still()
+    page.choose("Difference from", "nothing")
+    assert len({base, adapted, viewer, difference}) == 4 and page.still() == base
+
+
+def test_pixels_are_enlarged_and_levels_follow_the_zoom(page: LivePage) -> None:
+    zoom = page.zoom()
+    page.choose("Enlarge pixels", "8")
+    page.choose("Show", "ladder")
+    page.wait_for("· ladder, level_1.ply")
+    page.still()
+    assert page.zoom() == pytest.approx(zoom / 8, rel=0.05)
+    page.choose("Show", "base")
+
+
+def test_the_screen_is_adapted_for_with_a_curve_and_saved(page: LivePage, base: Wrapped) -> None:
+    source = base.model.source.read_bytes()
+    assert page.page.locator(".uplot").count() == 0 and page.page.get_by_role("button", name="Save", exact=True).is_disabled()
+    page.page.get_by_label("Seconds", exact=True).fill("6")
+    page.page.keyboard.press("Enter")
+    page.press("Adapt for this picture")
+    page.wait_for(r"· adapting, step")
+    done = page.wait_for("dB on views that nothing was adapted to")
+    page.wait_for("· adapted ×")
+    page.page.locator(".uplot").wait_for()
+    before, after = (float(part) for part in done.split(": ")[1].split(" dB")[0].split(" → "))
+    assert after >= before
+    page.press("Save")
+    saved = Path(page.wait_for("saved: ").split("saved: ")[1])
+    assert saved.relative_to(base.model.folder.parent).parts[0].startswith("demo_x")
+    assert len(wrap_model(saved).model.parameters()["means"]) > 0 and base.model.source.read_bytes() == source
+
+
+def test_a_run_is_stopped(page: LivePage) -> None:
+    page.page.get_by_label("Seconds", exact=True).fill("600")
+    page.page.keyboard.press("Enter")
+    page.press("Adapt for this picture")
+    page.wait_for(r": step \d")
+    page.press("Stop")
+    page.wait_for("dB on views that nothing was adapted to")
+    assert page.page.get_by_role("button", name="Stop", exact=True).is_disabled()
+
+
+def test_ctrl_c_ends_it(base: Wrapped) -> None:
+    with serving([base.model.folder]) as (process, _):
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=60)
+        assert process.returncode == 0 and said.splitlines()[-1] == "ended"

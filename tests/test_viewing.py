@@ -1,0 +1,350 @@
+"""The live view without a browser: cameras, pictures, and an adaptation that is watched and stopped."""
+
+import hashlib
+import json
+import math
+import sys
+import threading
+from dataclasses import replace
+
+import anchor_checkpoints
+import mip_checkpoints
+import moving
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.cli import main
+from mipmap_plugin.commands.view import _free, has_display
+from mipmap_plugin.errors import SceneError, SettingsError
+from mipmap_plugin.models.base import why_no_viewer
+from mipmap_plugin.viewing import adapting
+from mipmap_plugin.viewing.adapting import Adapter, Live, Progress, Wish
+from mipmap_plugin.viewing.around import BASE_PIXELS, NEAR, PIXELS, views_for_screen
+from mipmap_plugin.viewing.controls import figures, words
+from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
+from mipmap_plugin.viewing.page import NO_VISER, _check_address
+from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, inside, pose_of, up_of, zoomed_by_distance, zoomed_by_lens
+from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
+from mipmap_plugin.viewing.stage import AMPLIFIED, Look, Stage
+
+SIZE = (48, 64)  # height, width
+
+
+@pytest.fixture
+def base():
+    return wrap_model(tiny.model(), cameras=tiny.cameras(4), backend="reference")
+
+
+@pytest.fixture
+def stage(base):
+    return Stage(base, [File("base", base)], Supersampled("supersampled", base))
+
+
+@pytest.fixture
+def sampling(base):
+    return Sampling(base.model.parameters()["means"], base.views())
+
+
+@pytest.fixture
+def screen(base):
+    return base.cameras[0].resized(SIZE[1], SIZE[0])
+
+
+# Cameras
+
+
+def test_a_pose_gives_back_its_camera(base):
+    view = base.cameras[1]
+    pose = pose_of(view, depth=2.0)
+    camera = pose.camera(view.width, view.height)
+    assert torch.allclose(camera.viewmat, view.viewmat) and camera.fy == pytest.approx(view.fy)
+    middle = camera.to_camera(torch.tensor([pose.look_at], dtype=torch.float64))[0]
+    assert torch.allclose(middle, torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
+
+
+def test_a_view_of_the_training_is_at_zoom_1_and_fewer_pixels_at_less(base, sampling):
+    zooms = [sampling.of(view).zoom for view in base.cameras]
+    assert min(zooms) == pytest.approx(1, abs=0.25) and max(zooms) == pytest.approx(1, abs=0.25)
+    view = base.cameras[0]
+    assert sampling.of(view.zoomed(1 / 4)).zoom == pytest.approx(sampling.of(view).zoom / 4)
+    assert sampling.of(view).splats == int(inside(sampling.means, view).sum()) > 0
+
+
+def test_a_camera_that_sees_nothing_has_a_zoom(sampling, base):
+    away = pose_of(base.cameras[0], 1.0)
+    away = replace(away, position=(100.0, 100.0, 100.0))
+    assert sampling.of(away.camera(8, 8)).splats == 0 and sampling.of(away.camera(8, 8)).zoom == 1
+    assert zoomed_by_distance(away, 0.25, sampling, (8, 8)) == away
+
+
+@pytest.mark.parametrize("zoom", [1 / 8, 1 / 2, 1.5])
+def test_zooming_by_distance_moves_the_eye_to_that_zoom(base, sampling, zoom):
+    before = pose_of(base.cameras[0], sampling.of(base.cameras[0]).depth)
+    after = zoomed_by_distance(before, zoom, sampling, SIZE)
+    assert sampling.of(after.camera(SIZE[1], SIZE[0])).zoom == pytest.approx(zoom, rel=0.05)
+    assert (after.look_at, after.wxyz, after.fov) == (before.look_at, before.wxyz, before.fov)
+
+
+def test_zooming_by_focal_length_changes_the_lens_alone(base):
+    before = pose_of(base.cameras[0], 2.0)
+    after = zoomed_by_lens(before, 2.0)
+    assert after.camera(64, 48).fy == pytest.approx(2 * before.camera(64, 48).fy) and after.position == before.position
+    assert zoomed_by_lens(before, 1e-3).fov == LARGEST_FOV
+
+
+def test_up_is_what_the_views_have_in_common(base):
+    assert torch.tensor(up_of(base.cameras)).dot(torch.tensor([0.0, 0.0, 1.0])) > 0.8
+
+
+# Pictures
+
+
+def test_the_base_is_drawn_as_render_draws_it(stage, base, screen):
+    assert torch.equal(stage.draw(Look("base"), screen).image, base.render(screen).image.clamp(0, 1))
+    spark = stage.draw(Look("base", viewer="spark"), screen)
+    assert torch.equal(spark.image, base.render(screen, viewer="spark").image.clamp(0, 1))
+    assert spark.splats == (int(inside(base.model.parameters()["means"], screen).sum()), 60) and spark.psnr_db is None
+
+
+@pytest.mark.parametrize("viewer", [None, "classic", "playcanvas"])
+def test_a_coarse_picture_looks_like_the_whole_one(stage, base, screen, viewer):
+    """Fewer pixels alone would show thicker splats."""
+    whole, coarse = (stage.draw(Look("base", viewer=viewer), screen, fraction).image for fraction in (1.0, 0.25))
+    small = screen.resized(SIZE[1] // 4, SIZE[0] // 4)
+    assert coarse.shape[:2] == small.size
+    shrunk, plain = resize(whole, small.size, "box"), base.render(small, viewer=viewer).image.clamp(0, 1)
+    assert (coarse - shrunk).square().mean() < 0.6 * (plain - shrunk).square().mean()
+
+
+def test_pixels_are_enlarged_whole(stage, base, screen):
+    odd = screen.resized(67, 50)
+    picture = stage.draw(Look("base", pixel=4), odd)
+    assert picture.image.shape == (50, 67, 3) and (picture.drawn.height, picture.drawn.width) == (12, 17)
+    assert torch.equal(picture.image[0:4, 0:4], picture.image[:1, :1].expand(4, 4, 3))
+    assert picture.zoom == pytest.approx(stage.draw(Look("base"), odd).zoom / 4, rel=0.05)
+
+
+def test_a_difference_is_amplified_and_measured(stage, screen):
+    same = stage.draw(Look("base", against="base"), screen)
+    assert same.image.abs().max() == 0 and same.psnr_db > 100
+    base, supersampled = (stage.draw(Look(name), screen).image for name in ("base", "supersampled"))
+    apart = stage.draw(Look("base", against="supersampled"), screen)
+    assert torch.allclose(apart.image, (AMPLIFIED * (base - supersampled).abs()).clamp(0, 1))
+    assert apart.psnr_db == pytest.approx(-10 * math.log10((base - supersampled).square().mean()), abs=0.01)
+
+
+def test_the_supersampled_base_is_the_mean_of_the_look_that_was_trained(base, screen):
+    small = screen.zoomed(1 / 8)
+    image = Supersampled("s", base).render(Request(small, 1 / 4))
+    fine = base.render(small.resized(small.width * 4, small.height * 4), 1.0, "scaled").image.clamp(0, 1)
+    assert torch.allclose(image, resize(fine, small.size, "box"))
+
+
+@pytest.mark.parametrize("write", [anchor_checkpoints.write, moving.write_deformable, mip_checkpoints.folder], ids=["anchors", "moving", "filtered"])
+def test_every_kind_of_family_is_drawn(tmp_path, write, screen):
+    write(tmp_path / "base")
+    base = wrap_model(tmp_path / "base", cameras=tiny.cameras(4), backend="reference")
+    stage = Stage(base, [File("base", base)], Supersampled("supersampled", base))
+    for look in (Look("base"), Look("supersampled"), Look("base", pixel=2)):
+        picture = stage.draw(look, screen)
+        assert picture.image.shape == (*SIZE, 3) and picture.splats[0] <= picture.splats[1] > 0
+    if not why_no_viewer(base.model):
+        assert torch.equal(stage.draw(Look("base", viewer="classic"), screen).image, base.render(screen, viewer="classic").image.clamp(0, 1))
+
+
+def test_sources_of_the_same_name_are_told_apart(stage, base):
+    assert [stage.add(File("base", base)) for _ in range(2)] == ["base (2)", "base (3)"]
+
+
+# Files and levels
+
+
+def ladder(folder, shown_from=(0.7, None)):
+    levels = []
+    for number, least in enumerate(shown_from):
+        tiny.ply(folder / f"level_{number}.ply", count=60 - 20 * number)
+        levels.append({"file": f"level_{number}.ply", "shown_from": least})
+    (folder / "levels.json").write_text(json.dumps({"levels": levels}))
+    return folder
+
+
+def test_a_ladder_shows_the_level_of_the_zoom(tmp_path, base, screen):
+    (tmp_path / "ladder").mkdir()
+    levels = open_source(ladder(tmp_path / "ladder"), base, "reference")
+    assert isinstance(levels, Levels) and levels.name == "ladder"
+    assert [levels.shown(zoom) for zoom in (4.0, 0.7, 0.69, 0.01)] == ["ladder, level_0.ply"] * 2 + ["ladder, level_1.ply"] * 2
+    assert [levels.splats(Request(screen, zoom))[1] for zoom in (1.0, 0.5)] == [60, 40]
+    alone = File("level_1", wrap_model(tmp_path / "ladder/level_1.ply", cameras=base.cameras, backend="reference"))
+    assert torch.equal(levels.render(Request(screen, 0.5)), alone.render(Request(screen, 0.5)))
+
+
+@pytest.mark.parametrize("text", ['{"levels": []}', "[]", '{"levels": [{"file": "level_0.ply"}]}', '{"levels": [{"file": "a", "shown_from": "b"}]}'])
+def test_a_damaged_ladder_is_refused(tmp_path, base, text):
+    (tmp_path / "levels.json").write_text(text)
+    with pytest.raises(SceneError, match="lists no levels, or is damaged"):
+        open_source(tmp_path, base, "reference")
+
+
+def test_an_adapted_file_is_shown_on_the_background_of_the_base(tmp_path, screen):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(4), backend="reference", background=(1.0, 1.0, 1.0))
+    adapted = base.adapt(1 / 2, recipe="instant")
+    shown = of_adapted("new", adapted, base).render(Request(screen, 0.5))
+    assert torch.equal(shown, adapted.render(screen).image) and shown[0, 0].min() == 1
+    saved = open_source(adapted.save(tmp_path / "new.ply"), base, "reference")
+    assert torch.allclose(saved.render(Request(screen, 0.5)), shown, atol=1e-3)
+
+
+# While the camera moves
+
+
+def test_a_first_moving_picture_is_coarse_and_later_ones_are_as_fine_as_time_allows():
+    pace = Pace()
+    assert pace.fraction(1000) == COARSEST
+    for _ in range(20):
+        pace.learn(pixels=1000, seconds=MOVING_S)
+    assert pace.fraction(1000) == pytest.approx(1) and pace.fraction(4000) == pytest.approx(1 / 2) and pace.fraction(10**9) == COARSEST
+
+
+# Adapting
+
+
+def wish(base, scale=1 / 2, **changes):
+    screen = base.cameras[0].zoomed(scale)
+    return Wish(**{"screen": screen, "look_at": (0.0, 0.0, 0.0), "zoom": scale, "viewer": None, "seconds": 30.0, "recipe": "default", **changes})
+
+
+def ended(adapter, wish):
+    """What a run has come to when it has ended."""
+    over = threading.Event()
+    adapter.start(wish, over.set)
+    assert over.wait(120)
+    return adapter.progress
+
+
+def test_views_lie_around_the_screen_and_show_its_splats_but_are_not_its_own(base):
+    screen = base.cameras[0].resized(1600, 1200).zoomed(1 / 2)
+    views = views_for_screen(base, screen, torch.zeros(3, dtype=torch.float64), 1 / 2)
+    near = views[:NEAR]
+    distances = [float((view.center - screen.center).norm()) for view in near]
+    assert min(distances) > 0 and max(distances) < 0.3 * float(screen.center.norm())
+    assert all(float(view.center.norm()) == pytest.approx(float(screen.center.norm())) for view in near)
+    shown = [view.zoomed(1 / 2) for view in near]
+    assert all(view.width * view.height <= 1.01 * PIXELS and view.fx == pytest.approx(screen.fx, rel=0.01) for view in shown)
+    assert all(view.width * view.height <= 1.01 * BASE_PIXELS for view in near)
+    assert all(inside(base.model.parameters()["means"], view).sum() > 2 for view in shown) and len({view.cx for view in shown}) > NEAR / 2
+    assert views[NEAR:] and all(torch.equal(view.viewmat, base.cameras[number].viewmat) for number, view in enumerate(views[NEAR:]))
+
+
+def test_of_large_views_of_the_scene_the_middle_is_adapted_to(base):
+    screen = base.cameras[0].zoomed(40)
+    views = views_for_screen(base, screen, torch.zeros(3, dtype=torch.float64), 40.0)
+    own = [view.zoomed(40) for view in views[NEAR:]]
+    assert all(0.8 * PIXELS < view.width * view.height <= PIXELS and abs(view.cx - view.width / 2) < 40 for view in own)
+
+
+def test_a_run_shows_its_states_and_stopped_it_returns_the_best_and_the_base_stays(base, monkeypatch):
+    monkeypatch.setattr(adapting, "MEASURED_EVERY_S", 0.0)
+    before, request = digest(base), wish(base)
+    adapter = Adapter(base, Supersampled("supersampled", base), changed=lambda: len(adapter.progress.curve) > 3 and adapter.stop())
+    live, shown, over = Live(adapter, File("base", base)), [], threading.Event()
+    adapter.start(request, over.set)
+    while not over.is_set():
+        shown.append(live.render(Request(request.screen, request.zoom)))
+    progress = adapter.progress
+    assert progress.trouble == "" and not progress.running and digest(base) == before
+    report = progress.adapted.report
+    assert (report.scale, report.ended_by) == (0.5, "its observer") and report.curve[-1].step == 3
+    assert report.validation[report.returned] > max(report.validation.values()) - 0.02  # of equals the last
+    assert len(progress.curve) == 4 and progress.curve[0][0] < progress.curve[-1][0]
+    assert any(not torch.equal(picture, shown[-1]) for picture in shown)
+    assert live.shown(0.5) == "adapting, step 3" and live.splats(Request(request.screen, 0.5)) is None
+
+
+def test_what_cannot_be_adapted_is_told(base):
+    progress = ended(Adapter(base, Supersampled("supersampled", base)), wish(base, recipe="nonsense"))
+    assert progress.adapted is None and "there is no recipe 'nonsense'" in progress.trouble
+    assert "there is no recipe 'nonsense'" in words(progress)
+
+
+def test_only_one_run_at_a_time(base):
+    adapter = Adapter(base, Supersampled("supersampled", base))
+    adapter.start(wish(base, recipe="instant"))
+    with pytest.raises(SettingsError, match="stop it first"):
+        adapter.start(wish(base))
+    adapter.close()
+    assert adapter.progress.adapted is not None
+
+
+def test_a_zoom_is_rounded_to_the_scale_of_a_file(base):
+    assert [wish(base, zoom=zoom).scale for zoom in (0.98, 1.02, 0.26789, 3.14159)] == [1.0, 1.0, 0.268, 3.14]
+
+
+def digest(base):
+    return [hashlib.sha256(tensor.detach().numpy().tobytes()).hexdigest() for tensor in base.model.parameters().values()]
+
+
+# Words
+
+
+def test_the_figures_are_told(stage, screen):
+    text = figures(stage.draw(Look("base", against="supersampled"), screen))
+    assert "64 × 48 px" in text and "of 60 splats" in text and "dB apart" in text and "· base" in text
+
+
+def test_a_run_is_told_from_its_beginning_to_its_end(base):
+    request = wish(base, viewer="spark")
+    assert words(Progress()) == "" and words(Progress(request)) == "×0.5 for spark: preparing ..."
+    assert words(Progress(request, step=7, curve=((0.0, 20.0),))) == "×0.5 for spark: step 7"
+    done = words(Progress(request, adapted=base.adapt(1 / 2, recipe="instant", viewer="spark")))
+    assert "dB on views that nothing was adapted to" in done and "60 → 60 splats" in done
+
+
+# The command
+
+
+def test_without_viser_the_command_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", str(tiny.ply(tmp_path / "base.ply")), "--backend", "reference", "--no-browser"]) == 2
+    assert capsys.readouterr().err.strip() == f"mipmap-plugin: {NO_VISER}"
+    assert "pip install 'mipmap-plugin[view]'" in NO_VISER
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    (["--port", "70000"], "port: must be from 0 to 65535"),
+    (["--viewer", "portable"], "portable"),
+    (["--viewer", "nonsense"], "there is no 'nonsense'"),
+    (["--threads", "0"], "threads must be at least 1"),
+])  # fmt: skip
+def test_wrong_options_are_told(tmp_path, capsys, options, message):
+    words = ["view", str(tiny.ply(tmp_path / "base.ply")), "--backend", "reference", "--no-browser"]
+    assert main([*words, *options]) == 2 and message in capsys.readouterr().err
+
+
+def test_an_address_that_cannot_be_served_is_told():
+    with pytest.raises(SettingsError, match="nothing can be served at"):
+        _check_address("192.0.2.1", 8080)  # an address for documentation, which no machine has
+    _check_address("127.0.0.1", 0)
+
+
+def test_what_is_saved_takes_a_free_name(tmp_path):
+    (tmp_path / "bicycle").mkdir()
+    free = _free(tmp_path / "bicycle", None)
+    assert free(0.25, "spark") == tmp_path / "bicycle_x0.25_spark"
+    (tmp_path / "bicycle_x0.25_spark").mkdir()
+    assert free(0.25, "spark") == tmp_path / "bicycle_x0.25_spark_2"
+    (tmp_path / "base.ply").touch()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "base_x0.5.ply").touch()
+    assert _free(tmp_path / "base.ply", tmp_path / "out")(0.5, None) == tmp_path / "out" / "base_x0.5_2.ply"
+
+
+def test_a_display_is_known_by_the_environment(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert not has_display()
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert has_display()
