@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
@@ -19,6 +19,18 @@ PATIENCE, PERIOD = 1.0, 0.5
 def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator[Item]:
     """Yield the items, and show on a terminal how many of them there were."""
     yield from tqdm(items, total=total, desc=what, unit=unit, disable=None)
+
+
+@contextmanager
+def told(what: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Show on a terminal how many there are of how many, as the function that the block is given is told."""
+    with tqdm(desc=what, unit=unit, disable=None) as shown:
+
+        def tell(done: int, total: int) -> None:
+            shown.total = total
+            shown.update(done - shown.n)
+
+        yield tell
 
 
 def note(line: str) -> None:

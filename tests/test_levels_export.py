@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from contextlib import contextmanager
 
 import pytest
 import tiny
@@ -10,34 +11,50 @@ import tiny
 from mipmap_plugin import cli
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import write_json
+from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks
 from mipmap_plugin.levels.manifest import MANIFEST
-from mipmap_plugin.levels.streamed import distances, progression, viewer_settings, write_streamed
+from mipmap_plugin.levels.streamed import distances, nearer, progression, viewer_settings, write_streamed
 from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tiles
 
-# A stand-in for splat-transform: it writes its arguments to the output, and fails for a file of no bytes.
+# A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file of no bytes.
 STAND_IN = """#!{python}
 import json, pathlib, sys
+if sys.argv[1:] == ["--list-gpus"]:
+    sys.exit(print({cards!r}))
 *words, target = sys.argv[1:]
+print("splat-transform v3.7.0\\n    ▸ [1/2] 0_0\\n    ▸ [2/2] 1_0", file=sys.stderr)
 if any(word.endswith(".ply") and not pathlib.Path(word).stat().st_size for word in words):
     sys.exit("Invalid header")
-pathlib.Path(target).write_text(json.dumps(words))
+counts = lambda count: {{"0": {{"count": count}}, "2": {{"count": 1}}}}
+leaf = lambda x, count: {{"bound": {{"min": [x, 0, 0], "max": [x + 2, 1, 1]}}, "lods": counts(count)}}
+pathlib.Path(target).write_text(json.dumps({{"asked": words, "lodLevels": 3, "tree": {{"children": [leaf(0, 30), leaf(2, 10)]}}}}))
 """
+
+# What it lists; the first is a processor.
+CARDS = "[0] llvmpipe (LLVM 15.0.6, 256 bits)\n[1] NVIDIA GeForce RTX 3090"
+
+CHUNKS = [Chunk((0, 0, 0), (2, 1, 1), (30, 0, 1)), Chunk((2, 0, 0), (4, 1, 1), (10, 0, 1))]
 
 LADDER = {
     "base_pixel": 0.01,
-    "levels": [{"file": f"level_{number}.ply", "scale": 0.5**number} for number in range(3)],
+    "levels": [{"file": f"level_{number}.ply", "scale": 0.5**number, "splats": 60} for number in range(3)],
     "switches": [{"zoom": 0.7}, {"zoom": 0.35}],
 }
 
 
 @pytest.fixture
 def tool(tmp_path, monkeypatch):
-    """The only program on the path."""
+    """The only program on the path; it is given the GPUs to list."""
+
+    def installed(cards=""):
+        (place / "splat-transform").write_text(STAND_IN.format(python=sys.executable, cards=cards), encoding="utf-8")
+        (place / "splat-transform").chmod(0o755)
+
     place = tmp_path / "bin"
     place.mkdir()
-    (place / "splat-transform").write_text(STAND_IN.format(python=sys.executable))
-    (place / "splat-transform").chmod(0o755)
     monkeypatch.setenv("PATH", str(place))
+    installed()
+    return installed
 
 
 @pytest.fixture
@@ -63,12 +80,30 @@ def test_distances_become_a_geometric_progression():
     assert multiplier == pytest.approx(5**0.5) and base * multiplier == pytest.approx(10 ** (1 / 3))
 
 
+def test_distances_too_close_for_playcanvas_are_spread_around_their_middle():
+    assert progression([5, 5.1], 9.0) == pytest.approx((math.sqrt(5 * 5.1 / 1.2), 1.2))
+    assert progression([0.01], 2.0) == pytest.approx((0.1, 2))
+
+
+def test_chunks_are_taken_to_be_closer_than_their_splats():
+    """By half of the sum of half extents; of a box larger than most, three quarters of what it has more are left out."""
+    assert nearer(CHUNKS) == pytest.approx((1 + 0.5 + 0.5) / 2)
+    large = Chunk((0, 0, 0), (9, 9, 9), (20, 0, 0))
+    assert nearer([*CHUNKS, large]) == pytest.approx((40 * 1 + 20 * (1 + 3.5 / 4 + 2 * (0.5 + 4 / 4)) / 2) / 60)
+
+
 def test_a_page_is_told_to_keep_the_distances():
-    settings = viewer_settings(LADDER, 1000)
-    assert settings["lodMultiplier"] == pytest.approx(2) and settings["lodBaseDistance"] == pytest.approx(distances(LADDER, 1000)[0])
-    assert settings["splatBudgetMode"] == "limit"
+    settings, wanted = viewer_settings(LADDER, CHUNKS, 1000), distances(LADDER, 1000)
+    assert settings["lodBaseDistance"] == pytest.approx(wanted[0] - 1) and settings["zooms"] == pytest.approx([0.7, 0.35])
+    assert settings["lodMultiplier"] == pytest.approx((wanted[1] - 1) / (wanted[0] - 1))
+    assert settings["splatBudgetMode"] == "limit" and settings["splatBudget"] == 1_000_000
+    assert settings["lodUpdateDistance"] < 0.05 * settings["lodBaseDistance"]
+
+
+def test_a_ladder_of_one_level_is_not_streamed(ladder, tool):
+    write_json(ladder / MANIFEST, LADDER | {"switches": []}, overwrite=True)
     with pytest.raises(SettingsError, match="a single level"):
-        viewer_settings(LADDER | {"switches": []})
+        write_streamed(ladder)
 
 
 def test_a_tile_is_replaced_at_its_switch():
@@ -100,17 +135,38 @@ def test_the_box_holds_every_splat():
 
 def test_streamed_sog_is_written_with_its_levels_and_settings(ladder, tool):
     made = write_streamed(ladder, 1000)
-    words = json.loads(made.read_text())
-    assert words[-9:] == [word for number in range(3) for word in (str(ladder / f"level_{number}.ply"), "--lod", str(number))]
-    assert json.loads((made.parent / "playcanvas.json").read_text()) == viewer_settings(LADDER, 1000)
+    words = json.loads(made.read_text())["asked"]
+    assert words[-9:] == [word for number in range(3) for word in (str(ladder / f"level_{number}.ply"), "--tag-lod", str(number))]
+    assert words[words.index("--lod-chunk-extent") + 1] == str(int(distances(LADDER, 1000)[0] / 4))
+    assert read_chunks(made) == CHUNKS
+    assert json.loads((made.parent / "playcanvas.json").read_text()) == viewer_settings(LADDER, CHUNKS, 1000)
     with pytest.raises(OutputExists):
         write_streamed(ladder)
+
+
+@pytest.mark.parametrize(("cards", "options"), [("", ["--gpu", "cpu", "--sh-iterations", "1", "--lod-chunk-count", "4"]), (CARDS, ["--gpu", "1"])])
+def test_tables_are_small_where_no_gpu_makes_them(ladder, tool, cards, options):
+    tool(cards)
+    words = json.loads(write_streamed(ladder).read_text())["asked"]
+    assert words[2 : words.index("--lod-chunk-extent")] == options
+
+
+def test_a_terminal_shows_how_many_files_are_written(ladder, tool, monkeypatch):
+    seen = []
+
+    @contextmanager
+    def told(what, unit):
+        yield lambda *numbers: seen.append((what, unit, *numbers))
+
+    monkeypatch.setattr("mipmap_plugin.formats.streamed_sog.told", told)
+    write_streamed(ladder)
+    assert seen == [("writing Streamed SOG", "file", 0, 2), ("writing Streamed SOG", "file", 1, 2)]
 
 
 def test_tiles_are_written_with_their_files(ladder, tool):
     made = write_tiles(ladder)
     assert sorted(file.name for file in made.parent.iterdir()) == ["level_0.glb", "level_1.glb", "level_2.glb", "tileset.json"]
-    assert json.loads((made.parent / "level_1.glb").read_text())[-1] == str(ladder / "level_1.ply")
+    assert json.loads((made.parent / "level_1.glb").read_text())["asked"][-1] == str(ladder / "level_1.ply")
 
 
 def test_a_failed_conversion_leaves_nothing(ladder, tool):

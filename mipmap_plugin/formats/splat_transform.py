@@ -6,6 +6,7 @@ format, because splat-transform recognizes formats by suffix only, and executes 
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import tempfile
@@ -33,8 +34,11 @@ READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRI
 TOOL = "splat-transform"
 INSTALL = "npm install -g @playcanvas/splat-transform"
 
-# Seconds; ten million splats take one minute.
+# Seconds; ten million splats take one minute, but for SOG without a GPU.
 LONGEST = 1200
+
+# Adapters that splat-transform lists beside GPUs, and that are processors.
+SOFTWARE = re.compile("llvmpipe|swiftshader|lavapipe|software|basic render", re.IGNORECASE)
 
 
 def is_written(path: Path) -> bool:
@@ -109,6 +113,20 @@ def find_tool() -> list[str] | None:
     return command if version.returncode == 0 else None
 
 
+def graphics_card(tool: Sequence[str]) -> str:
+    """The number of the first GPU that splat-transform lists; empty if there is none."""
+    try:
+        listed = subprocess.run([*tool, "--list-gpus"], capture_output=True, text=True, errors="replace", timeout=60, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return next((number for number, name in re.findall(r"^\[(\d+)\] (.*)$", listed, re.MULTILINE) if not SOFTWARE.search(name)), "")
+
+
+def table_options(card: str) -> list[str]:
+    """How SOG's table of spherical harmonics is found: on the GPU of that number; without one, in a single iteration, for each takes minutes."""
+    return ["--gpu", card] if card else ["--gpu", "cpu", "--sh-iterations", "1"]
+
+
 def convert(inputs: Sequence[str | Path], output: Path) -> None:
     """Write `output`, in a format given by its name, from files and the options after each. Raises OutputError."""
     tool = refuse_exchange(output)
@@ -118,11 +136,14 @@ def convert(inputs: Sequence[str | Path], output: Path) -> None:
 
 def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
     """Run splat-transform. Returns its error message, empty on success."""
-    # On a GPU SOG's palette may differ; on the CPU the same file is written on every machine.
-    command = [*tool, "--quiet", "--overwrite", "--gpu", "cpu", *map(str, inputs), str(target)]
+    options = table_options(graphics_card(tool)) if target.suffix.lower() == ".sog" else ["--gpu", "cpu"]
+    command = [*tool, "--quiet", "--overwrite", *options, *map(str, inputs), str(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except subprocess.TimeoutExpired:
+        slow = "; without a GPU SOG takes so long; .spz and .compressed.ply do not" if "--sh-iterations" in options else ""
+        return f"not ready after {LONGEST // 60} minutes{slow}"
+    except OSError as error:
         return str(error)[:160]
     if done.returncode == 0 and target.is_file():
         return ""

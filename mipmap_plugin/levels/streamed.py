@@ -1,8 +1,11 @@
 """Streamed SOG, which PlayCanvas, SuperSplat and Babylon.js load piece by piece: the levels through splat-transform, and when to show which.
 
 PlayCanvas shows a chunk by its distance, multiplied by the smaller tangent of half a field of view over the tangent of 22.5°: level 0 up
-to `lodBaseDistance`, level k up to `lodBaseDistance · lodMultiplier^k`. On a canvas that is H px along that side, such a distance d is seen
-with (H / 2) / (d · tan 22.5°) px per world unit. A base pixel of size p, seen at the zoom z, has z / p.
+to `lodBaseDistance`, level k up to `lodBaseDistance · lodMultiplier^k`. On a canvas that is H px along that side, what such a distance d is
+away is seen with (H / 2) / (d · tan 22.5°) px per world unit. A base pixel of size p, seen at the zoom z, has z / p.
+
+The distance of a chunk is that to the nearest point of its box, of which `lodDistanceShrink` has taken most of what is larger than in half of
+the chunks. Seen from afar, from any direction alike, the nearest point is closer than the middle by half of the sum of the box's half extents.
 """
 
 from __future__ import annotations
@@ -15,22 +18,43 @@ from typing import Any
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import new_folder, write_json
-from mipmap_plugin.formats.splat_transform import convert
+from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
 from mipmap_plugin.levels.manifest import read_manifest
 
-STREAMED, SETTINGS = "streamed", "playcanvas.json"
+STREAMED, META, SETTINGS = "streamed", "lod-meta.json", "playcanvas.json"
 
 # px: the shorter side of the canvas that distances are computed for.
 CANVAS = 1080
 
+# The part of the distance of the first switch that a chunk may extend over, so that its near and far end are seen at nearly one zoom.
+EXTENT = 1 / 4
+
+# PlayCanvas's own: the part of a box's excess that is left out of distances, and the splats that are shown at most.
+SHRINK, BUDGET = 0.75, 1_000_000
+
+# PlayCanvas's bounds of `lodBaseDistance`, in world units, and of `lodMultiplier`.
+NEAREST, LEAST_MULTIPLIER = 0.1, 1.2
+
+# The part of the distance of the first switch that the camera moves before PlayCanvas looks again which levels to show; its own is 1 unit.
+MOVED = 1 / 50
+
 
 def distances(manifest: dict[str, Any], canvas: int = CANVAS) -> list[float]:
-    """The distances of PlayCanvas's rule, in world units, at which the levels of a ladder should be switched, rising."""
+    """The distances from splats, in world units and a field of view of 45°, at which the levels of a ladder should be switched, rising."""
     return [canvas / 2 * manifest["base_pixel"] / (math.tan(math.pi / 8) * switch["zoom"]) for switch in manifest["switches"]]
 
 
+def nearer(chunks: Sequence[Chunk]) -> float:
+    """How much closer than its splats a chunk is taken to be, in world units: the mean over the finest level's splats."""
+    halves = [[(high - low) / 2 for low, high in zip(chunk.low, chunk.high, strict=True)] for chunk in chunks]
+    usual = [sorted(axis)[len(axis) // 2] for axis in zip(*halves, strict=True)]
+    seen = [[half - SHRINK * max(0.0, half - middle) for half, middle in zip(each, usual, strict=True)] for each in halves]
+    splats = [chunk.splats[0] for chunk in chunks]
+    return float(sum(count * sum(each) / 2 for count, each in zip(splats, seen, strict=True))) / max(1, sum(splats))
+
+
 def progression(rising: Sequence[float], ratio: float) -> tuple[float, float]:
-    """`lodBaseDistance` and `lodMultiplier`: the geometric progression closest to the distances, by least squares of logarithms.
+    """`lodBaseDistance` and `lodMultiplier`: of those that PlayCanvas takes, the closest to the distances, by least squares of logarithms.
 
     `ratio`: the multiplier where there is only one distance.
     """
@@ -38,38 +62,38 @@ def progression(rising: Sequence[float], ratio: float) -> tuple[float, float]:
     middle = (len(logs) - 1) / 2
     spread = sum((number - middle) ** 2 for number in range(len(logs)))
     slope = sum((number - middle) * log for number, log in enumerate(logs)) / spread if spread else math.log(ratio)
-    return math.exp(fmean(logs) - slope * middle), math.exp(slope)
+    slope = max(slope, math.log(LEAST_MULTIPLIER))
+    return max(math.exp(fmean(logs) - slope * middle), NEAREST), math.exp(slope)
 
 
-def viewer_settings(manifest: dict[str, Any], canvas: int = CANVAS) -> dict[str, Any]:
-    """What a page has to set on its PlayCanvas splat component. Raises SettingsError for a single level."""
-    rising = distances(manifest, canvas)
-    if not rising:
-        raise SettingsError("this ladder has a single level, which needs no streaming; give a smaller --coarsest")
+def viewer_settings(manifest: dict[str, Any], chunks: Sequence[Chunk], canvas: int = CANVAS) -> dict[str, Any]:
+    """What a page has to set on its PlayCanvas splat component (the first two) and on `scene.gsplat`, and the zooms at which levels then change."""
+    rising, offset = distances(manifest, canvas), nearer(chunks)
     scales = [level["scale"] for level in manifest["levels"]]
-    base, multiplier = progression(rising, scales[0] / scales[1])
+    base, multiplier = progression([max(distance - offset, distance / 2) for distance in rising], scales[0] / scales[1])
+    shown = [base * multiplier**number + offset for number in range(len(rising))]
     return {
         "lodBaseDistance": base,
         "lodMultiplier": multiplier,
         "splatBudgetMode": "limit",  # the default slides the distances until a number of splats is shown
+        "splatBudget": max(BUDGET, manifest["levels"][0]["splats"]),  # of fewer, the distances slide in this mode too
+        "lodUpdateDistance": MOVED * base,
         "canvas": canvas,
-        "distances": rising,
+        "zooms": [switch["zoom"] * wanted / got for switch, wanted, got in zip(manifest["switches"], rising, shown, strict=True)],
     }
-
-
-def tool_inputs(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    """The inputs of splat-transform: each file with its level."""
-    return [word for number, level in enumerate(manifest["levels"]) for word in (str(folder / level["file"]), "--lod", str(number))]
 
 
 def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = False) -> Path:
     """Write Streamed SOG and the viewer's settings to the subfolder `streamed` of a ladder; return its lod-meta.json.
 
-    Raises SettingsError without splat-transform, OutputExists, OutputError.
+    Raises SettingsError without splat-transform and for a single level, OutputExists, OutputError.
     """
     manifest = read_manifest(folder)
-    settings = viewer_settings(manifest, canvas)
+    rising = distances(manifest, canvas)
+    if not rising:
+        raise SettingsError("this ladder has a single level, which needs no streaming; give a smaller --coarsest")
     with new_folder(folder / STREAMED, overwrite) as temporary:
-        convert(tool_inputs(folder, manifest), temporary / "lod-meta.json")
-        write_json(temporary / SETTINGS, settings, overwrite=False)
-    return folder / STREAMED / "lod-meta.json"
+        made = temporary / META
+        write_streamed_sog([folder / level["file"] for level in manifest["levels"]], made, int(EXTENT * rising[0]))
+        write_json(temporary / SETTINGS, viewer_settings(manifest, read_chunks(made), canvas), overwrite=False)
+    return folder / STREAMED / META

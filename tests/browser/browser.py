@@ -101,6 +101,15 @@ class Browser:
         _told(viewer, shown, "url => viewer.open(url)", url)
         return Page(viewer, shown)
 
+    def stream(self, viewer: str, folder: Path, component: dict[str, Any], **settings: Any) -> Page:
+        """A folder of Streamed SOG in a viewer; `component`: settings of its splats, such as lodBaseDistance; `settings` as for `open`."""
+        page, of_name = VIEWERS[viewer]
+        url = f"/files/{len(self._files)}"
+        self._files[url] = Path(folder)
+        shown = self._started(page, {**of_name, **settings})
+        _told(viewer, shown, "([url, component]) => viewer.open(url, component)", [f"{url}/lod-meta.json", component])
+        return Page(viewer, shown)
+
     def _started(self, page: str, settings: dict[str, Any]) -> Any:
         """The page of a viewer with these settings, started once: compiling its shaders costs more than a view."""
         key = page + json.dumps(settings, sort_keys=True)
@@ -122,6 +131,10 @@ class Page:
     def draw(self, cameras: Sequence[Camera], background: Sequence[float] = (0.0, 0.0, 0.0)) -> list[np.ndarray]:
         """[H, W, 3] float32 in 0..1 for each camera, in the canvas' own 8 bits. Raises BrowserError when a view takes over a minute."""
         return [self._view(camera, background) for camera in cameras]
+
+    def levels(self) -> list[int]:
+        """How many splats of each level the last picture has, of a streamed file."""
+        return list(_told(self._viewer, self._shown, "() => viewer.levels()", None))
 
     def _view(self, camera: Camera, background: Sequence[float]) -> np.ndarray:
         matrices = {"projection": projection(camera), "viewmat": opengl(camera)}
@@ -173,7 +186,11 @@ class _Handler(SimpleHTTPRequestHandler):
         super().__init__(*arguments, directory=str(HERE))
 
     def translate_path(self, path: str) -> str:
-        return str(self._files[path]) if path in self._files else super().translate_path(path)
+        if path in self._files:
+            return str(self._files[path])
+        folder, _, name = path.removeprefix("/files/").partition("/")
+        opened = self._files.get(f"/files/{folder}")
+        return str(opened / name) if opened and name else super().translate_path(path)
 
     def log_message(self, format: str, *arguments: Any) -> None:
         """Nothing: a test's output is its own."""

@@ -1,8 +1,11 @@
 import * as pc from 'playcanvas'
-import { canvas, drawToTexture, drawUntil, readPixels, readTexture } from './common.js'
+import { canvas, drawToTexture, drawUntil, nextFrame, readPixels, readTexture } from './common.js'
 
 // 1 - cosine of the milliradian that the engine lets a camera turn before it sorts again.
 const SORT_TURN = 1e-6
+
+// Milliseconds that the levels of one view may take to load.
+const LONGEST_LOAD = 30000
 
 // `device`: webgl2 or webgpu. `settings`: of the engine's `scene.gsplat`, such as antiAlias; its defaults are what its users see.
 export async function start({ device: type = 'webgl2', ...settings }) {
@@ -13,7 +16,7 @@ export async function start({ device: type = 'webgl2', ...settings }) {
   const options = new pc.AppOptions()
   options.graphicsDevice = device
   options.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem]
-  options.resourceHandlers = [pc.GSplatHandler]
+  options.resourceHandlers = [pc.GSplatHandler, pc.TextureHandler]
   const app = new pc.AppBase(canvas)
   app.init(options)
   app.setCanvasFillMode(pc.FILLMODE_NONE)
@@ -33,7 +36,8 @@ export async function start({ device: type = 'webgl2', ...settings }) {
   }
 
   return {
-    async open(url) {
+    // `component`: settings of the splats' component, such as lodBaseDistance.
+    async open(url, component = {}) {
       if (shown) {
         shown.entity.destroy()
         app.assets.remove(shown.asset)
@@ -47,7 +51,7 @@ export async function start({ device: type = 'webgl2', ...settings }) {
         app.assets.load(asset)
       })
       const entity = new pc.Entity('splats')
-      entity.addComponent('gsplat', { asset })
+      entity.addComponent('gsplat', { asset, ...component })
       app.root.addChild(entity)
       shown = { asset, entity }
     },
@@ -62,15 +66,51 @@ export async function start({ device: type = 'webgl2', ...settings }) {
       eye.camera.calculateProjection = (matrix) => matrix.set(view.projection)
       // A sort is asked for in one frame, done by a worker, and taken over in a later one, whose picture is the first in order.
       await drawUntil(() => isSorted(app, eye), frame)
+      // Levels that are asked for come from the server; then they are sorted anew.
+      for (let since = performance.now(); !isStreamed(app, eye); ) {
+        if (performance.now() - since > LONGEST_LOAD) throw new Error('the levels were still loading')
+        await frame()
+        await nextFrame()
+      }
+      await drawUntil(() => isSorted(app, eye), frame)
       return target ? readTexture(target) : readPixels(device.gl, view)
+    },
+
+    // How many splats of each level the last picture has, of a streamed file.
+    levels() {
+      const counts = []
+      for (const { octree, nodeInfos } of octrees(app, eye)) {
+        nodeInfos.forEach(({ currentLod }, i) => {
+          if (currentLod >= 0) counts[currentLod] = (counts[currentLod] ?? 0) + octree.nodes[i].lods[currentLod].count
+        })
+      }
+      return Array.from(counts, (count) => count ?? 0)
     },
   }
 }
 
+// What draws the splats for a camera, in each layer.
+function managersOf(app, eye) {
+  const layers = app.renderer.gsplatDirector.camerasMap.get(eye.camera.camera)?.layersMap.values() ?? []
+  return [...layers].map((layer) => layer.gsplatManager).filter(Boolean)
+}
+
+function octrees(app, eye) {
+  return managersOf(app, eye).flatMap(({ world }) => [...world._octreeInstances.values()])
+}
+
+// Whether every chunk of a streamed file shows the level that it should from here; the engine looks every tenth frame.
+function isStreamed(app, eye) {
+  const isNear = ({ world }) => world._lastLodCameraPos.distance(eye.getPosition()) <= app.scene.gsplat.lodUpdateDistance
+  const isShown = ({ currentLod, optimalLod }) => optimalLod >= 0 && currentLod === optimalLod
+  const isWhole = (instance) => instance.pendingLoadCount === 0 && instance.nodeInfos.every(isShown)
+  const all = octrees(app, eye)
+  return all.length === 0 || (managersOf(app, eye).every(isNear) && all.every(isWhole))
+}
+
 // Whether the order that is drawn is that of this camera, and none is on its way.
 function isSorted(app, eye) {
-  const layers = app.renderer.gsplatDirector.camerasMap.get(eye.camera.camera)?.layersMap.values() ?? []
-  const managers = [...layers].map((layer) => layer.gsplatManager).filter(Boolean)
+  const managers = managersOf(app, eye)
   const settled = ({ cpuSorter, world, sortNeeded, lastSortCameraFwd }) =>
     !sortNeeded &&
     !cpuSorter?.jobsInFlight &&
