@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts, without_none, wrap
-from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter
+from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter, Way
 from mipmap_plugin.config import ViewPolicy
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.splat_transform import refuse_exchange
@@ -26,6 +26,7 @@ def levels(
     ratio: float | None = None,
     least_db: float | None = None,
     until_splats: int | None = None,
+    by: Way = "auto",
     streamed_sog: bool = False,
     tiles: bool = False,
     canvas: int = 1080,
@@ -51,6 +52,8 @@ def levels(
         ratio: Of neighboring scales; by default 1.74 for viewers that compensate or hardly dilate, else 1.41.
         least_db: Make a level again for a narrower band, down to a ratio of 1.19, if it falls below this PSNR at the ends of its band.
         until_splats: End with the first level that has at most this many splats, if that comes before the coarsest scale.
+        by: zoom, one scale for the whole scene; distance, a scale for each splat, as viewers that stream chunks show it; auto is distance for such
+            a viewer and a scene with a background far behind its foreground.
         streamed_sog: Also write Streamed SOG for PlayCanvas, SuperSplat and Babylon.js, through splat-transform, with the distances to set there.
         tiles: Also write 3D Tiles for Cesium, through splat-transform.
         canvas: Shorter side in px of the canvas that the distances of Streamed SOG are computed for.
@@ -71,7 +74,7 @@ def levels(
     exports = Exports(streamed_sog, tiles, canvas)
     exports.check(output)
     settings = {"seed": seed, **without_none(views=views, steps=steps)}
-    request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, settings)
+    request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, settings, by)
     manifest, files = _saved(wrap(checkpoint, cameras, background, backend, screen_filter, threads), request, output, exports, overwrite)
     if json:
         print_facts(manifest, json)
@@ -115,6 +118,17 @@ def _saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expo
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = ()) -> None:
     """Print what a ladder's manifest says, in lines."""
+    if manifest.get("by") == "distance":
+        _print_distances(folder, manifest)
+    else:
+        _print_zooms(folder, manifest)
+    base = min(point["base_db"] for point in manifest["curve"])
+    print(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
+    print(f"  {manifest['measured']}")
+    print("".join(f"  {path}\n" for path in exports), end="")
+
+
+def _print_zooms(folder: Path, manifest: dict[str, Any]) -> None:
     print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels")
     for level in manifest["levels"]:
         ends = {"down to": level["shown_from"], "up to": level["shown_to"]}
@@ -122,7 +136,13 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
         quality = list(level["psnr_db"].values())
         print(f"  {level['file']}  x{level['scale']:.3g}, shown {shown}: {min(quality):.1f} to {max(quality):.1f} dB, ", end="")
         print(f"{level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s")
-    base = min(point["base_db"] for point in manifest["curve"])
-    print(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
-    print(f"  {manifest['measured']}")
-    print("".join(f"  {path}\n" for path in exports), end="")
+
+
+def _print_distances(folder: Path, manifest: dict[str, Any]) -> None:
+    print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels by distance")
+    for level in manifest["levels"]:
+        ends = {"from": level["distance_from"] or None, "to": level["distance_to"]}
+        shown = " ".join(f"{word} {distance:.3g}" for word, distance in ends.items() if distance is not None) or "everywhere"
+        print(f"  {level['file']}  shown {shown}: {level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s")
+    print(f"  distances in world units on a canvas of {manifest['canvas']} px: lodBaseDistance {manifest['lodBaseDistance']:.4g}, ", end="")
+    print(f"lodMultiplier {manifest['lodMultiplier']:.3g}")

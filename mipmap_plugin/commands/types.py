@@ -45,5 +45,6 @@ Scale = Annotated[
 Scales = tyro.conf.UseAppendAction[list[Scale]]
 Background = Literal["white", "black"]
 ScreenFilter = TrainedName
+Way = Literal["auto", "zoom", "distance"]  # of levels (`levels.request.WAYS`)
 Checkpoint = tyro.conf.Positional[Path]
 Checkpoints = tyro.conf.Positional[tuple[Path, ...]]

@@ -14,6 +14,7 @@ from pathlib import Path
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.levels.contents import Contents, CurvePoint, Level, Switch
+from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, make_levels_by_distance
 from mipmap_plugin.levels.manifest import write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
@@ -48,11 +49,13 @@ class Ladder:
         return saved
 
 
-def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
+def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> Ladder | DistanceLadder:
     """Make the levels. `resume`: a folder for finished levels, to go on from after an interruption; saving the ladder removes it.
 
     Raises SettingsError for a model that no viewer draws and for a group of viewers, BackendUnavailable, Interrupted.
     """
+    if by_distance(base, request):
+        return make_levels_by_distance(base, request, resume)
     target = base.target(request.viewer)
     store = LevelStore(None if resume is None else Path(resume), base, request)
     with announced("rendering the base"):

@@ -33,6 +33,12 @@ POWER, KEPT = 2 / 3, 0.5
 # whose splats are few for its pixels, they regain 4, so that more splats are kept there.
 MERGING_COSTS = 9.0
 
+# What levels are made for; "auto" is "distance" for a viewer of STREAMING and an unbounded scene, else "zoom".
+WAYS = ("auto", "zoom", "distance")
+
+# Viewers that choose a level for each chunk by its distance.
+STREAMING = ("playcanvas", "supersplat", "playcanvas-webgpu", "playcanvas-aa", "babylon")
+
 
 @dataclass(frozen=True)
 class LadderRequest:
@@ -45,6 +51,7 @@ class LadderRequest:
     until_splats: int | None = None  # the first level with at most this many splats is the last
     recipe: str = "default"
     settings: Mapping[str, Any] = field(default_factory=dict)  # of AdaptConfig, for all levels
+    by: str = "zoom"  # one scale for the whole scene; "distance": each splat has the scale at which the rule of a streaming viewer shows it
 
     def __post_init__(self) -> None:
         check_scale(self.coarsest)
@@ -54,6 +61,8 @@ class LadderRequest:
             raise SettingsError(f"ratio: must be from {FINEST_RATIO:.3g} to 4, such as 2, got {self.ratio:g}")
         if self.until_splats is not None and self.until_splats < 1:
             raise SettingsError(f"until_splats: must be at least 1, got {self.until_splats}")
+        if self.by not in WAYS:
+            raise SettingsError(f"by: must be one of {', '.join(WAYS)}, got {self.by}")
         if taken := {"band", "start", "viewer", "scale", "images"} & self.settings.keys():
             raise SettingsError(f"{', '.join(sorted(taken))}: set by the ladder for each level; leave out")
 

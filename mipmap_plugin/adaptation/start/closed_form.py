@@ -92,7 +92,7 @@ def _form(gaussians: Gaussians, views: Sequence[Camera], scale: float, effects: 
     narrow = (wide - ((_filter_variance(target) - averaging) * target_pixel**2)[:, None]).clamp_min(0)
     if compensates(target.screen_filter):  # the area shrinks only by the factor by which the opacity can rise
         narrow = narrow.maximum(gaussians.opacities[:, None] * wide)
-    thinnest = torch.full_like(narrow, MIN_AXIS**2).scatter(1, wide.topk(2, dim=1).indices, max(MIN_AXIS**2, _min_variance(target)))
+    thinnest = torch.full_like(narrow, MIN_AXIS**2).scatter(1, wide.topk(2, dim=1).indices, max(MIN_AXIS**2, min_variance(target)))
     scales = narrow.maximum(thinnest * target_pixel[:, None].square()).sqrt()
     new = replace(gaussians, scales=scales)
     opacities = gaussians.opacities * _compensation(gaussians, views, base)
@@ -160,7 +160,7 @@ def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
     return torch.where(finest.isfinite(), finest, anywhere)
 
 
-def _min_variance(effects: Effects) -> float:
+def min_variance(effects: Effects) -> float:
     """The minimum variance (target px²) of a splat's two longer axes for which the viewer does not leave it out."""
     return CULL_MARGIN * max(0.0, effects.settings.min_variance - _filter_variance(effects), effects.settings.least_spread)
 

@@ -1,0 +1,106 @@
+"""A ladder of levels by distance: as `levels.ladder`, but each splat of a level is at the scale at which a viewer's rule shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from mipmap_plugin import threads
+from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.effects import INTEGRATED
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.levels.distance.chunks import Chunks
+from mipmap_plugin.levels.distance.level import LevelRun, Scene
+from mipmap_plugin.levels.distance.manifest import Contents, write
+from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
+from mipmap_plugin.levels.distance.walks import focal_of
+from mipmap_plugin.levels.distance.yardstick import measured
+from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest
+from mipmap_plugin.levels.store import LevelStore
+from mipmap_plugin.progress import announced
+from mipmap_plugin.wrap import Wrapped
+
+# A chunk measures at most this part of the distance of the nearest parts of a scene, so that its rear is at the scale of its front, but at least
+# one world unit: splat-transform takes whole numbers.
+CHUNK = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceLadder:
+    """A finished ladder in memory."""
+
+    contents: Contents
+    _store: LevelStore
+
+    @property
+    def levels(self) -> list[Adapted]:
+        """From the finest to the coarsest."""
+        return self.contents.levels
+
+    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
+        """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError."""
+        saved = write(self.contents, Path(folder), overwrite)
+        self._store.remove()
+        return saved
+
+
+def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> DistanceLadder:
+    """Make the levels. `resume`: as for `levels.ladder.make_levels`. Raises what that raises, and SettingsError for a model whose splats cannot be
+    merged, or for settings that levels by distance do not have."""
+    refuse(base, request)
+    target = base.target(request.viewer)
+    band = Band.first(request.first_ratio(target), as_it_is=target == base.effects())
+    scene = scene_of(base, request, band)
+    store = LevelStore(None if resume is None else Path(resume), base, request)
+    first = store.level("level_0", lambda state: _first(base, request, band, state))
+    with threads.limited(base.threads, shared=getattr(scene.backend, "own_threads", False)):
+        levels = [first]
+        for number in range(1, scene.rule.count):
+            run = LevelRun(scene, number, [level.model for level in levels])
+            levels.append(store.level(f"level_{number}", run.run))
+        with announced("measuring the levels"):
+            curve = measured(scene, [level.model for level in levels])
+    return DistanceLadder(Contents(scene, levels, curve), store)
+
+
+def by_distance(base: Wrapped, request: LadderRequest) -> bool:
+    """Whether the levels of a request are made by distance."""
+    if request.by != "auto":
+        return request.by == "distance"
+    mergeable = base.model.traits.same_for_all_views and base.effects().screen_filter not in INTEGRATED
+    return mergeable and request.viewer in STREAMING and is_unbounded(base.model.parameters()["means"].detach(), base.views())
+
+
+def refuse(base: Wrapped, request: LadderRequest) -> None:
+    """Raise SettingsError for what levels by distance do not support."""
+    if not base.model.traits.same_for_all_views:
+        raise SettingsError(f"{base.model.family}: its splats differ by view or time, so that levels by distance cannot mix them; give by zoom")
+    if request.least_db is not None or request.until_splats is not None:
+        raise SettingsError("least_db and until_splats: levels by distance follow from the distances of the cameras; leave both out")
+
+
+def scene_of(base: Wrapped, request: LadderRequest, band: Band) -> Scene:
+    """The rule and the chunks that suit a base. Raises BackendUnavailable."""
+    backend, note = base.backend(gradients=True, viewer=request.viewer)
+    with torch.no_grad():
+        splats, views = base.model.gaussians(base.any_camera()).detach(), base.views()
+        pixels = pixel_size(splats.means, views)
+        rule = DistanceRule.of(pixels, request, band)
+        extent = chunk_extent(nearest(pixels) * focal_of(views[0]))
+        return Scene(base, request, rule, Chunks.of(splats, extent), extent, base.target(request.viewer), backend, note)
+
+
+def chunk_extent(distance: float) -> int:
+    """The largest side of a chunk in world units, for a scene whose nearest parts are at this distance."""
+    return max(1, round(CHUNK * distance))
+
+
+def _first(base: Wrapped, request: LadderRequest, band: Band, state: Path | None) -> Adapted:
+    """x1: the base, converted to the viewer with the settings of a zoom-out unless that draws it as its training did."""
+    as_it_is = base.target(request.viewer) == base.effects()
+    converted = {} if as_it_is else {**band.settings(), "most_splats": len(base.model.parameters()["means"])}
+    return base.adapt(1.0, resume=state, **{"recipe": request.recipe, "viewer": request.viewer, **converted, **request.settings})
+

@@ -1,0 +1,84 @@
+"""`levels.json` of levels by distance, with the keys of a ladder by zoom: zooms are those of the scene's nearest parts."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.formats.atomic import new_folder, sha256, write_json
+from mipmap_plugin.levels.distance.level import Scene
+from mipmap_plugin.levels.distance.rule import nearest
+from mipmap_plugin.levels.distance.yardstick import TRUTH, WalkPoint
+from mipmap_plugin.levels.manifest import FORMAT, MANIFEST, level_name, refuse_ladder
+
+# px: the shorter side of the canvas that `distances` are written for; they are in proportion to it.
+CANVAS = 1080
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """Levels from the finest to the coarsest, and how good they are on walks."""
+
+    scene: Scene
+    levels: list[Adapted]
+    curve: list[WalkPoint]
+
+
+def write(ladder: Contents, folder: Path, overwrite: bool) -> Path:
+    """Write the levels, a report beside each, and the manifest; the folder appears complete or not at all. Raises OutputExists, OutputError."""
+    refuse_ladder(folder, ladder.scene.base, overwrite=overwrite)
+    with new_folder(folder, overwrite) as temporary:
+        files = [level.save(temporary / level_name(number)) for number, level in enumerate(ladder.levels)]
+        write_json(temporary / MANIFEST, manifest(ladder, files), overwrite=False)
+    return folder
+
+
+def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
+    """The manifest of a ladder whose levels are in `files`."""
+    scene, first = ladder.scene, ladder.levels[0].report
+    near = nearest(scene.pixel_of(scene.splats.means))
+    switches = [scene.rule.ends(number)[1] for number in range(scene.rule.count - 1)]
+    distance, multiplier = scene.rule.playcanvas(CANVAS)
+    return {
+        "format": FORMAT,
+        "by": "distance",
+        "viewer": scene.request.viewer,
+        "base": first.base,
+        "base_pixel": near,
+        "levels": [_entry(ladder, number, file, near) for number, file in enumerate(files)],
+        "switches": [{"pixel": size, "zoom": near / size} for size in switches],
+        "lodBaseDistance": distance,
+        "lodMultiplier": multiplier,
+        "canvas": CANVAS,
+        "chunk_extent": scene.extent,
+        "curve": [asdict(point) for point in ladder.curve],
+        "worst_db": min(point.psnr_db for point in ladder.curve),
+        "mean_db": fmean(point.psnr_db for point in ladder.curve),
+        "measured": TRUTH,
+        "versions": first.versions,
+    }
+
+
+def _entry(ladder: Contents, number: int, file: Path, near: float) -> dict[str, Any]:
+    """One level, and the distances on the canvas between which it is shown; null: no limit."""
+    level, rule = ladder.levels[number], ladder.scene.rule
+    low, high = rule.ends(number)
+    last = number == rule.count - 1
+    to_distance = rule.playcanvas(CANVAS)[0] / rule.first
+    return {
+        "file": file.name,
+        "scale": min(1.0, near / rule.middle(number)) if number else 1.0,
+        "pixel_from": low,
+        "pixel_to": None if last else high,
+        "distance_from": low * to_distance,
+        "distance_to": None if last else high * to_distance,
+        "splats": level.report.gaussians_after,
+        "bytes": file.stat().st_size,
+        "sha256": sha256(file),
+        "seconds": level.report.seconds["total"],
+        "holds": level.report.returned,
+        "psnr_db": {f"{point.pixel:.4g}": point.psnr_db for point in ladder.curve if point.level == number},
+    }

@@ -1,0 +1,84 @@
+"""PlayCanvas's rule: which level of a chunk a camera sees.
+
+A chunk at distance d, times the tangent of half the smaller field of view over that of 22.5°, is shown at level 0 up to `lodBaseDistance`, and at
+level k up to `lodBaseDistance · lodMultiplier^k`. A pixel there is d / f world units wide, f the focal length in px, whatever the canvas: so this is
+a rule for *the size of a pixel in the world*, and a level is made for one such size. For a splat whose closest training view had pixels of size p,
+a level for pixels of size q is at the scale p / q: a near flower at x1/4, say, where a far mountain is still at x1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.levels.request import Band, LadderRequest
+
+# The fraction of splats that were seen with smaller pixels than what counts as the nearest parts of a scene: floaters lie before a camera.
+NEAREST = 0.05
+
+# A scene whose pixels differ by more than this between its near and its far parts is unbounded: of lego's 1.3, of flowers' 16.
+UNBOUNDED = 3.0
+
+
+@dataclass(frozen=True)
+class DistanceRule:
+    """Which level is shown where a pixel has which size. Sizes are in world units, distances in world units times px / px."""
+
+    first: float  # level 0 is shown up to this size of a pixel
+    ratio: float  # level k up to first · ratio^k
+    count: int  # of levels, level 0 included; the last is shown at any larger size
+
+    @classmethod
+    def of(cls, pixels: Tensor, request: LadderRequest, band: Band) -> DistanceRule:
+        """The rule for splats that training saw with pixels of these sizes [N]. `band`: the zooms that level 0 was adapted to.
+
+        The nearest parts of the scene leave level 0 where its band ends; the last level is the one that has them at the coarsest scale.
+        """
+        near = nearest(pixels)
+        first = near / band.low
+        steps = math.log(near / request.coarsest / first) / math.log(band.ratio)
+        return cls(first, band.ratio, 1 + max(1, math.ceil(steps - 1e-6)))
+
+    def level(self, pixels: Tensor) -> Tensor:
+        """The level that is shown where pixels have these sizes; int64 of the same shape."""
+        steps = torch.log(pixels.double().clamp_min(torch.finfo(torch.float64).tiny) / self.first) / math.log(self.ratio)
+        return (steps.floor() + 1).clamp(0, self.count - 1).long()
+
+    def ends(self, level: int) -> tuple[float, float]:
+        """The sizes of a pixel from which and up to which a level is made."""
+        return (self.first * float(self.ratio ** (level - 1)) if level else 0.0), self.first * float(self.ratio**level)
+
+    def middle(self, level: int) -> float:
+        """The size of a pixel that a level below 0 is merged for: the middle of its ends."""
+        return self.first * float(self.ratio ** (level - 0.5))
+
+    def playcanvas(self, canvas: int) -> tuple[float, float]:
+        """`lodBaseDistance` and `lodMultiplier` for a canvas whose shorter side has so many px."""
+        return canvas / 2 / math.tan(math.pi / 8) * self.first, self.ratio
+
+
+def nearest(pixels: Tensor) -> float:
+    """The size of a pixel at the nearest parts of a scene, of the sizes [N] at its splats."""
+    return float(_quantile(pixels, NEAREST))
+
+
+def is_unbounded(means: Tensor, views: Sequence[Camera]) -> bool:
+    """Whether the near and the far parts of a scene need scales of their own. `means` [N, 3]; `views`: of its training."""
+    pixels = pixel_size(means, views)
+    return bool(_quantile(pixels, 1 - NEAREST) > UNBOUNDED * _quantile(pixels, NEAREST))
+
+
+def focal(camera: Camera) -> float:
+    """The focal length in px along the shorter side, which the rule is about."""
+    return camera.fx if camera.width <= camera.height else camera.fy
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    """As torch.quantile, which refuses more than 16 million values."""
+    return values.kthvalue(min(len(values), 1 + round(share * (len(values) - 1)))).values
