@@ -12,12 +12,12 @@ from mipmap_plugin.backends.cpu_kernels.drawing import flags_of, view_of
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, broadcast, fma, lowest_bit, minimum, select, total
 from mipmap_plugin.backends.cpu_kernels.memory import load, row_of, store
 from mipmap_plugin.backends.cpu_kernels.planes import TRANSMITTANCE, distances, new_state
-from mipmap_plugin.backends.cpu_kernels.pool import empty
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.records import Limits, SplatArrays
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import MIN_ALPHA, Effects
+from mipmap_plugin.pool import empty
 
 
 def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None) -> np.ndarray:
