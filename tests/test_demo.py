@@ -7,8 +7,9 @@ from importlib.resources import files
 import pytest
 
 from mipmap_plugin.demo.run import PROTOCOL, WorldView, embedded, run_demo
+from mipmap_plugin.demo.story import story
 from mipmap_plugin.errors import OutputExists
-from mipmap_plugin.evaluation.evaluate import Evaluator
+from mipmap_plugin.evaluation.evaluate import Evaluator, Row
 
 
 def test_the_base_fits_into_two_megabytes_and_knows_its_views():
@@ -30,3 +31,17 @@ def test_a_second_demo_does_not_overwrite_the_first(tmp_path):
     with pytest.raises(OutputExists, match="--overwrite"):
         run_demo(tmp_path, [0.25])
     assert (tmp_path / "x0.25.ply").read_text() == "mine"
+
+
+def test_the_story_says_what_changed_at_each_zoom_and_where_it_is(tmp_path):
+    def row(name: str, scale: float, psnr_db: float, gaussians: int) -> Row:
+        return Row(name, scale, "demo", psnr_db, None, adapt_seconds=6.2, ms_per_view=1.0, gaussians=gaussians)
+
+    rows = [row("base", 0.25, 14.3, 12_000), row("supersampled", 0.25, 36.0, 12_000), row("adapted", 0.25, 30.6, 2_400)]
+    rows += [row("base", 4.0, 14.2, 12_000), row("adapted", 4.0, 19.8, 12_000)]
+    lines = story(rows, "spark", 41.0, tmp_path, tmp_path / "report.html").splitlines()
+    assert "in spark" in lines[0] and len(lines) == 5
+    assert "x1/4" in lines[1] and "base 14.3 dB (thick and bright) -> adapted 30.6 dB, 12,000 -> 2,400 splats, in 6 s" in lines[1]
+    assert "x4" in lines[2] and "needles and holes" in lines[2]
+    assert "41 s" in lines[3] and str(tmp_path) in lines[3]
+    assert lines[4] == f"page: {tmp_path / 'report.html'}"

@@ -7,7 +7,7 @@ from pathlib import Path
 import tyro
 
 from mipmap_plugin.commands.types import Scale
-from mipmap_plugin.commands.voice import say
+from mipmap_plugin.commands.voice import detail, say
 
 
 def demo(
@@ -17,10 +17,10 @@ def demo(
     report: bool = True,
     overwrite: bool = False,
 ) -> None:
-    """Adapt the embedded scene at x1/4 and x4, write before/after pictures and a page, and print a table.
+    """Adapt the embedded scene at x1/8, x1/4 and x4, write before/after pictures and a page, and print what changed.
 
     Args:
-        scale: Scales, instead of 1/4 and 4; may be given several times.
+        scale: Scales, instead of 1/8, 1/4 and 4; may be given several times.
         viewer: The viewer that the files are made for: spark, playcanvas (or supersplat), ...
         output: The folder for the pictures.
         report: Also write report.html, a page that shows the zooms, the viewers and the curves.
@@ -28,4 +28,4 @@ def demo(
     """
     from mipmap_plugin.demo.run import run_demo
 
-    say(run_demo(output, scale or (0.25, 4.0), viewer, report=report, overwrite=overwrite))
+    say(run_demo(output, scale or (0.125, 0.25, 4.0), viewer, report=report, overwrite=overwrite, detail=detail))

@@ -1,0 +1,29 @@
+"""What a demo ends with: a line for each zoom, what it was drawn for, how long it took, and where to look."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mipmap_plugin.evaluation.evaluate import Row
+
+# What is wrong with a base at other zooms (Mip-Splatting, section 1).
+FAULT = {True: "thick and bright", False: "needles and holes"}  # zoomed out, zoomed in
+
+
+def story(rows: Sequence[Row], viewer: str | None, seconds: float, output: Path, page: Path | None) -> str:
+    """Lines for people. rows: the evaluations named base and adapted of each scale, among others; seconds: of the whole demo."""
+    by_name = {(row.scale, row.name): row for row in rows}
+    scales = list(dict.fromkeys(row.scale for row in rows))
+    drawn = f"in {viewer}" if viewer else "in viewers that draw as 3DGS does"
+    lines = [f"The embedded scene {drawn}, three views that nothing was trained on, dB against the ray-traced world:"]
+    for scale in scales:
+        base, adapted = by_name[scale, "base"], by_name[scale, "adapted"]
+        change = f"base {base.psnr_db:.1f} dB ({FAULT[scale < 1]}) -> adapted {adapted.psnr_db:.1f} dB"
+        lines.append(f"  {_zoom(scale):5}{change}, {base.gaussians:,} -> {adapted.gaussians:,} splats, in {adapted.adapt_seconds:.0f} s")
+    lines.append(f"All of it took {seconds:.0f} s. Files and pictures (base | adapted | truth): {output.resolve()}")
+    return "\n".join([*lines, *([f"page: {page}"] if page else [])])
+
+
+def _zoom(scale: float) -> str:
+    return f"x1/{1 / scale:g}" if scale < 1 else f"x{scale:g}"
