@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts, without_none, wrap
+from mipmap_plugin.commands.pages import LEVELS_PAGE as PAGE
+from mipmap_plugin.commands.pages import look_at, write_levels_page
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter
 from mipmap_plugin.config import ViewPolicy
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.splat_transform import refuse_exchange
 
 if TYPE_CHECKING:
-    from mipmap_plugin.levels.request import LadderRequest
-    from mipmap_plugin.wrap import Wrapped
+    from mipmap_plugin.levels.contents import Contents
 
 
 def levels(
@@ -38,6 +39,7 @@ def levels(
     backend: str = "auto",
     threads: int | None = None,
     seed: int = 0,
+    report: bool = False,
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
@@ -63,16 +65,25 @@ def levels(
         backend: Name of a backend; auto chooses the fastest one that can serve the request.
         threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of everything random.
+        report: Also write report.html into the folder: dB over zoom with the switches, and pictures at each.
         overwrite: Replace a ladder that exists.
         json: Print levels.json.
     """
+    from mipmap_plugin.levels.ladder import make_levels
+    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.request import LadderRequest
+    from mipmap_plugin.wrap import state_path
 
-    exports = Exports(streamed_sog, tiles, canvas)
+    exports = Exports(streamed_sog, tiles, canvas, report)
     exports.check(output)
     settings = {"seed": seed, **without_none(views=views, steps=steps)}
     request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, settings)
-    manifest, files = _saved(wrap(checkpoint, cameras, background, backend, screen_filter, threads), request, output, exports, overwrite)
+    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    refuse_ladder(output, wrapped, overwrite=overwrite)
+    ladder = make_levels(wrapped, request, resume=state_path(output))
+    saved = ladder.save(output, overwrite=overwrite)
+    files = exports.write(saved, ladder.contents, checkpoint.resolve().name)
+    manifest = read_manifest(saved)
     if json:
         print_facts(manifest, json)
     else:
@@ -86,6 +97,7 @@ class Exports:
     streamed_sog: bool
     tiles: bool
     canvas: int  # px
+    report: bool = False
 
     def check(self, output: Path) -> None:
         """Raise SettingsError for an impossible canvas, or if splat-transform is needed and not installed."""
@@ -94,23 +106,16 @@ class Exports:
         if self.streamed_sog or self.tiles:
             refuse_exchange(output)
 
-    def write(self, ladder: Path) -> list[Path]:
-        """Write them into the folder of a ladder; return the files that viewers open."""
+    def write(self, ladder: Path, contents: Contents, title: str) -> list[Path]:
+        """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""
+        page = [write_levels_page(ladder, contents, title)] if self.report else []
+        return self._for_viewers(ladder) + page
+
+    def _for_viewers(self, ladder: Path) -> list[Path]:
         from mipmap_plugin.levels.streamed import write_streamed
         from mipmap_plugin.levels.tiles import write_tiles
 
         return ([write_streamed(ladder, self.canvas)] if self.streamed_sog else []) + ([write_tiles(ladder)] if self.tiles else [])
-
-
-def _saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
-    """Make and save a ladder; return its manifest and what was exported."""
-    from mipmap_plugin.levels.ladder import make_levels
-    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
-    from mipmap_plugin.wrap import state_path
-
-    refuse_ladder(output, wrapped, overwrite=overwrite)
-    saved = make_levels(wrapped, request, resume=state_path(output)).save(output, overwrite=overwrite)
-    return read_manifest(saved), exports.write(saved)
 
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = ()) -> None:
@@ -125,4 +130,4 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
     base = min(point["base_db"] for point in manifest["curve"])
     print(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
     print(f"  {manifest['measured']}")
-    print("".join(f"  {path}\n" for path in exports), end="")
+    print("".join(f"{look_at(path)}\n" if path.name == PAGE else f"  {path}\n" for path in exports), end="")
