@@ -17,7 +17,7 @@ from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import over_band
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.commands.levels import print_summary
+from mipmap_plugin.commands.ladders import print_summary
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import OutputExists, SettingsError
@@ -266,5 +266,5 @@ def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     print_summary(tmp_path, manifest)
     said = capsys.readouterr().out
     assert "2 levels" in said and "level_1.ply  x0.5, shown up to" in said and "at worst" in said
-    assert not state_path(tmp_path / "ladder").exists()
+    assert not state_path(tmp_path / "ladder").exists() and not (tmp_path / "ladder" / "report.html").exists()
     assert cli.main(words) == 2 and "--overwrite" in capsys.readouterr().err

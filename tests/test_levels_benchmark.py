@@ -10,6 +10,8 @@ import torch
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
 
 from levels import Dolly, Show, at, changes, film, middle
+from levels_counts import Row
+from levels_counts import page as page_of_counts
 from levels_page import page
 
 from mipmap_plugin import wrap_model
@@ -63,3 +65,11 @@ def test_the_page_compares_films():
     assert "## lego in spark" in text and "5 s for all levels (3, 2)" in text
     cells = [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line.startswith("| base")]
     assert cells[0][1:5] == ["base", "25.0", "27.0", "9.0"]
+
+
+def test_the_lead_of_a_count_is_over_the_better_rival():
+    rivals = {"splat-transform": 26.0, "adaptive": 27.5}
+    row = Row(0.5, 19_000, 0.5, 32.0, 60.0, 29.0, rivals, {"splat-transform": 30.0, "adaptive": 31.0})
+    text = page_of_counts({"flowers_r8": [row]})
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| 19,000")]
+    assert cells == [["19,000", "x0.5", "32.0", "29.0", "26.0 (30.0)", "27.5 (31.0)", "+4.5", "60"]] and "## flowers_r8" in text

@@ -18,7 +18,7 @@ from mipmap_plugin.evaluation.metrics import SAME_DB
 from mipmap_plugin.evaluation.shots import Shot
 from mipmap_plugin.formats.images import data_uri
 from mipmap_plugin.pages.gallery import Gallery
-from mipmap_plugin.pages.html import LARGEST, html, write_levels, write_page
+from mipmap_plugin.pages.html import LARGEST, html, write_page
 from mipmap_plugin.pages.in_viewers import made_for_viewers, viewer_pictures, why_not
 from mipmap_plugin.pages.record import Page, Picture, Zoom, zoom_name
 from mipmap_plugin.pages.reports import adaptation_zoom
@@ -49,7 +49,7 @@ def model_folder(tmp_path):
 
 
 def test_a_page_asks_the_network_for_nothing(tmp_path):
-    text = write_levels(tmp_path / "page.html", "levels", [Zoom("×1/4", 0.25, pictures())], False).read_text()
+    text = write_page(tmp_path / "page.html", Page("levels", "", (), [Zoom("×1/4", 0.25, pictures())]), False).read_text()
     assert "default-src 'none'" in text
     assert all(link.startswith(("data:", "#")) for link in re.findall(r"(?:src|href)=\"([^\"]*)\"", text))
     assert not re.findall(r"url\(|@import|fetch\(|XMLHttpRequest|import\(", text)
@@ -65,7 +65,7 @@ def test_no_name_becomes_markup(tmp_path):
 
 def test_a_page_of_many_large_pictures_stays_below_ten_megabytes(tmp_path):
     zooms = [Zoom(f"×{number}", number, pictures(700)) for number in range(1, 4)]
-    path = write_levels(tmp_path / "page.html", "large", zooms, False)
+    path = write_page(tmp_path / "page.html", Page("large", "", (), zooms), False)
     assert path.stat().st_size <= LARGEST + 4096
     [zoom, *_] = record_of(path)["zooms"]
     assert zoom["size"] == [700, 700] and zoom["shown"][0] < 700
@@ -187,6 +187,28 @@ def test_the_page_of_a_tradeoff_has_the_points_of_its_json(model_folder, tmp_pat
     assert record["tradeoffs"] == written["scales"] and record["provenance"] == written["machine"]
     assert capsys.readouterr().out.splitlines()[-1] == f"page: {folder / 'report.html'}"
     assert main([str(word) for word in (*words, "--no-picture", "--report")]) == 2
+
+
+def test_the_page_of_levels_has_the_figures_of_their_manifest(model_folder, tmp_path, capsys):
+    words = ["levels", model_folder, "--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--report", *BRIEF]
+    assert main([str(word) for word in (*words, "--output", tmp_path / "ladder")]) == 0
+    page = tmp_path / "ladder" / "report.html"
+    assert capsys.readouterr().out.splitlines()[-1] == f"page: {page}"
+    record, manifest = record_of(page), json.loads((tmp_path / "ladder" / "levels.json").read_text())
+    assert record["ladder"] == manifest and record["title"] == "base: levels"
+    [switch] = manifest["switches"]
+    assert [zoom["scale"] for zoom in record["zooms"]] == pytest.approx(sorted({0.5, switch["zoom"], 1.0}))
+    means = {point["zoom"]: point for point in manifest["curve"]}
+    for zoom in record["zooms"]:
+        pictures = {picture["name"]: picture for picture in zoom["pictures"]}
+        assert ("next level" in pictures) == (zoom["scale"] == switch["zoom"])
+        assert [picture["role"] for picture in zoom["pictures"]][:3] == ["base", "adapted", "truth"]
+        if point := means.get(zoom["scale"]):
+            assert pictures["base in antialiased"]["mean"]["psnr_db"] == pytest.approx(point["base_db"])
+    at_switch = next(zoom for zoom in record["zooms"] if zoom["scale"] == switch["zoom"])
+    shown = next(picture for picture in at_switch["pictures"] if picture["name"] == "level shown")
+    assert shown["mean"]["psnr_db"] == pytest.approx(switch["psnr_db"]) and shown["note"] == "level_0.ply"
+    assert f"at worst {manifest['worst_db']:.1f} dB" in record["lead"]
 
 
 def test_viewers_show_the_base_and_the_file_beside_the_truth(monkeypatch):

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.common import print_facts, without_none, wrap
+from mipmap_plugin.commands.common import without_none, wrap
+from mipmap_plugin.commands.ladders import Exports, print_summary, saved
 from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter, Way
 from mipmap_plugin.config import ViewPolicy
-from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.splat_transform import refuse_exchange
-
-if TYPE_CHECKING:
-    from mipmap_plugin.levels.request import LadderRequest
-    from mipmap_plugin.wrap import Wrapped
 
 
 def levels(
@@ -39,6 +31,7 @@ def levels(
     backend: str = "auto",
     threads: int | None = None,
     seed: int = 0,
+    report: bool = False,
     overwrite: bool = False,
     json: bool = False,
 ) -> None:
@@ -66,83 +59,14 @@ def levels(
         backend: Name of a backend; auto chooses the fastest one that can serve the request.
         threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of everything random.
+        report: Also write report.html into the folder: dB over zoom with the switches, and pictures at each.
         overwrite: Replace a ladder that exists.
         json: Print levels.json.
     """
     from mipmap_plugin.levels.request import LadderRequest
 
-    exports = Exports(streamed_sog, tiles, canvas)
+    exports = Exports(streamed_sog, tiles, canvas, checkpoint.resolve().name if report else None)
     exports.check(output)
-    settings = {"seed": seed, **without_none(views=views, steps=steps)}
-    request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, settings, by)
-    manifest, files = _saved(wrap(checkpoint, cameras, background, backend, screen_filter, threads), request, output, exports, overwrite)
-    if json:
-        print_facts(manifest, json)
-    else:
-        print_summary(output, manifest, files)
-
-
-@dataclass(frozen=True)
-class Exports:
-    """What is written besides the levels."""
-
-    streamed_sog: bool
-    tiles: bool
-    canvas: int  # px
-
-    def check(self, output: Path) -> None:
-        """Raise SettingsError for an impossible canvas, or if splat-transform is needed and not installed."""
-        if self.canvas < 1:
-            raise SettingsError(f"canvas: must be at least 1 px, got {self.canvas}")
-        if self.streamed_sog or self.tiles:
-            refuse_exchange(output)
-
-    def write(self, ladder: Path) -> list[Path]:
-        """Write them into the folder of a ladder; return the files that viewers open."""
-        from mipmap_plugin.levels.streamed import write_streamed
-        from mipmap_plugin.levels.tiles import write_tiles
-
-        return ([write_streamed(ladder, self.canvas)] if self.streamed_sog else []) + ([write_tiles(ladder)] if self.tiles else [])
-
-
-def _saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
-    """Make and save a ladder; return its manifest and what was exported."""
-    from mipmap_plugin.levels.ladder import make_levels
-    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
-    from mipmap_plugin.wrap import state_path
-
-    refuse_ladder(output, wrapped, overwrite=overwrite)
-    saved = make_levels(wrapped, request, resume=state_path(output)).save(output, overwrite=overwrite)
-    return read_manifest(saved), exports.write(saved)
-
-
-def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = ()) -> None:
-    """Print what a ladder's manifest says, in lines."""
-    if manifest.get("by") == "distance":
-        _print_distances(folder, manifest)
-    else:
-        _print_zooms(folder, manifest)
-    base = min(point["base_db"] for point in manifest["curve"])
-    print(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
-    print(f"  {manifest['measured']}")
-    print("".join(f"  {path}\n" for path in exports), end="")
-
-
-def _print_zooms(folder: Path, manifest: dict[str, Any]) -> None:
-    print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels")
-    for level in manifest["levels"]:
-        ends = {"down to": level["shown_from"], "up to": level["shown_to"]}
-        shown = ", ".join(f"{word} x{zoom:.3g}" for word, zoom in ends.items() if zoom is not None) or "at every zoom"
-        quality = list(level["psnr_db"].values())
-        print(f"  {level['file']}  x{level['scale']:.3g}, shown {shown}: {min(quality):.1f} to {max(quality):.1f} dB, ", end="")
-        print(f"{level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s")
-
-
-def _print_distances(folder: Path, manifest: dict[str, Any]) -> None:
-    print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels by distance")
-    for level in manifest["levels"]:
-        ends = {"from": level["distance_from"] or None, "to": level["distance_to"]}
-        shown = " ".join(f"{word} {distance:.3g}" for word, distance in ends.items() if distance is not None) or "everywhere"
-        print(f"  {level['file']}  shown {shown}: {level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s")
-    print(f"  distances in world units on a canvas of {manifest['canvas']} px: lodBaseDistance {manifest['lodBaseDistance']:.4g}, ", end="")
-    print(f"lodMultiplier {manifest['lodMultiplier']:.3g}")
+    request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, {"seed": seed, **without_none(views=views, steps=steps)}, by)
+    manifest, files = saved(wrap(checkpoint, cameras, background, backend, screen_filter, threads), request, output, exports, overwrite)
+    print_summary(output, manifest, files, json)

@@ -14,8 +14,12 @@ from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
 if TYPE_CHECKING:
     from mipmap_plugin.adaptation.adapted import Adapted
     from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
+    from mipmap_plugin.levels.contents import Contents
     from mipmap_plugin.pages.gallery import Gallery
     from mipmap_plugin.wrap import Wrapped
+
+# The page in the folder of a ladder.
+LEVELS_PAGE = "report.html"
 
 
 def look_at(page: Path) -> str:
@@ -93,3 +97,13 @@ def write_tradeoff_page(page: Path | None, checkpoint: Path, base: Wrapped, trad
 
     title = f"{checkpoint.resolve().name}: accuracy and time"
     write_page(page, tradeoff_page(title, base, facts(tradeoffs, complete=True), (this_command(),)), overwrite)
+
+
+def write_levels_page(folder: Path, ladder: Contents, title: str) -> Path:
+    """Write the page of a ladder into its folder."""
+    from mipmap_plugin.levels.manifest import read_manifest
+    from mipmap_plugin.pages.html import write_page
+    from mipmap_plugin.pages.levels import levels_page
+
+    page = levels_page(f"{title}: levels", ladder, read_manifest(folder), (this_command(),))
+    return write_page(folder / LEVELS_PAGE, page, overwrite=True)

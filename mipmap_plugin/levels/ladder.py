@@ -59,7 +59,7 @@ def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None
     target = base.target(request.viewer)
     store = LevelStore(None if resume is None else Path(resume), base, request)
     with announced("rendering the base"):
-        yardstick = Yardstick(base, int(request.settings.get("seed", 0)))
+        yardstick = Yardstick(base, request.seed)
     work = _Work(base, request, store, yardstick)
     levels, ratio = [work.first(request.first_ratio(target), as_it_is=target == base.effects())], request.first_ratio(target)
     while not work.ends(levels[-1]):

@@ -79,6 +79,11 @@ class LadderRequest:
             return self.ratio
         return WIDE if target.screen_filter in COMPENSATED or target.eps2d <= SMALL_DILATION else NARROW
 
+    @property
+    def seed(self) -> int:
+        """Of everything random."""
+        return int(self.settings.get("seed", 0))
+
     def facts(self) -> dict[str, Any]:
         """The request as JSON holds it."""
         return {**vars(self), "settings": dict(self.settings)}

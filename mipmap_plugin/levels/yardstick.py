@@ -37,6 +37,11 @@ class Yardstick:
         self._views = [view.window(WINDOW, WINDOW) for view in jittered(base.views(), VIEWS, generator)]
         self._images = {view: base.render(view).image.clamp(0, 1) for view in self._views}
 
+    def example(self) -> tuple[Camera, Tensor]:
+        """One of the views, and the base's own image of it [h, w, 3]."""
+        view = self._views[0]
+        return view, self._images[view]
+
     def psnr(self, level: Adapted, zoom: float) -> float:
         """Mean PSNR (dB) of a level at a zoom."""
         return self._mean(lambda camera, truth: _psnr(level.render(camera).image, truth), zoom)

@@ -22,8 +22,8 @@ function logTicks(low, high) {
 
 const spread = (values) => [Math.min(...values), Math.max(...values)];
 
-/** An empty plot with axes. `bend`: what is done to x before it is placed, such as a logarithm. */
-function plot({ title, x, y, xTicks, bend = (value) => value, xLabel, yLabel }) {
+/** An empty plot with axes. `bend`: what is done to x before it is placed, such as a logarithm; `nameOf`: how x is written. */
+function plot({ title, x, y, xTicks, bend = (value) => value, nameOf = String, xLabel, yLabel }) {
   const [left, right] = x.map(bend), room = (y[1] - y[0] || 1) * 0.08, [bottom, top] = [y[0] - room, y[1] + room];
   const place = {
     x: (value) => MARGIN.left + ((bend(value) - left) / (right - left || 1)) * (WIDTH - MARGIN.left - MARGIN.right),
@@ -34,7 +34,7 @@ function plot({ title, x, y, xTicks, bend = (value) => value, xLabel, yLabel }) 
     svg.append(draw("line", { class: "grid-line", x1: MARGIN.left, x2: WIDTH - MARGIN.right, y1: place.y(tick), y2: place.y(tick) }));
     svg.append(draw("text", { x: MARGIN.left - 6, y: place.y(tick) + 4, "text-anchor": "end" }, String(tick)));
   }
-  for (const tick of xTicks) svg.append(draw("text", { x: place.x(tick), y: HEIGHT - MARGIN.bottom + 17, "text-anchor": "middle" }, String(tick)));
+  for (const tick of xTicks) svg.append(draw("text", { x: place.x(tick), y: HEIGHT - MARGIN.bottom + 17, "text-anchor": "middle" }, nameOf(tick)));
   svg.append(draw("line", { class: "axis", x1: MARGIN.left, x2: WIDTH - MARGIN.right, y1: HEIGHT - MARGIN.bottom, y2: HEIGHT - MARGIN.bottom }));
   svg.append(draw("text", { x: WIDTH - MARGIN.right, y: HEIGHT - 6, "text-anchor": "end" }, xLabel));
   svg.append(draw("text", { x: 4, y: 11 }, yLabel));

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.formats.atomic import json_text, new_file
-from mipmap_plugin.pages.record import Page, Zoom
+from mipmap_plugin.pages.record import Page
 
 # Bytes: what every browser opens at once and every mail carries.
 LARGEST = 9_500_000
@@ -16,7 +15,7 @@ LARGEST = 9_500_000
 # px: how much of each picture is shown, around its middle; the largest that keeps the page small.
 SIDES = (800, 640, 480, 360, 240, 160, 96, 48, 16)
 
-SCRIPTS = ("dom.js", "compare.js", "charts.js", "sections.js")
+SCRIPTS = ("dom.js", "compare.js", "charts.js", "ladder.js", "sections.js")
 
 
 def write_page(path: Path, page: Page, overwrite: bool) -> Path:
@@ -25,11 +24,6 @@ def write_page(path: Path, page: Page, overwrite: bool) -> Path:
     with new_file(path, overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
     return path
-
-
-def write_levels(path: Path, title: str, zooms: Sequence[Zoom], overwrite: bool) -> Path:
-    """Write a page of pictures by zoom, such as those of a ladder of levels. Raises OutputExists and OutputError."""
-    return write_page(path, Page(title, "", (), zooms), overwrite)
 
 
 def html(record: dict[str, Any]) -> str:

@@ -85,6 +85,7 @@ class Page:
     rows: Sequence[dict[str, Any]] = ()  # of a table, as the command's JSON has them
     adaptations: Sequence[dict[str, Any]] = ()  # reports (`adaptation.report`), each with a "title"
     tradeoffs: Sequence[dict[str, Any]] = ()  # scales of a tradeoff.json
+    ladder: dict[str, Any] | None = None  # a levels.json
     effects: Sequence[dict[str, Any]] = ()
     provenance: dict[str, Any] = field(default_factory=dict)
     notes: Sequence[str] = ()

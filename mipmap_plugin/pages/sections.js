@@ -70,6 +70,7 @@ document.getElementById("title").textContent = record.title;
 document.getElementById("lead").textContent = record.lead;
 page.append(
   ...(record.zooms.length ? comparison() : []),
+  ...(record.ladder ? [ladderSection()] : []),
   ...(record.tradeoffs.length ? [tradeoffSection()] : []),
   ...(record.rows.length ? [rowsSection()] : []),
   ...(record.adaptations.length ? [curveSection()] : []),

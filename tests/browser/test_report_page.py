@@ -53,6 +53,15 @@ def tradeoff(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here / "out" / "tradeoff.json"
 
 
+@pytest.fixture(scope="module")
+def ladder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The manifest of a ladder; its page lies beside it."""
+    here = tmp_path_factory.mktemp("ladder")
+    words = ["levels", tiny.folder(here / "base"), "--viewer", "spark", "--coarsest", "1/4", "--ratio", "2", "--steps", "5", "--views", "given"]
+    assert main([str(word) for word in (*words, "--output", here / "levels", "--report")]) == 0
+    return here / "levels" / "levels.json"
+
+
 @pytest.fixture
 def open_page(chromium: Any) -> Iterator[Open]:
     """Opens a page; fails at the end if it had an error or asked for anything but itself."""
@@ -151,8 +160,8 @@ def test_pixels_stay_whole(open_page: Open, evaluation: Path) -> None:
 
 
 @pytest.mark.parametrize("viewport", [PHONE, WIDE], ids=["phone", "wide"])
-def test_nothing_is_wider_than_the_screen(open_page: Open, evaluation: Path, tradeoff: Path, viewport: dict[str, int]) -> None:
-    for path in (evaluation.with_suffix(".html"), tradeoff.with_name("report.html")):
+def test_nothing_is_wider_than_the_screen(open_page: Open, evaluation: Path, tradeoff: Path, ladder: Path, viewport: dict[str, int]) -> None:
+    for path in (evaluation.with_suffix(".html"), tradeoff.with_name("report.html"), ladder.with_name("report.html")):
         page = open_page(path, viewport=viewport)
         assert page.evaluate("document.documentElement.scrollWidth") <= viewport["width"]
 
@@ -181,6 +190,30 @@ def test_a_point_of_the_front_tells_its_figures(open_page: Open, tradeoff: Path)
         page.locator(".chart .mark").first.focus()
         reach()
         assert page.text_content(".readout >> nth=0").startswith(f"{best['name']}, {best['backend']}: {best['psnr_db']['median']:.2f} dB")
+
+
+def test_a_ladder_is_a_curve_over_zoom_with_its_switches_and_levels(open_page: Open, ladder: Path) -> None:
+    page, manifest = open_page(ladder.with_name("report.html")), json.loads(ladder.read_text())
+    assert page.locator("#levels .switch").count() == len(manifest["switches"]) > 0
+    assert page.locator("#levels .mark").count() == len(manifest["curve"])
+    places = page.eval_on_selector_all("#levels .mark", "marks => marks.map(each => Number(each.getAttribute('cx')))")
+    assert places == sorted(places)
+    last = manifest["curve"][-1]
+    page.locator("#levels .mark").last.focus()
+    assert f"{last['psnr_db']:.2f} dB with level_{last['level']}.ply" in page.text_content("#levels .readout")
+    shown = page.eval_on_selector_all("#levels tbody tr", "rows => rows.map(row => [row.cells[0], row.cells[4]].map(cell => cell.textContent))")
+    assert shown == [[level["file"], str(level["splats"])] for level in manifest["levels"]]
+
+
+def test_the_slider_shows_the_level_of_each_zoom(open_page: Open, ladder: Path) -> None:
+    page, manifest = open_page(ladder.with_name("report.html")), json.loads(ladder.read_text())
+    page.focus("#zoom")
+    for zoom in json.loads(page.text_content("#record"))["zooms"]:
+        number = sum(zoom["scale"] < switch["zoom"] for switch in manifest["switches"])
+        assert page.text_content(".card.adapted small >> nth=-1") == f"level_{number}.ply"
+        page.keyboard.press("ArrowRight")
+    assert page.text_content(".zoom output") == "×1" and number == 0
+    assert page.text_content(".names .right").startswith("level shown")
 
 
 def test_the_curve_has_a_mark_for_every_check_and_the_start(open_page: Open, tmp_path: Path) -> None:

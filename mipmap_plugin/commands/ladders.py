@@ -1,0 +1,97 @@
+"""What `mipmap-plugin levels` writes and prints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
+from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.splat_transform import refuse_exchange
+
+if TYPE_CHECKING:
+    from mipmap_plugin.levels.request import LadderRequest
+    from mipmap_plugin.wrapped import Wrapped
+
+
+@dataclass(frozen=True)
+class Exports:
+    """What is written besides the levels."""
+
+    streamed_sog: bool
+    tiles: bool
+    canvas: int  # px
+    title: str | None = None  # of the report page; None: no page
+
+    def check(self, output: Path) -> None:
+        """Raise SettingsError for an impossible canvas, or if splat-transform is needed and not installed."""
+        if self.canvas < 1:
+            raise SettingsError(f"canvas: must be at least 1 px, got {self.canvas}")
+        if self.streamed_sog or self.tiles:
+            refuse_exchange(output)
+
+    def write(self, ladder: Path, contents: Contents | DistanceContents) -> list[Path]:
+        """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""
+        from mipmap_plugin.levels.contents import Contents
+
+        page = [write_levels_page(ladder, contents, self.title)] if self.title is not None and isinstance(contents, Contents) else []
+        return self._for_viewers(ladder) + page
+
+    def _for_viewers(self, ladder: Path) -> list[Path]:
+        from mipmap_plugin.levels.streamed import write_streamed
+        from mipmap_plugin.levels.tiles import write_tiles
+
+        return ([write_streamed(ladder, self.canvas)] if self.streamed_sog else []) + ([write_tiles(ladder)] if self.tiles else [])
+
+
+def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
+    """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once."""
+    from mipmap_plugin.levels.distance.ladder import by_distance
+    from mipmap_plugin.levels.ladder import make_levels
+    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
+    from mipmap_plugin.wrap import state_path
+
+    refuse_ladder(output, wrapped, overwrite=overwrite)
+    if exports.title is not None and by_distance(wrapped, request):
+        raise SettingsError("the page shows levels by zoom, and these are by distance; leave out --report, or add --by zoom")
+    ladder = make_levels(wrapped, request, resume=state_path(output))
+    folder = ladder.save(output, overwrite=overwrite)
+    return read_manifest(folder), exports.write(folder, ladder.contents)
+
+
+def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:
+    """Print a ladder's manifest, as JSON or in lines."""
+    if json:
+        print_facts(manifest, json)
+        return
+    if manifest.get("by") == "distance":
+        _print_distances(folder, manifest)
+    else:
+        _print_zooms(folder, manifest)
+    base = min(point["base_db"] for point in manifest["curve"])
+    print(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
+    print(f"  {manifest['measured']}")
+    print("".join(f"{look_at(path)}\n" if path.name == LEVELS_PAGE else f"  {path}\n" for path in exports), end="")
+
+
+def _print_zooms(folder: Path, manifest: dict[str, Any]) -> None:
+    print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels")
+    for level in manifest["levels"]:
+        ends = {"down to": level["shown_from"], "up to": level["shown_to"]}
+        shown = ", ".join(f"{word} x{zoom:.3g}" for word, zoom in ends.items() if zoom is not None) or "at every zoom"
+        quality = list(level["psnr_db"].values())
+        print(f"  {level['file']}  x{level['scale']:.3g}, shown {shown}: {min(quality):.1f} to {max(quality):.1f} dB, ", end="")
+        print(f"{level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s")
+
+
+def _print_distances(folder: Path, manifest: dict[str, Any]) -> None:
+    print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels by distance")
+    for level in manifest["levels"]:
+        ends = {"from": level["distance_from"] or None, "to": level["distance_to"]}
+        shown = " ".join(f"{word} {distance:.3g}" for word, distance in ends.items() if distance is not None) or "everywhere"
+        print(f"  {level['file']}  shown {shown}: {level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s")
+    print(f"  distances in world units on a canvas of {manifest['canvas']} px: lodBaseDistance {manifest['lodBaseDistance']:.4g}, ", end="")
+    print(f"lodMultiplier {manifest['lodMultiplier']:.3g}")
