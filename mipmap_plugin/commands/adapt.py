@@ -13,6 +13,7 @@ from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.many import Many, Request, adapt_many
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
+from mipmap_plugin.commands.terminal_picture import show_before_and_after
 from mipmap_plugin.commands.types import Background, Checkpoints, Scale, ScreenFilter, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
@@ -137,6 +138,8 @@ def _save_all(base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: Adapt
     reports = []
     for adapted, target in models:
         reports.append(_saved(adapted, target, overwrite, quiet=json))
+        if not json:
+            show_before_and_after(base, adapted)
         if page:
             page.add(base, adapted)
     if page:

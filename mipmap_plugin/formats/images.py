@@ -120,6 +120,12 @@ def png(image: Tensor) -> bytes:
     return file.getvalue()
 
 
+def paletted(image: Tensor, colors: int = 256) -> tuple[np.ndarray, np.ndarray]:
+    """An image [H, W, 3] as numbers of colors, [H, W], and the at most `colors` colors, [C, 3] in 0..255; errors are spread over neighbors."""
+    quantized = Image.fromarray(_bytes(image)).quantize(colors)
+    return np.asarray(quantized), np.asarray(quantized.getpalette()).reshape(-1, 3)[:colors]
+
+
 def data_uri(image: Tensor, side: int) -> str:
     """The middle of an image [h, w, 3], at most `side` x `side` px, as the address of a PNG."""
     height, width = image.shape[:2]
