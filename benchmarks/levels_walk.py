@@ -3,10 +3,9 @@
     python benchmarks/levels_walk.py DATA --ladders DIR
     python benchmarks/levels_walk.py DATA --ladders DIR --only flowers_r8
 
-Ladders that are not in DIR yet are made there: by distance, and by zoom, whose switches PlayCanvas's rule follows as closely as
-it can. The rival is splat-transform's --decimate to the splats of each of our levels, at our distances; it is left out where splat-transform
-is not found. Everything is drawn by our renderer as the viewer draws. Writes levels_walk/<base>_<viewer>.json, and levels_walk.md from all
-in that folder.
+Ladders that are not in DIR yet are made there: by distance, and by zoom, whose switches PlayCanvas's rule follows as closely as it can. The rival is
+splat-transform's --decimate to the splats of each of our levels, at our distances; it is left out where splat-transform is not found. Everything is
+drawn by our renderer as the viewer draws. Writes levels_walk/<base>_<viewer>.json, and levels_walk.md from all in that folder.
 """
 
 from __future__ import annotations

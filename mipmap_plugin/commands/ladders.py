@@ -13,6 +13,8 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.splat_transform import refuse_exchange
 
 if TYPE_CHECKING:
+    from mipmap_plugin.levels.contents import Contents as ZoomContents
+    from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
     from mipmap_plugin.levels.request import LadderRequest
     from mipmap_plugin.wrapped import Wrapped
 
@@ -33,7 +35,7 @@ class Exports:
         if self.streamed_sog or self.tiles:
             refuse_exchange(output)
 
-    def write(self, ladder: Path, contents: Contents | DistanceContents) -> list[Path]:
+    def write(self, ladder: Path, contents: ZoomContents | DistanceContents) -> list[Path]:
         """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""
         from mipmap_plugin.levels.contents import Contents
 

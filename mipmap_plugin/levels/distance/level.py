@@ -26,6 +26,8 @@ from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.candidates import WEIGHT_VIEWS, warm_up_backend
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.target.image_store import ImageStore
+from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.views import GOLDEN, choose_views
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
@@ -137,14 +139,29 @@ class LevelRun:
         truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, begins, SAMPLES)
         finest = [each.gaussians(scene.base.any_camera()).detach() for each in self.finer]
         coming = [scene.unmade(finest[0], level) for level in range(self.number + 1, scene.rule.count)]
-        self.finest, self.others, self.truth = finest[-1], (finest, coming), truth
-        self.validation = Validation(steering, choosing, 1.0, truth, self._render, self.config.resize)
-        self.fixed, self.mixture = 0, Mixture.of(scene.rule, scene.chunks, [])
+        self.finest, self.others = finest[-1], (finest, coming)
+        self.unmerged = Mixture.of(scene.rule, scene.chunks, [*finest, finest[-1], *coming])
+        self.shares = ImageStore(LIMIT, self.finest.means)
+        self.truth = lambda view: truth(view) * self._share(view)
+        self.validation = Validation(steering, choosing, 1.0, self.truth, self._render, self.config.resize)
+        self.fixed, self.mixture = 0, self.unmerged
 
     def _render(self, splats: Gaussians, camera: Camera) -> Tensor:
-        """A view in which the level is shown where the viewer shows it, and all other levels elsewhere."""
+        """A view in which the level is shown where the viewer shows it, and all other levels elsewhere; each pixel counts by its share."""
         drawn = self.mixture.with_student(self.number, splats, camera, self.fixed)
-        return self.scene.backend.render(drawn, camera, self.scene.target).image
+        return self.scene.backend.render(drawn, camera, self.scene.target).image * self._share(camera)
+
+    @torch.no_grad()
+    def _share(self, camera: Camera) -> Tensor:
+        """[H, W, 3], 0..1: the part of each pixel that is this level's. Without it, the level would make up for what others lack elsewhere."""
+
+        def make() -> Tensor:
+            live = self.scene.pixel_of(self.finest.means) < self.size
+            target = self.scene.target
+            plain = replace(target, sh_degree=0, background=(0.0, 0.0, 0.0), settings=target.settings.without_color_rounding())
+            return self.scene.backend.render(self.unmerged.part_of(self.number, live, camera), camera, plain).image.clamp(0, 1)
+
+        return self.shares((camera.viewmat.numpy().tobytes(), camera.size, camera.fx, camera.cx, camera.cy), make)
 
     def run(self, resume: Path | None) -> Adapted:
         """Make the level, or go on with the run that `resume` holds."""

@@ -78,7 +78,7 @@ def _entry(ladder: Contents, number: int, file: Path, near: float) -> dict[str, 
         "splats": level.report.gaussians_after,
         "bytes": file.stat().st_size,
         "sha256": sha256(file),
-        "seconds": level.report.seconds["total"],
+        "seconds": level.report.seconds.get("total", 0.0),
         "holds": level.report.returned,
         "psnr_db": {f"{point.pixel:.4g}": point.psnr_db for point in ladder.curve if point.level == number},
     }

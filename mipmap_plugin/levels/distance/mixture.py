@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.rule import DistanceRule, focal
+from mipmap_plugin.splatting.harmonics import C0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,16 @@ class Mixture:
         still, live = student[rows[rows < fixed]].detach(), student[rows[rows >= fixed]]
         others = [level[shown[self.places[k]] == k] for k, level in enumerate(self.levels) if k != number]
         return together([*others, still, live])
+
+    def part_of(self, number: int, live: Tensor, camera: Camera) -> Gaussians:
+        """The splats that the camera sees, in white those of a level that are `live` [N], all others in black."""
+        shown = self.shown(camera)
+        parts = []
+        for k, (level, place) in enumerate(zip(self.levels, self.places, strict=True)):
+            here = shown[place] == k
+            white = (live[here] if k == number else torch.zeros_like(here[here])).to(level.means)
+            parts.append(replace(level[here], sh=((white - 0.5) / C0)[:, None, None].expand(-1, 1, 3)))
+        return together(parts)
 
 
 def together(parts: Sequence[Gaussians]) -> Gaussians:
