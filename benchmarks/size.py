@@ -177,7 +177,7 @@ def heard(reader: int, began: float) -> tuple[list[float], bytes]:
 def lines(row: dict[str, Any]) -> list[str]:
     """The rows of the table of one command: the whole, then its phases."""
     head = f"| {row['splats']:,} | {row['command']} | {row['version']} |"
-    silence = f"{row['silence']:.1f} ({row['first sign']:.1f})"
+    silence = "" if row["command"] == "load" else f"{row['silence']:.1f} ({row['first sign']:.1f})"
     whole = f"{head} whole | {row['seconds']:.1f} | {row['cpu']:.1f} | {row['peak'] / row['file']:.2f} | {silence} |"
     phases = row["phases"].items() if len(row["phases"]) > 1 else ()
     return [whole, *(f"{head} {name} | {each['seconds']:.1f} | {each['cpu']:.1f} | {each['peak'] / row['file']:.2f} | |" for name, each in phases)]

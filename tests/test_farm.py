@@ -71,6 +71,20 @@ def test_workers_of_this_machine(tmp_path, capsys):
     assert "3 jobs: " in (out := capsys.readouterr().out) and "2 done" in out and "nowhere does not exist" in out
 
 
+@pytest.mark.slow
+def test_files_that_are_sent_come_back_adapted(tmp_path):
+    from mipmap_plugin.jobs.farm import on_dask
+
+    base = tiny.folder(tmp_path / "base", tiny.cameras(3))
+    settings = {"steps": 2, "seed": 0, "views": "given"}
+    jobs = [Job(Base(base, backend="reference"), tmp_path / f"{name}.ply", 0.5, settings=settings) for name in ("a", "b", "c", "d", "e")]
+    outcomes = list(on_dask(jobs, "local:2", threads=1, send_files=True))
+    assert [outcome.status for outcome in outcomes] == ["done"] * 5 and {outcome.file for outcome in outcomes} == {job.target for job in jobs}
+    assert len({job.target.read_bytes() for job in jobs}) == 1
+    assert jobs[0].target.read_bytes() == run(replace(jobs[0], target=tmp_path / "here.ply")).file.read_bytes()
+    assert [outcome.status for outcome in on_dask(jobs[:1], "local:1", threads=1, send_files=True)] == ["finished before"]
+
+
 @pytest.mark.parametrize("place", ["tcp://127.0.0.1:1", "local:0", "nonsense"])
 def test_a_place_without_a_scheduler_is_said_in_a_sentence(tmp_path, capsys, monkeypatch, place):
     monkeypatch.setattr("mipmap_plugin.jobs.farm.CONNECT_S", 0.5)

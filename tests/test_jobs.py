@@ -2,9 +2,11 @@
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -317,6 +319,28 @@ def test_a_job_whose_worker_is_killed_is_done_again(worker, tmp_path):
     assert failed.status == "failed" and "was killed, perhaps for want of memory" in failed.reason
     worker.stop()
     assert do(job_of(tmp_path), worker).status == "interrupted"
+
+
+@pytest.mark.slow
+def test_nothing_is_lost_whenever_a_worker_is_killed(tmp_path):
+    """At 20 moments, from the worker's start to its answer."""
+    job, moments = job_of(tmp_path, settings={"steps": 40, "seed": 0, "views": "given"}), random.Random(0)
+    began = time.monotonic()
+    assert do(replace(job, target=tmp_path / "whole.ply"), Worker(1)).status == "done"
+    seconds, killed = time.monotonic() - began, 0
+    for number in range(20):
+        again, worker, at = replace(job, target=tmp_path / f"{number}.ply"), Worker(1), [moments.uniform(0, seconds)]
+
+        def kill_once(worker=worker, at=at):
+            nonlocal killed
+            if at and not worker.has_ended(at.pop()):
+                killed += 1
+                os.kill(worker._process.pid, signal.SIGKILL)
+
+        assert do(again, worker, kill_once).status == "done"
+        worker.close()
+        assert again.target.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    assert killed >= 10 and not list(tmp_path.glob("*.resume*")) and not list(tmp_path.glob(".*"))
 
 
 def test_side_by_side_makes_the_same_bytes_as_one_after_the_other(run, scenes, tmp_path):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,6 +12,7 @@ import tyro
 
 from mipmap_plugin.commands.common import print_facts, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
+from mipmap_plugin.commands.resuming import resumable, resume_path
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
@@ -72,10 +75,11 @@ def evaluate(
     page = evaluation_page_path(checkpoint[0], output) if report else None
     _refuse(checkpoint, images, [path for path in (output, page) if path], overwrite)
     settings = without_none(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
-    results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page)
-    for path, folder in zip(checkpoint, images, strict=True):
-        wrapped, scene = wrap(path, None, background, backend, screen_filter, threads), _scene(folder, appearance)
-        results.measure(wrapped, scene, appearance, recipe, settings)
+    results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
+    with results.resumable():
+        for path, folder in zip(checkpoint, images, strict=True):
+            wrapped, scene = wrap(path, None, background, backend, screen_filter, threads), _scene(folder, appearance)
+            results.measure(wrapped, scene, appearance, recipe, settings)
     facts = results.write(checkpoint, output, overwrite)
     print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol), published)
 
@@ -83,16 +87,27 @@ def evaluate(
 class _Results:
     """What was measured of all checkpoints."""
 
-    def __init__(self, protocol: str, perceptual: Perceptual | None, scales: list[float], page: Path | None) -> None:
+    def __init__(self, protocol: str, perceptual: Perceptual | None, scales: list[float], page: Path | None, output: Path | None) -> None:
         self._protocol, self._perceptual, self._scales, self._page = protocol, perceptual, scales, page
+        written = output or page
+        self._kept = resume_path(written) if written else None
         self._rows, self._notes, self._galleries = list[Any](), dict[str, None](), list[Any]()  # notes each once, in their order
+
+    def resumable(self) -> AbstractContextManager[None]:
+        """Inside, Ctrl-C says how to go on, and what an earlier command finished is told."""
+        return resumable(self._kept, "row")
 
     def measure(self, wrapped: Wrapped, scene: Scene, appearance: str, recipes: Sequence[str], settings: dict[str, Any]) -> None:
         """Add the rows and notes of one checkpoint."""
         from mipmap_plugin.evaluation import evaluate as evaluation
+        from mipmap_plugin.evaluation.cells import Cells
 
         gallery = evaluation_gallery(wrapped, self._protocol) if self._page else None
-        judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, gallery)
+        lpips = self._perceptual and self._perceptual.label
+        asked = {"protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings, "page": self._page is not None}
+        made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "scene": scene.digest(), "backend": wrapped.backend()[0].name}
+        cells = Cells(self._kept, asked | made_from)
+        judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, gallery, cells)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
         self._notes |= dict.fromkeys(evaluation.notes(wrapped, self._scales, appearance))
         self._galleries.append(gallery)
@@ -108,6 +123,8 @@ class _Results:
             write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
         if output:
             write_json(output, facts, overwrite)
+        if self._kept:
+            shutil.rmtree(self._kept, ignore_errors=True)
         return facts
 
     def print_tables(self, title: str, dataset: Any) -> None:

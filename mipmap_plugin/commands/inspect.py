@@ -44,12 +44,11 @@ def inspect(
 
     with announced(f"reading {checkpoint.name}"):
         model = load_model(checkpoint, iteration=iteration)
-    wrapped = wrap_model(model, screen_filter=screen_filter)
-    view = wrapped.views()[0]
-    gaussians = model.gaussians(view)
     with announced("examining"):
+        wrapped = wrap_model(model, screen_filter=screen_filter)
+        gaussians = model.gaussians(wrapped.views()[0])
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
-    effects = explain(wrapped.effects(), gaussians, effects_of(model))
+        effects = explain(wrapped.effects(), gaussians, effects_of(model))
     with announced("drawing as viewers do"):
         differences = viewer_differences(wrapped) if viewers else "not requested"
     facts = {

@@ -11,6 +11,7 @@ import tyro
 
 from mipmap_plugin.commands.common import print_facts, scene, wrap
 from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
+from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.recipes import recipe as make_config
@@ -69,7 +70,7 @@ def tradeoff(
         overwrite: Replace results that exist.
         json: Print JSON instead of tables.
     """
-    from mipmap_plugin.evaluation.tradeoff.files import Folder, refuse
+    from mipmap_plugin.evaluation.tradeoff.files import KEPT, Folder, refuse
     from mipmap_plugin.evaluation.tradeoff.points import Plan
     from mipmap_plugin.evaluation.tradeoff.run import run
 
@@ -78,7 +79,8 @@ def tradeoff(
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
     model, photographs = wrap(checkpoint, None, background, "auto", screen_filter, threads), scene(images) if images else None
     _check(model, plan, scale)
-    tradeoffs = run(model, photographs, unique_scales(scale), plan, views, Folder(output, picture, overwrite))
+    with resumable(output / KEPT, "cell"):
+        tradeoffs = run(model, photographs, unique_scales(scale), plan, views, Folder(output, picture, overwrite))
     write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite)
     _print(tradeoffs, page, json)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import product
 from statistics import fmean
 from typing import Any
@@ -14,11 +15,22 @@ from tqdm import tqdm
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.evaluation.measure import FILTERS, RenderView, adapt_alone, base_in_viewer, baselines, views_seen, warm_stopwatch, warm_up
+from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.evaluation.measure import (
+    FILTERS,
+    Baseline,
+    RenderView,
+    adapt_alone,
+    base_in_viewer,
+    baselines,
+    views_seen,
+    warm_stopwatch,
+    warm_up,
+)  # fmt: skip
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_exposed, test_views
-from mipmap_plugin.evaluation.shots import Shot, Watcher
+from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
@@ -54,6 +66,18 @@ class Evaluator:
     perceptual: Perceptual | None = None
     scene: str = ""
     watcher: Watcher | None = None  # is shown the first view of each row
+    cells: Cells = field(default_factory=Cells)  # rows that an earlier command finished
+
+    def cell(self, key: dict[str, Any], measure: Callable[[Evaluator], Row]) -> Row:
+        """The row `key`: measured by an evaluator like this one, or kept from before an interruption."""
+        recorder = Recorder(self.watcher)
+        known = self.cells.find(key)
+        if known is None:
+            row = measure(replace(self, watcher=recorder))
+            self.cells.keep(key, {"row": asdict(row), **recorder.taken()})
+            return row
+        recorder.replay(known, self.views[0].camera)
+        return Row(**known["row"])
 
     def row(self, name: str, scale: float, show: RenderView, **facts: Any) -> Row:
         """The mean quality of `show(camera at the base scale)` over the views. PSNRs of views are averaged, as in the literature."""
@@ -90,9 +114,12 @@ def training_free_rows(
     count = len(model.model.gaussians(model.any_camera()))
     filters = [name for name in FILTERS if name not in without]
     found = baselines(model, scale, judge.protocol.shrink_by, filters=filters, upsampler=upsampler)
-    rows = [judge.row(baseline.name, scale, baseline.render, gaussians=count) for baseline in found]
     in_viewers = [base_in_viewer(name, model, scale) for name in viewers_for(viewer)] if viewer else []
-    return rows + worst([judge.row(baseline.name, scale, baseline.render, gaussians=count) for baseline in in_viewers])
+
+    def row(baseline: Baseline) -> Row:
+        return judge.cell({"row": baseline.name, "scale": scale}, lambda judge: judge.row(baseline.name, scale, baseline.render, gaussians=count))
+
+    return [row(baseline) for baseline in found] + worst([row(baseline) for baseline in in_viewers])
 
 
 def worst(rows: Sequence[Row]) -> list[Row]:
@@ -131,13 +158,15 @@ def adapted_row(name: str, adapted: Adapted, judge: Evaluator) -> Row:
     return worst([row(viewer) for viewer in adapted.viewers])[0]
 
 
-def evaluator_of(model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, watcher: Watcher | None = None) -> Evaluator:
-    """What compares a model with the photographs of its scene. Raises SettingsError."""
+def evaluator_of(
+    model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, watcher: Watcher | None = None, cells: Cells | None = None
+) -> Evaluator:
+    """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
     scene = model.place(scene)
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
     views = test_views(scene, model.cameras[0], model.background)
-    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, watcher)
+    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, watcher, cells or Cells())
 
 
 def evaluate(
@@ -166,12 +195,24 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
         make_config(name, scale)
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
-        if recipes and (scale != 1 or viewer):
-            warm_up(model, scale, model.cameras)
-        for name, on in product(recipes if scale != 1 or viewer else [], ("train", "scored")):
-            adapted = adapt_alone(model, scale, recipe=name, **(settings | _views(make_config(name, scale), on, judge.views)))
-            rows.append(adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge))
+        rows += _adapted_rows(model, judge, scale, recipes, settings) if scale != 1 or viewer else []
     return rows
+
+
+def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Sequence[str], settings: dict[str, Any]) -> list[Row]:
+    """The rows of each recipe, adapted to the training poses and to the evaluated ones."""
+    warm = False
+
+    def adapted(name: str, on: str, judge: Evaluator) -> Row:
+        nonlocal warm
+        if not warm:
+            warm_up(model, scale, model.cameras)
+            warm = True
+        adapted = adapt_alone(model, scale, recipe=name, **(settings | _views(make_config(name, scale), on, judge.views)))
+        return adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge)
+
+    each = product(recipes, ("train", "scored"))
+    return [judge.cell({"recipe": name, "on": on, "scale": scale}, partial(adapted, name, on)) for name, on in each]
 
 
 def _views(config: AdaptConfig, on: str, judged: Sequence[TruthView]) -> dict[str, Any]:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.evaluation.photographs import packed, unpacked
+
+# What is kept of a shot beside its images.
+SHOT_FACTS = ("row", "scene", "scale", "psnr_db", "ssim", "lpips")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,3 +38,47 @@ class Watcher(Protocol):
 
     def adapted(self, row: str, adapted: Adapted) -> None:
         """The row of this name is about to be evaluated for `adapted`."""
+
+    def restored(self, row: str, report: dict[str, Any]) -> None:
+        """The row of this name was evaluated before an interruption, for an adaptation with this report."""
+
+
+class Recorder:
+    """A watcher that keeps what it is told about a row, for a cell (`cells`), and tells another watcher."""
+
+    def __init__(self, other: Watcher | None) -> None:
+        self._other = other
+        self._shots: list[dict[str, Any]] = []
+        self._reports: list[tuple[str, dict[str, Any]]] = []
+
+    def shot(self, shot: Shot) -> None:
+        """Keep a row's first view."""
+        images = {"image": packed(shot.image.cpu()), "truth": packed(shot.truth.cpu())}
+        self._shots.append({name: getattr(shot, name) for name in SHOT_FACTS} | images)
+        if self._other:
+            self._other.shot(shot)
+
+    def adapted(self, row: str, adapted: Adapted) -> None:
+        """Keep a report."""
+        self._reports.append((row, adapted.report.model_dump(mode="json")))
+        if self._other:
+            self._other.adapted(row, adapted)
+
+    def restored(self, row: str, report: dict[str, Any]) -> None:
+        """Tell the other watcher."""
+        if self._other:
+            self._other.restored(row, report)
+
+    def taken(self) -> dict[str, Any]:
+        """What was kept since the last call; without images if nobody watches."""
+        kept = {"shots": self._shots if self._other else [], "reports": self._reports}
+        self._shots, self._reports = [], []
+        return kept
+
+    def replay(self, kept: dict[str, Any], camera: Camera) -> None:
+        """Tell the other watcher what was kept of a row; `camera`: of the first view."""
+        for row, report in kept["reports"]:
+            self.restored(row, report)
+        for shot in kept["shots"] if self._other else ():
+            images = {name: unpacked(shot[name]) for name in ("image", "truth")}
+            self._other.shot(Shot(camera=camera, **{**shot, **images}))  # type: ignore[union-attr]  # the loop is empty without it

@@ -48,6 +48,11 @@ class Gallery:
             seen = self._shots[scale][0]
             self._viewers[scale] = viewer_pictures(self._base, adapted, seen.camera.zoomed(scale), seen.truth)
 
+    def restored(self, row: str, report: dict[str, Any]) -> None:
+        """Keep the report of an adaptation from before an interruption; its file is no longer there to be drawn as viewers do."""
+        self._adapted[row] = report["scale"]
+        self.adaptations.append({"title": f"{zoom_name(report['scale'])}, {row}", **report})
+
     def effects(self) -> list[dict[str, Any]]:
         """The effects of the base."""
         return effects_of_base(self._base)
@@ -62,7 +67,8 @@ class Gallery:
         pictures = [Picture(shot.row, self._role(shot, in_viewer), shot.image, _quality(shot), means.get(shot.row, {})) for shot in shots]
         pictures.append(Picture("truth", "truth", shots[0].truth, note=self._truth))
         label = f"{shots[0].scene} {zoom_name(scale)}" if named else zoom_name(scale)
-        reason = why_not(self._base) if any(each == scale for each in self._adapted.values()) else "Nothing was adapted: give --recipe default."
+        restored = why_not(self._base) or "It was adapted before an interruption, after which viewers' pictures are not drawn again."
+        reason = restored if any(each == scale for each in self._adapted.values()) else "Nothing was adapted: give --recipe default."
         return Zoom(
             label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", self._viewers.get(scale, ()),
             "" if scale in self._viewers else reason,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import os
 import platform
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,16 @@ from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwrita
 
 NAMES = ("tradeoff.json", "tradeoff.csv", "tradeoff.png")
 
+# The folder, in that of the results, with what an interrupted command had measured (`cells`).
+KEPT = "tradeoff.resume"
+
 
 def refuse(folder: Path, picture: bool, overwrite: bool) -> None:
     """Raise now the errors that `write` would raise at the end: OutputExists, and SettingsError without matplotlib."""
     if picture:
         figure_class()
     for name in NAMES:
-        refuse_output(folder / name, overwrite, is_file=True)
+        refuse_output(folder / name, goes_on(Folder(folder, picture, overwrite)).overwrite, is_file=True)
     refuse_unwritable(folder / NAMES[0])
 
 
@@ -53,6 +57,21 @@ class Folder:
     path: Path
     picture: bool  # whether to write the plot
     overwrite: bool
+
+
+def goes_on(folder: Folder) -> Folder:
+    """The folder, whose results are replaced if they are those of an interrupted command, which are incomplete."""
+    return replace(folder, overwrite=folder.overwrite or ((folder.path / KEPT).is_dir() and not _is_complete(folder.path / NAMES[0])))
+
+
+def _is_complete(file: Path) -> bool:
+    """Whether a file has all results of a command; unreadable ones have to be looked at by a person."""
+    try:
+        return bool(json.loads(file.read_text(encoding="utf-8"))["complete"])
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError, KeyError, TypeError):
+        return True
 
 
 def write(folder: Folder, tradeoffs: Sequence[Tradeoff], *, complete: bool) -> None:

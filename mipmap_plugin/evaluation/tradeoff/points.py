@@ -4,8 +4,9 @@ adaptation. The time to measure quality is not counted, and evaluated views are 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.measure import (
     BASE,
     FILTERS,
@@ -101,26 +103,60 @@ class Plan:
             raise SettingsError("repeats must be at least 1, and supersampling at least 2")
 
 
-def measure(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan) -> Iterator[Point]:
-    """Yield each point as soon as it is measured. Raises SettingsError and BackendUnavailable."""
+def measure(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan, cells: Cells | None = None) -> Iterator[Point]:
+    """Yield each point as soon as it is measured, or found in `cells`. Raises SettingsError and BackendUnavailable."""
+    cells = cells or Cells()
     runs = [(name, steps, backend) for backend in plan.backends for name in plan.recipes for steps in plan.steps or (None,)]
     free = [baseline for backend in plan.backends for baseline in _baselines(on_backend(model, backend), truth, scale, plan)]
     count = len(model.model.gaussians(model.any_camera()))
     bar = tqdm(total=len(free) + len(runs) * plan.repeats + len(RENDERERS) * plan.renderers, disable=None, desc=f"tradeoff x{scale:g}")
-    first: Adapted | None = None
+    adapted: dict[tuple[str, int | None, str], Adapted] = {}
+    warm: set[str] = set()
+
+    def kept(key: dict[str, Any], measure: Callable[[], list[Point]]) -> list[Point]:
+        return _kept(cells, {"scale": scale, "truth": truth.label, "repeats": plan.repeats, "seed": plan.seed, "viewer": plan.viewer} | key, measure)
+
+    def shown(baseline: Baseline) -> list[Point]:
+        return [_measured(Point(scale, baseline.kind, baseline.name, baseline.backend, count), baseline.render, truth, plan.repeats)]
+
+    def run(name: str, steps: int | None, backend: str) -> list[Point]:
+        if backend not in warm:
+            warm_up(on_backend(model, backend), scale, truth.adapt_on)
+            warm.add(backend)
+        points, adapted[name, steps, backend] = _run(on_backend(model, backend), truth, scale, plan, (name, steps), bar)
+        return points
+
+    def rendered() -> list[Point]:
+        if runs and runs[0] not in adapted:  # it was measured before an interruption
+            run(*runs[0])
+        shown = _renderers(model, adapted[runs[0]] if runs else None, scale)
+        return [_measured(point, show, truth, plan.repeats) for point, show in shown]
+
     with bar:
         for baseline in free:
-            yield _measured(Point(scale, baseline.kind, baseline.name, baseline.backend, count), baseline.render, truth, plan.repeats)
+            yield from kept({"baseline": baseline.name, "backend": baseline.backend}, partial(shown, baseline))
             bar.update()
-        for backend in plan.backends if runs else ():
-            warm_up(on_backend(model, backend), scale, truth.adapt_on)
         for name, steps, backend in runs:
-            points, adapted = _run(on_backend(model, backend), truth, scale, plan, (name, steps), bar)
-            yield from points
-            first = first or adapted
-        for point, show in _renderers(model, first, scale) if plan.renderers else ():
-            yield _measured(point, show, truth, plan.repeats)
-            bar.update()
+            yield from kept({"recipe": name, "steps": steps, "backend": backend}, partial(run, name, steps, backend))
+        if plan.renderers:
+            yield from kept({"renderers": runs[:1]}, rendered)
+            bar.update(len(RENDERERS))
+
+
+def _kept(cells: Cells, key: dict[str, Any], measure: Callable[[], list[Point]]) -> list[Point]:
+    """The points of a cell: measured now, or kept from before an interruption."""
+    known = cells.find(key)
+    if known is None:
+        points = measure()
+        cells.keep(key, {"points": [asdict(point) for point in points]})
+        return points
+    return [_point(facts) for facts in known["points"]]
+
+
+def _point(facts: dict[str, Any]) -> Point:
+    """The point that `asdict` made these facts of."""
+    values: dict[str, Any] = {name: Spread(**value) if isinstance(value, dict) else value for name, value in facts.items()}
+    return Point(**values)
 
 
 def on_backend(model: Wrapped, name: str) -> Wrapped:

@@ -1,0 +1,55 @@
+"""Finished cells of a long measurement, each in a file of its own: after Ctrl-C or a kill the same command begins with the one in progress.
+
+A cell is found again by its provenance: the hash of everything that it depends on is its file's name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.adaptation.report import versions
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.torch_file import load_torch, save_torch
+
+
+class Cells:
+    """The cells of one measurement in a folder, or nowhere."""
+
+    def __init__(self, folder: Path | None = None, provenance: Mapping[str, Any] | None = None) -> None:
+        """`provenance`: what all cells depend on, as JSON: the base, the photographs, the protocol, the settings."""
+        self.folder, self._provenance = folder, {**(provenance or {}), "versions": versions()}
+        self.found = self.kept = 0  # cells that an earlier command had finished; that are in the folder
+
+    def find(self, key: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The content of a cell, if an earlier command finished it."""
+        file = self._file(key)
+        if file is None or not file.is_file():
+            return None
+        try:
+            content: dict[str, Any] = load_torch(file)
+        except CheckpointError:  # cut off by a crash of the machine
+            return None
+        self.found, self.kept = self.found + 1, self.kept + 1
+        return content
+
+    def remove(self) -> None:
+        """Delete the folder, when everything is written elsewhere."""
+        if self.folder is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def keep(self, key: Mapping[str, Any], content: dict[str, Any]) -> None:
+        """Write a finished cell, of tensors and plain values, atomically. Raises OutputError."""
+        file = self._file(key)
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            save_torch(file, content, overwrite=True)
+            self.kept += 1
+
+    def _file(self, key: Mapping[str, Any]) -> Path | None:
+        facts = json.dumps([self._provenance, dict(key)], sort_keys=True, default=str)
+        return self.folder and self.folder / f"{hashlib.sha256(facts.encode()).hexdigest()[:24]}.pt"

@@ -1,0 +1,101 @@
+"""Evaluate and tradeoff after Ctrl-C and kill -9: the same command goes on with the cell that was in progress, and comes to the same results."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+import tiny
+from running import wait_until
+
+from mipmap_plugin.cli import main
+from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.formats.torch_file import load_torch
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A base and photographs of it."""
+    tiny.folder(tmp_path / "base", tiny.cameras(3))
+    tiny.scene(tmp_path / "scene", train=tiny.cameras(2), count=30)
+    return tmp_path
+
+
+def evaluate(folder, output):
+    words = ["evaluate", folder / "base", "--images", folder / "scene", "--scale", "1/2", "--recipe", "paper", "--steps", "20"]
+    return [*map(str, words), "--backend", "reference", "--output", str(folder / output)]
+
+
+def tradeoff(folder, output):
+    words = ["tradeoff", folder / "base", "--scale", "1/2", "--recipe", "default", "--steps", "20", "--backend", "reference"]
+    words += ["--output", folder / output, "--supersampling", "2", "--repeats", "1", "--views", "1"]
+    return [*map(str, words), "--no-renderers", "--no-picture"]
+
+
+def stopped(words, number, cells, at_least):
+    """Run a command until so many cells are kept, and send it a signal; return what it said."""
+    process = subprocess.Popen([sys.executable, "-m", "mipmap_plugin.cli", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        wait_until(lambda: len(list(cells.glob("*.pt"))) >= at_least or process.poll() is not None)
+        assert process.poll() is None, process.communicate()[1]
+        os.kill(process.pid, number)
+        _, said = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    return process.returncode, said
+
+
+def untimed(rows):
+    return [{name: value for name, value in row.items() if name not in ("adapt_seconds", "ms_per_view")} for row in rows]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill -9"])
+def test_evaluate_goes_on_where_it_stopped(folder, capsys, number):
+    kept = folder / "rows.json.resume"
+    code, said = stopped(evaluate(folder, "rows.json"), number, kept, 3)
+    before = {path.name: path.stat().st_mtime_ns for path in kept.glob("*.pt")}
+    assert len(before) >= 3 and not (folder / "rows.json").exists()
+    if number == signal.SIGINT:
+        assert code == 130 and f"interrupted with {len(before)} rows finished; run the same command again to go on" in said
+    assert main(evaluate(folder, "rows.json")) == 0
+    assert f"rows.json.resume has {len(before)} rows of a command that was interrupted" in capsys.readouterr().err
+    assert not kept.exists() and (folder / "rows.html").exists()
+    assert main(evaluate(folder, "whole.json")) == 0
+    interrupted, whole = (json.loads((folder / name).read_text())["rows"] for name in ("rows.json", "whole.json"))
+    assert untimed(interrupted) == untimed(whole)
+
+
+def test_tradeoff_goes_on_where_it_was_killed(folder, capsys):
+    kept = folder / "new" / "tradeoff.resume"
+    stopped(tradeoff(folder, "new"), signal.SIGKILL, kept, 3)
+    points = [point for path in kept.glob("*.pt") for point in load_torch(path)["points"]]
+    assert main(tradeoff(folder, "new")) == 0
+    assert "cells of a command that was interrupted" in capsys.readouterr().err and not kept.exists()
+    [told] = json.loads((folder / "new" / "tradeoff.json").read_text())["scales"]
+    timed = {(point["name"], point["step"]): point["ms_per_frame"] for point in told["points"]}
+    assert len(points) >= 3 and all(timed[point["name"], point["step"]] == point["ms_per_frame"] for point in points)  # the same measurement
+
+
+def test_a_finished_command_is_not_replaced(folder):
+    assert main(tradeoff(folder, "new")) == 0
+    (folder / "new" / "tradeoff.resume").mkdir()
+    assert main(tradeoff(folder, "new")) == 2
+
+
+def test_a_cell_is_found_by_all_that_it_depends_on(tmp_path):
+    Cells(tmp_path, {"base": "a"}).keep({"row": "base", "scale": 0.5}, {"psnr": 1.0})
+    assert Cells(tmp_path, {"base": "a"}).find({"scale": 0.5, "row": "base"}) == {"psnr": 1.0}
+    assert Cells(tmp_path, {"base": "b"}).find({"row": "base", "scale": 0.5}) is None
+    assert Cells(tmp_path, {"base": "a"}).find({"row": "base", "scale": 0.25}) is None
+    [file] = tmp_path.iterdir()
+    file.write_bytes(file.read_bytes()[:-9])
+    assert Cells(tmp_path, {"base": "a"}).find({"row": "base", "scale": 0.5}) is None
+
+
+def test_without_a_place_nothing_is_kept(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cells = Cells()
+    cells.keep({"row": "base"}, {"psnr": 1.0})
+    assert cells.find({"row": "base"}) is None and not list(tmp_path.iterdir())
