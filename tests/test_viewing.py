@@ -248,19 +248,20 @@ def test_of_large_views_of_the_scene_the_middle_is_adapted_to(base):
 def test_a_run_shows_its_states_and_stopped_it_returns_the_best_and_the_base_stays(base, monkeypatch):
     monkeypatch.setattr(adapting, "MEASURED_EVERY_S", 0.0)
     before, request = digest(base), wish(base)
-    adapter = Adapter(base, Supersampled("supersampled", base), changed=lambda: len(adapter.progress.curve) > 3 and adapter.stop())
-    live, shown, over = Live(adapter, File("base", base)), [], threading.Event()
+    seen, over = threading.Event(), threading.Event()  # the run goes on until a state was seen, however slow this machine is
+    adapter = Adapter(base, Supersampled("supersampled", base), lambda: seen.is_set() and len(adapter.progress.curve) > 3 and adapter.stop())
+    live, start = Live(adapter, File("base", base)), File("base", base).render(Request(request.screen, request.zoom))
     adapter.start(request, over.set)
     while not over.is_set():
-        shown.append(live.render(Request(request.screen, request.zoom)))
+        if not torch.equal(live.render(Request(request.screen, request.zoom)), start):
+            seen.set()
     progress = adapter.progress
     assert progress.trouble == "" and not progress.running and digest(base) == before
     report = progress.adapted.report
-    assert (report.scale, report.ended_by) == (0.5, "its observer") and report.curve[-1].step == 3
+    assert (report.scale, report.ended_by) == (0.5, "its observer") and report.curve[-1].step >= 3
     assert report.validation[report.returned] > max(report.validation.values()) - 0.02  # of equals the last
-    assert len(progress.curve) == 4 and progress.curve[0][0] < progress.curve[-1][0]
-    assert any(not torch.equal(picture, shown[-1]) for picture in shown)
-    assert live.shown(0.5) == "adapting, step 3" and live.splats(Request(request.screen, 0.5)) is None
+    assert seen.is_set() and len(progress.curve) >= 4 and progress.curve[0][0] < progress.curve[-1][0]
+    assert live.shown(0.5) == f"adapting, step {report.curve[-1].step}" and live.splats(Request(request.screen, 0.5)) is None
 
 
 def test_what_cannot_be_adapted_is_told(base):

@@ -87,16 +87,16 @@ def tradeoff_page_path(folder: Path, overwrite: bool) -> Path:
     return folder / "report.html"
 
 
-def write_tradeoff_page(page: Path | None, checkpoint: Path, base: Wrapped, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> None:
-    """Write the page of a tradeoff, unless `page` is None."""
+def write_tradeoff_page(page: Path | None, checkpoint: Path, base: Wrapped, tradeoffs: Sequence[Tradeoff], overwrite: bool) -> Path | None:
+    """Write the page of a tradeoff, unless `page` is None, and return it."""
     if page is None:
-        return
+        return None
     from mipmap_plugin.evaluation.tradeoff.files import facts
     from mipmap_plugin.pages.html import write_page
     from mipmap_plugin.pages.reports import tradeoff_page
 
     title = f"{checkpoint.resolve().name}: accuracy and time"
-    write_page(page, tradeoff_page(title, base, facts(tradeoffs, complete=True), (this_command(),)), overwrite)
+    return write_page(page, tradeoff_page(title, base, facts(tradeoffs, complete=True), (this_command(),)), overwrite)
 
 
 def write_levels_page(folder: Path, ladder: Contents, title: str) -> Path:

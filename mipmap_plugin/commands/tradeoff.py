@@ -63,7 +63,7 @@ def tradeoff(
         views: Maximum number of views to evaluate on.
         background: Of the scene; by default that of the checkpoint, or else black.
         screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
-        threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
+        threads: Maximum number of processor threads; by default as many as torch finds.
         seed: Seed of the first repeat.
         picture: Draw tradeoff.png, which needs the extra `plot`.
         report: Also write report.html, a page whose fronts tell each point under the pointer.
@@ -81,8 +81,7 @@ def tradeoff(
     _check(model, plan, scale)
     with resumable(output / KEPT, "cell"):
         tradeoffs = run(model, photographs, unique_scales(scale), plan, views, Folder(output, picture, overwrite))
-    write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite)
-    _print(tradeoffs, page, json)
+    _print(tradeoffs, write_tradeoff_page(page, checkpoint, model, tradeoffs, overwrite), json)
 
 
 def _check(model: Wrapped, plan: Plan, scales: Sequence[float]) -> None:
