@@ -5,6 +5,7 @@ import json
 import math
 import sys
 import threading
+import time
 from dataclasses import replace
 
 import anchor_checkpoints
@@ -271,12 +272,28 @@ def test_what_cannot_be_adapted_is_told(base):
 
 
 def test_only_one_run_at_a_time(base):
-    adapter = Adapter(base, Supersampled("supersampled", base))
-    adapter.start(wish(base, recipe="instant"))
+    adapter, over = Adapter(base, Supersampled("supersampled", base)), threading.Event()
+    adapter.start(wish(base, recipe="instant"), over.set)
     with pytest.raises(SettingsError, match="stop it first"):
         adapter.start(wish(base))
+    assert over.wait(120) and adapter.progress.adapted is not None
+
+
+def test_a_run_that_is_preparing_ends_with_the_program(base, monkeypatch):
+    monkeypatch.setattr(adapting, "GRACE_S", 0.1)
+    preparing = threading.Event()
+
+    def forever(*_, **__):
+        preparing.set()
+        while True:
+            time.sleep(0.01)
+
+    monkeypatch.setattr(base, "adapt", forever)
+    adapter = Adapter(base, Supersampled("supersampled", base))
+    adapter.start(wish(base))
+    assert preparing.wait(60) and adapter.picture(base.cameras[0]) is None
     adapter.close()
-    assert adapter.progress.adapted is not None
+    assert not adapter.progress.running and adapter.progress.adapted is None and not adapter._thread.is_alive()
 
 
 def test_a_zoom_is_rounded_to_the_scale_of_a_file(base):

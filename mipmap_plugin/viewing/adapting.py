@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import threading
 import time
@@ -32,8 +33,8 @@ VALIDATION_VIEWS = 10
 # A zoom that differs from x1 by less is x1.
 SAME_ZOOM = 0.03
 
-# Seconds that a run may take to end when the program does.
-GRACE_S = 10.0
+# Seconds that a run may take to end when the program does: with its next step, and in the middle of whatever it does.
+GRACE_S, LAST_GRACE_S = 2.0, 20.0
 
 
 @dataclass(frozen=True)
@@ -77,15 +78,16 @@ class Adapter:
         self._warm = set[str | None]()  # the viewers that were adapted for before
         self._stopping = threading.Event()
         self._asked: Camera | None = None  # whose picture somebody waits for
-        self._answer: Tensor | None = None
-        self._talk = threading.Condition()  # guards these two
+        self._answer: tuple[Camera, Tensor] | None = None  # the last picture, and whose it is
+        self._stepping = False  # the run takes steps, and answers between them
+        self._talk = threading.Condition()  # guards these three
 
     def start(self, wish: Wish, then: Callable[[], None] = lambda: None) -> None:
         """Begin a run, and call `then` in its thread when it has ended. Raises SettingsError while one is running."""
         if self.progress.running:
             raise SettingsError("an adaptation is running; stop it first")
         self._stopping.clear()
-        self._answer = None
+        self._answer, self._stepping = None, False
         self.progress = Progress(wish, running=True)
         self._thread = threading.Thread(target=self._run, args=(wish, then), name="adapting", daemon=True)
         self._thread.start()
@@ -95,17 +97,22 @@ class Adapter:
         self._stopping.set()
 
     def close(self) -> None:
-        """End the run, and wait for it for a while."""
+        """End the run with the program: after its next step or, if that takes long, in the middle of it, without a result."""
         self.stop()
-        if self._thread is not None:
-            self._thread.join(GRACE_S)
+        if self._thread is None:
+            return
+        self._thread.join(GRACE_S)
+        if self._thread.is_alive():  # a thread that still computes when Python ends makes it crash
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread.ident or 0), ctypes.py_object(SystemExit))
+            self._thread.join(LAST_GRACE_S)
 
     def picture(self, camera: Camera) -> Tensor | None:
-        """What a camera of the new scale sees of the run's state, [H, W, 3]; the last such picture while no step is taken, None before any."""
+        """What a camera of the new scale sees of the run's state, [H, W, 3]; None while no step is taken, unless it was drawn before."""
         with self._talk:
-            self._asked = camera
-            self._talk.wait_for(lambda: self._asked is not camera or not self.progress.running, PATIENCE_S)
-            return self._answer
+            if self._stepping:
+                self._asked = camera
+                self._stepping = self._talk.wait_for(lambda: self._asked is not camera or not self.progress.running, PATIENCE_S)
+            return self._answer[1] if self._answer is not None and alike(self._answer[0], camera) else None
 
     def _run(self, wish: Wish, then: Callable[[], None]) -> None:
         try:
@@ -115,6 +122,8 @@ class Adapter:
         except Exception as error:
             self._set(trouble=f"{type(error).__name__}: {error}", running=False)
             raise
+        except SystemExit:  # of `close`
+            self._set(running=False)
         finally:
             with self._talk:
                 self._talk.notify_all()
@@ -148,10 +157,10 @@ class Adapter:
         return observe
 
     def _answer_with(self, render: Callable[[Camera], Tensor]) -> None:
-        camera = self._asked
+        camera, self._stepping = self._asked, True
         if camera is None:
             return
-        answer = render(camera)
+        answer = camera, render(camera)
         with self._talk:
             self._answer = answer
             if self._asked is camera:
@@ -161,6 +170,11 @@ class Adapter:
     def _set(self, **changes: object) -> None:
         self.progress = replace(self.progress, **changes)  # type: ignore[arg-type]  # mypy does not check these names
         self._changed()
+
+
+def alike(one: Camera, other: Camera) -> bool:
+    """Whether two cameras give the same picture."""
+    return one.size == other.size and (one.fx, one.fy) == (other.fx, other.fy) and torch.equal(one.viewmat, other.viewmat)
 
 
 def psnr(image: Tensor, truth: Tensor) -> float:
@@ -179,7 +193,7 @@ class Live:
     def render(self, request: Request) -> Tensor:
         """The picture, [H, W, 3], as the viewer draws it that the run is for."""
         image = self._adapter.picture(request.camera) if self._adapter.progress.running else None
-        return image if image is not None and image.shape[:2] == request.camera.size else self._base.render(request)
+        return self._base.render(request) if image is None else image
 
     def shown(self, zoom: float) -> str:
         """The step."""
