@@ -4,8 +4,8 @@
     python benchmarks/levels.py DATA --ladders DIR --only lego_200 --viewer spark
 
 Ladders that are not in DIR yet are made there (minutes each). The rival is splat-transform's --decimate, to the splats of each of our levels, in the
-same file format; its levels are shown at the same zooms. It is left out where splat-transform is not found. Writes levels/<base>_<viewer>.json,
-and levels.md and levels.png from all in that folder.
+same file format; its levels are shown at the same zooms. It is left out where splat-transform is not found. Writes levels/<base>_<viewer>.json
+and .png, a strip of frames, and levels.md and levels.png from all in that folder. --no-measure makes the strips only.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from statistics import fmean
 
 import torch
 import tyro
-from levels_page import draw, page
+from levels_page import draw, page, strip
 from torch import Tensor
 from tqdm import tqdm
 
@@ -45,6 +45,9 @@ VIEWERS = ("spark", "playcanvas")
 # Frames of the dolly, from x1 to COARSEST in equal ratios, and the test views that it is seen from.
 FRAMES, COARSEST = 49, 1 / 16
 VIEWS = slice(3, 25, 12)
+
+# Zooms of the strip of frames.
+STRIP = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
 
 # The filter that shrinks the truth, as in protocol P3 and for the pseudo truth.
 SHRINK_BY = "pil-bicubic"
@@ -147,6 +150,13 @@ def drawn(base: Wrapped, model: SplatModel, viewer: str, camera: Camera) -> Tens
     return render_model(model, backend, camera, base.target(viewer)).image.clamp(0, 1)
 
 
+def frames(dolly: Dolly, shown: Sequence[Show], viewer: str) -> dict[str, list[Tensor]]:
+    """What the first view shows at the strip's zooms: the truth, then each way to show the scene."""
+    view = dolly.views[0]
+    pictures = {"supersampled base": [dolly.truth(view, zoom) for zoom in STRIP]}
+    return pictures | {show.name: [drawn(dolly.base, show.file(zoom), viewer, at(view, zoom)) for zoom in STRIP] for show in shown}
+
+
 def changes(dolly: Dolly, ours: Show, viewer: str) -> list[Change]:
     """What each switch changes."""
     found = []
@@ -199,6 +209,7 @@ def main(
     output: Path = Path("benchmarks/results"),
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    measure: bool = True,
 ) -> None:
     """Measure, and write the tables and the plot.
 
@@ -208,17 +219,22 @@ def main(
         output: Where the results go; those of the same base and viewer are replaced.
         only: Which bases; all by default.
         viewer: Which viewers; all by default.
+        measure: Measure, and not only draw the strips of frames.
     """
     torch.set_num_threads(1)
+    (output / "levels").mkdir(parents=True, exist_ok=True)
     for name in only or BASES:
         base = wrap_model(data / "checkpoints" / "bases" / name, threads=1)
         views = test_views(base.place(load_scene(data / "images" / name.split("_")[0])), base.cameras[0], base.background)[VIEWS]
         dolly = Dolly(base, [view.camera for view in views])
-        truths = dolly.truths()
+        truths = dolly.truths() if measure else {}
         for each in viewer or VIEWERS:
             ladder = ladder_of(base, each, ladders / f"{name}_{each}")
             with tempfile.TemporaryDirectory() as folder:
                 shown = shows(base, each, ladder, Path(folder))
+                strip(output / "levels" / f"{name}_{each}.png", frames(dolly, shown, each), STRIP)
+                if not measure:
+                    continue
                 films = [film(dolly, show, each, truths) for show in shown]
             manifest = json.loads((ladder / MANIFEST).read_text())
             facts = {
@@ -228,8 +244,9 @@ def main(
             }  # fmt: skip
             write_json(output / "levels" / f"{name}_{each}.json", facts, overwrite=True)
     results = [json.loads(file.read_text()) for file in sorted((output / "levels").glob("*.json"), reverse=True)]
-    (output / "levels.md").write_text(page(results), encoding="utf-8")
-    draw(output / "levels.png", results)
+    if results:
+        (output / "levels.md").write_text(page(results), encoding="utf-8")
+        draw(output / "levels.png", results)
 
 
 if __name__ == "__main__":

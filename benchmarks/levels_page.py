@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
+
+from PIL import Image, ImageDraw
+from torch import Tensor
 
 from mipmap_plugin.evaluation.report import markdown
 from mipmap_plugin.evaluation.tradeoff.plot import figure_class
@@ -20,6 +23,9 @@ file*: the default recipe at x1/4. *splat-transform*: its `--decimate` to the sp
 
 ![dB over zoom](levels.png)
 """
+
+# px: how high each picture of a strip is shown, with the line of words above it.
+HEIGHT, WORDS = 150, 16
 
 COLORS = {"levels": "tab:blue", "base": "tab:gray", "splat-transform": "tab:orange"}
 
@@ -49,6 +55,20 @@ def row(film: dict[str, Any], ours: dict[str, Any]) -> list[str]:
     splats = ", ".join(f"{count / 1000:.1f}" for count in film["splats"])
     numbers = [f"{min(quality):.1f}", f"{fmean(quality):.1f}", lead, f"{fmean(flicker):.2f}", f"{max(flicker):.2f}", f"{film['megabytes']:.1f}"]
     return [film["name"], *numbers, splats]
+
+
+def strip(path: Path, rows: Mapping[str, Sequence[Tensor]], zooms: Sequence[float]) -> None:
+    """A row of pictures for each way to show the scene, by zoom; pixels are enlarged whole."""
+    sheet = Image.new("RGB", ((HEIGHT + 4) * len(zooms), (HEIGHT + WORDS) * len(rows)), "white")
+    pen = ImageDraw.Draw(sheet)
+    for row, (name, pictures) in enumerate(rows.items()):
+        for column, (zoom, picture) in enumerate(zip(zooms, pictures, strict=True)):
+            corner = column * (HEIGHT + 4), row * (HEIGHT + WORDS)
+            pen.text((corner[0] + 2, corner[1] + 2), f"{name}, x1/{1 / zoom:g}" if zoom < 1 else f"{name}, x1", fill="black")
+            pixels = Image.fromarray((picture.clamp(0, 1).numpy() * 255).round().astype("uint8"))
+            sheet.paste(pixels.resize((HEIGHT, HEIGHT), Image.Resampling.NEAREST), (corner[0], corner[1] + WORDS))
+    with new_file(path, overwrite=True) as temporary:
+        sheet.save(temporary, format="PNG")
 
 
 def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
+from PIL import Image
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
 
 from levels import Dolly, Show, at, changes, film, middle
 from levels_counts import Row
 from levels_counts import page as page_of_counts
-from levels_page import page
+from levels_page import HEIGHT, WORDS, page, strip
 
 from mipmap_plugin import wrap_model
 
@@ -73,3 +74,11 @@ def test_the_lead_of_a_count_is_over_the_better_rival():
     text = page_of_counts({"flowers_r8": [row]})
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| 19,000")]
     assert cells == [["19,000", "x0.5", "32.0", "29.0", "26.0 (30.0)", "27.5 (31.0)", "+4.5", "60"]] and "## flowers_r8" in text
+
+
+def test_a_strip_has_a_row_for_each_way_and_a_column_for_each_zoom(tmp_path):
+    red, blue = torch.tensor([1.0, 0, 0]), torch.tensor([0, 0, 1.0])
+    strip(tmp_path / "strip.png", {"ours": [red.expand(4, 4, 3), red.expand(2, 2, 3)], "base": [blue.expand(4, 4, 3), red.expand(2, 2, 3)]}, (1.0, 0.5))
+    with Image.open(tmp_path / "strip.png") as sheet:
+        middles = [[sheet.getpixel((x, row * (HEIGHT + WORDS) + WORDS + HEIGHT // 2)) for x in (HEIGHT // 2, sheet.width - HEIGHT // 2)] for row in (0, 1)]
+    assert middles == [[(255, 0, 0), (255, 0, 0)], [(0, 0, 255), (255, 0, 0)]]
