@@ -46,7 +46,8 @@ INTRO = """# Scenes of real size
 
 Made by `python benchmarks/size.py DATA`, in pieces: seconds, CPU seconds and the peak of memory (over what Python, torch and the package
 themselves take, as a multiple of the PLY's size) of whole commands and of their phases, `adapt` at x1/4, on flowers with its splats split into so
-many, 173 cameras of 1256 x 828 px. *Silence*: the longest time without a sign on the terminal, and in brackets until the first.
+many, 173 cameras of 1256 x 828 px. *Silence*: the longest time without a sign on the terminal, and in brackets until the first. Five others used the
+two cores, so that seconds and silences are several times those of a quiet machine: compare CPU seconds. *before*: 6867b30.
 `evaluate`: the base and everything that needs no adapting, on {photographs} photographs. {machine}
 """
 HEAD = "| splats | command | version | phase | seconds | CPU s | peak / file | silence |\n|" + "---|" * 8
@@ -177,7 +178,7 @@ def heard(reader: int, began: float) -> tuple[list[float], bytes]:
 def lines(row: dict[str, Any]) -> list[str]:
     """The rows of the table of one command: the whole, then its phases."""
     head = f"| {row['splats']:,} | {row['command']} | {row['version']} |"
-    silence = "" if row["command"] == "load" else f"{row['silence']:.1f} ({row['first sign']:.1f})"
+    silence = "" if row["command"] == "load" or row["silence"] is None else f"{row['silence']:.1f} ({row['first sign']:.1f})"
     whole = f"{head} whole | {row['seconds']:.1f} | {row['cpu']:.1f} | {row['peak'] / row['file']:.2f} | {silence} |"
     phases = row["phases"].items() if len(row["phases"]) > 1 else ()
     return [whole, *(f"{head} {name} | {each['seconds']:.1f} | {each['cpu']:.1f} | {each['peak'] / row['file']:.2f} | |" for name, each in phases)]
