@@ -19,6 +19,7 @@ class TileJob(Job):
 
     work: Literal["truth", "start", "tile"] = "tile"
     number: int = 0
+    finished: int = 0  # rounds that are done
 
     def __str__(self) -> str:
         return f"{self.base.checkpoint.name} x{self.scale:g}: {self.work}{'' if self.work == 'start' else f' {self.number + 1}'}"
@@ -51,7 +52,7 @@ class TileJob(Job):
         from mipmap_plugin.tiles.tile import Tile
         from mipmap_plugin.wrapped import state_path
 
-        model, facts, keeper = Tile(scene, self.number, folder).adapt(state_path(self.target))
+        model, facts, keeper = Tile(scene, self.number, self.finished, folder).adapt(state_path(self.target))
         with together(self.target):
             model.save(self.target, provenance={}, overwrite=True)
             write_json(facts_file(self.target), facts, overwrite=True)

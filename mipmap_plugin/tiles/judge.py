@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipmap_plugin.adaptation.report import AS_IT_IS
-from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.tiles.scene import TiledScene
-from mipmap_plugin.tiles.splats import Splats
-from mipmap_plugin.tiles.start import open_starts, psnr
+from mipmap_plugin.tiles.start import open_round, open_starts, psnr
+from mipmap_plugin.tiles.tile import ROUNDS
 from mipmap_plugin.tiles.truth import Truths
 
 JOINED = "the joined tiles"
@@ -20,7 +19,7 @@ def judged(scene: TiledScene, folder: Path, tiles: int) -> tuple[dict[str, float
     if not scene.views.choosing:
         return {}, JOINED
     truths = Truths.whole(folder, scene.views.choosing)
-    joined = Splats.of(scene.kind, [PlyRows(folder / f"tile_{number}.ply") for number in range(tiles)])
+    joined = open_round(scene, folder, len(ROUNDS))
     start = f"the start, {load_torch(folder / 'start.pt')['name']}"
     states = {AS_IT_IS: scene.base, start: open_starts(scene, folder), JOINED: joined}
     psnrs = {name: psnr(scene, splats, truths, scene.views.choosing) for name, splats in states.items()}

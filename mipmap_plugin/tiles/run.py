@@ -25,7 +25,8 @@ from mipmap_plugin.tiles.job import CUT, START, TileJob
 from mipmap_plugin.tiles.judge import JOINED, judged
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import TiledScene, find_splats, make_cut
-from mipmap_plugin.tiles.start import start_file, write_base
+from mipmap_plugin.tiles.start import round_file, start_file, write_base
+from mipmap_plugin.tiles.tile import ROUNDS
 from mipmap_plugin.tiles.truth import parts, truth_file
 
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
@@ -71,10 +72,10 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
     scene.wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
     seconds = {"cutting": time.perf_counter() - began}
 
-    def do(work: str, targets: list[Path]) -> list[Outcome]:
+    def do(work: str, targets: list[Path], finished: int = 0) -> list[Outcome]:
         stage = time.perf_counter()
         jobs = [
-            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number)  # type: ignore[arg-type]
+            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number, finished=finished)  # type: ignore[arg-type]
             for number, target in enumerate(targets)
         ]
         outcomes = _done(jobs, engine, work)
@@ -83,7 +84,8 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
 
     do("truth", [truth_file(folder, part) for part in range(parts(scene.views.all))])
     do("start", [folder / START])
-    outcomes = do("tile", [folder / f"tile_{number}.ply" for number in range(tiles)])
+    for finished in range(len(ROUNDS)):
+        outcomes = do("tile", [round_file(folder, finished + 1, number) for number in range(tiles)], finished)
     outcomes.sort(key=lambda outcome: outcome.job.number)  # type: ignore[attr-defined]
     last = time.perf_counter()
     with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
@@ -91,7 +93,7 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
     seconds["validation"] = time.perf_counter() - last
     seconds["total"] = time.perf_counter() - began
     facts = [outcome.report for outcome in outcomes]
-    files = [folder / f"tile_{number}.ply" for number in range(tiles)]
+    files = [round_file(folder, len(ROUNDS), number) for number in range(tiles)]
     if returned != JOINED:
         files = [start_file(folder, number) for number in range(tiles)]
     if returned == AS_IT_IS:

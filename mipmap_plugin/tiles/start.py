@@ -34,7 +34,17 @@ def start_file(folder: Path, number: int) -> Path:
 
 def open_starts(scene: TiledScene, folder: Path) -> Splats:
     """The splats that all tiles begin with, tile after tile."""
-    return Splats.of(scene.kind, [PlyRows(start_file(folder, number)) for number in range(len(scene.cores))])
+    return open_round(scene, folder, 0)
+
+
+def round_file(folder: Path, finished: int, number: int) -> Path:
+    """The file of a tile after so many rounds."""
+    return folder / f"tile_{number}_round_{finished}.ply" if finished else start_file(folder, number)
+
+
+def open_round(scene: TiledScene, folder: Path, finished: int) -> Splats:
+    """All tiles after so many rounds, one after the other; 0: as they begin."""
+    return Splats.of(scene.kind, [PlyRows(round_file(folder, finished, number)) for number in range(len(scene.cores))])
 
 
 def write_base(scene: TiledScene, folder: Path) -> None:

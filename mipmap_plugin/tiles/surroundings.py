@@ -19,12 +19,16 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.progress import counted
+from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.tiles.crops import Crop
 from mipmap_plugin.tiles.slabs import BLACK, Painter
 from mipmap_plugin.tiles.splats import Splats
 
 # The range of depths is wider than the core's by this fraction of it at both ends.
 SPARE = 0.02
+
+# Blend weights of a pixel that are too small to be seen.
+INVISIBLE = 1 / 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +39,7 @@ class _Surrounding:
     through: Tensor  # [h, w, 1] half, the transmittance of the front
     back: Tensor  # [h, w, 3] half, background included
     beside: Tensor  # [B] int32, rows of the halo's splats that are drawn with the core
+    clear: Tensor  # [h, w, 1] half, the transmittance of the back
 
 
 class Surroundings:
@@ -62,9 +67,11 @@ class Surroundings:
         ends = torch.tensor([float(depths[0]) - spare, float(depths[-1]) + spare])
         first, last = torch.searchsorted(halo_depths, ends).tolist()
         front = self._painter.draw(splats, camera, rows[:first])
-        back = self._painter.draw(splats, camera, rows[last:]).over(torch.tensor(self._painter.effects.background))
+        back = self._painter.draw(splats, camera, rows[last:])
         splats.release()
-        return _Surrounding(front.image.half(), front.transmittance.half(), back.half(), rows[first:last].to(torch.int32))
+        behind = back.over(torch.tensor(self._painter.effects.background))
+        beside = rows[first:last].to(torch.int32)
+        return _Surrounding(front.image.half(), front.transmittance.half(), behind.half(), beside, back.transmittance.half())
 
     @property
     def beside(self) -> float:
@@ -78,6 +85,20 @@ class Surroundings:
         rendered = self._painter.backend.render(both, camera, replace(self._painter.effects, background=BLACK))
         inner = rendered.image + (1 - rendered.alpha)[..., None] * view.back.float()
         return view.front.float() + view.through.float() * inner
+
+
+    @torch.no_grad()
+    def share(self, core: Gaussians, camera: Camera) -> Tensor:
+        """[h, w, 1]: the core's fraction of the blend weights of all splats in each pixel of a crop."""
+        view = self._views[camera.name]
+        halo = self._halo[view.beside.long()]
+        white, black = (torch.full((len(splats), 1, 3), (color - 0.5) / C0) for splats, color in ((core, 1.0), (halo, 0.0)))
+        both = _joined(replace(core, sh=white), replace(halo, sh=black))
+        settings = self._painter.effects.settings.without_color_rounding()
+        rendered = self._painter.backend.render(both, camera, replace(self._painter.effects, background=BLACK, sh_degree=0, settings=settings))
+        through = view.through.float()
+        own = through * rendered.image[..., :1]
+        return own / (1 - through * (1 - rendered.alpha)[..., None] * view.clear.float()).clamp_min(INVISIBLE)
 
 
 def _joined(first: Gaussians, second: Gaussians) -> Gaussians:
