@@ -27,6 +27,7 @@ STOREYS = [
     {"levels"},
     {"evaluation", "models.conformance"},
     {"pages", "jobs"},
+    {"tiles"},
     {"demo"},
     {"commands"},
     {"cli"},

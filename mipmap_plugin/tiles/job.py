@@ -19,7 +19,6 @@ class TileJob(Job):
 
     work: Literal["truth", "start", "tile"] = "tile"
     number: int = 0
-    finished: int = 0  # rounds that are done
 
     def __str__(self) -> str:
         return f"{self.base.checkpoint.name} x{self.scale:g}: {self.work}{'' if self.work == 'start' else f' {self.number + 1}'}"
@@ -28,10 +27,10 @@ class TileJob(Job):
         """Do the work, unless its file is there already. Raises what `TiledScene` raises."""
         if self.target.exists():
             return Outcome(self, "finished before", self.target, _facts(self.target))
-        from mipmap_plugin.tiles.scene import TiledScene
+        from mipmap_plugin.tiles.scene import opened
 
         folder = self.target.parent
-        scene = TiledScene(self.base, self.scale, self.viewer, self.config(), folder / CUT)
+        scene = opened(self.base, self.scale, self.viewer, self.config(), folder / CUT)
         with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
             self._do(scene, folder)
         return Outcome(self, "done", self.target, _facts(self.target))
@@ -52,7 +51,7 @@ class TileJob(Job):
         from mipmap_plugin.tiles.tile import Tile
         from mipmap_plugin.wrapped import state_path
 
-        model, facts, keeper = Tile(scene, self.number, self.finished, folder).adapt(state_path(self.target))
+        model, facts, keeper = Tile(scene, self.number, folder).adapt(state_path(self.target))
         with together(self.target):
             model.save(self.target, provenance={}, overwrite=True)
             write_json(facts_file(self.target), facts, overwrite=True)

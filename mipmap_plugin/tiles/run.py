@@ -13,20 +13,20 @@ from typing import Any
 from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.errors import JobsFailed, SettingsError
-from mipmap_plugin.formats.atomic import named, new_file, sha256, together, write_json
+from mipmap_plugin.formats.atomic import named, new_file, refuse_output, sha256, together, write_json
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
-from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.models.outputs import REPORT, parts_of
 from mipmap_plugin.progress import announced, counted
+from mipmap_plugin.splatting.viewers import viewers_for
 from mipmap_plugin.tiles.job import CUT, START, TileJob
 from mipmap_plugin.tiles.judge import JOINED, judged
 from mipmap_plugin.tiles.report import make_report
-from mipmap_plugin.tiles.scene import TiledScene, find_splats, make_cut
-from mipmap_plugin.tiles.start import round_file, start_file, write_base
-from mipmap_plugin.tiles.tile import ROUNDS
+from mipmap_plugin.tiles.scene import TiledScene, find_splats, make_cut, opened
+from mipmap_plugin.tiles.start import start_file, tile_file, write_base
 from mipmap_plugin.tiles.truth import parts, truth_file
 
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
@@ -68,14 +68,14 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
     if not (folder / CUT).exists():
         with announced("cutting"):
             make_cut(job.base.checkpoint, tiles, folder / CUT)
-    scene = TiledScene(job.base, job.scale, job.viewer, job.config(), folder / CUT)
+    scene = opened(job.base, job.scale, job.viewer, job.config(), folder / CUT)
     scene.wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
     seconds = {"cutting": time.perf_counter() - began}
 
-    def do(work: str, targets: list[Path], finished: int = 0) -> list[Outcome]:
+    def do(work: str, targets: list[Path]) -> list[Outcome]:
         stage = time.perf_counter()
         jobs = [
-            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number, finished=finished)  # type: ignore[arg-type]
+            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number)  # type: ignore[arg-type]
             for number, target in enumerate(targets)
         ]
         outcomes = _done(jobs, engine, work)
@@ -84,16 +84,15 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
 
     do("truth", [truth_file(folder, part) for part in range(parts(scene.views.all))])
     do("start", [folder / START])
-    for finished in range(len(ROUNDS)):
-        outcomes = do("tile", [round_file(folder, finished + 1, number) for number in range(tiles)], finished)
+    files = [tile_file(folder, number) for number in range(tiles)]
+    outcomes = do("tile", files)
     outcomes.sort(key=lambda outcome: outcome.job.number)  # type: ignore[attr-defined]
     last = time.perf_counter()
     with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
-        validation, returned = judged(scene, folder, tiles)
+        validation, returned = judged(scene, folder)
     seconds["validation"] = time.perf_counter() - last
     seconds["total"] = time.perf_counter() - began
     facts = [outcome.report for outcome in outcomes]
-    files = [round_file(folder, len(ROUNDS), number) for number in range(tiles)]
     if returned != JOINED:
         files = [start_file(folder, number) for number in range(tiles)]
     if returned == AS_IT_IS:
@@ -107,12 +106,18 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
 def _refuse(job: Job, tiles: int) -> None:
     """Raise SettingsError for what cannot be done in tiles."""
     find_splats(job.base.checkpoint)
+    config = job.config()
     if tiles < 2:
         raise SettingsError(f"tiles: give at least 2, got {tiles}; a scene that is not cut needs no tiles")
     if job.images is not None or job.scale > 1:
         raise SettingsError(f"x{job.scale:g}: a scene is cut into tiles for a zoom-out, without photographs; adapt it without tiles")
+    if config.most_splats is not None or config.band != (1, 1):
+        raise SettingsError("tiles are adapted to one scale, and to no number of splats; leave most_splats (--splats) and band out")
+    if job.viewer is not None and len(viewers_for(job.viewer)) > 1:
+        raise SettingsError(f"tiles are adapted for one viewer at a time, and {job.viewer} stands for several; give one of them")
     if job.target.suffix not in ("", ".ply"):
         raise SettingsError(f"{job.target}: tiles are joined to a .ply or a model folder; give one of these, and convert it afterwards")
+    refuse_output(job.target, job.overwrite, parts_of(find_splats(job.base.checkpoint)[0].path, None))
 
 
 def _claim(folder: Path, job: Job, tiles: int) -> None:

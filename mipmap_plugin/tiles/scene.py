@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -116,8 +116,6 @@ class TiledScene:
         self.options, _ = read_options(self.checkpoint.folder)
         self.wrapped = self._wrapped(base, stored["sample"])
         targets = self.wrapped.targets(viewer)
-        if len(targets) > 1 or config.band != (1, 1) or scale > 1 or config.most_splats is not None:
-            raise SettingsError("tiles are adapted to one scale of at most 1, for one viewer, to no number of splats; leave the rest out")
         self.target: Effects = next(iter(targets.values()))
         self.backend, self.backend_note = self._backend(base.backend)
 
@@ -166,3 +164,14 @@ class TiledScene:
     def painter(self, effects: Effects) -> Painter:
         """What draws splats from the disk."""
         return Painter(self.backend, effects)
+
+
+def opened(base: Base, scale: float, viewer: str | None, config: AdaptConfig, cut_file: Path) -> TiledScene:
+    """A scene, kept open for the next job of the same process."""
+    status = cut_file.stat()
+    return _opened(base, scale, viewer, config.model_dump_json(), cut_file, (status.st_mtime_ns, status.st_ino))
+
+
+@lru_cache(maxsize=1)
+def _opened(base: Base, scale: float, viewer: str | None, config: str, cut_file: Path, _: tuple[int, int]) -> TiledScene:
+    return TiledScene(base, scale, viewer, AdaptConfig.model_validate_json(config), cut_file)

@@ -19,6 +19,7 @@ from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.truth import Truths
@@ -32,19 +33,19 @@ def start_file(folder: Path, number: int) -> Path:
     return folder / f"start_{number}.ply"
 
 
+def tile_file(folder: Path, number: int) -> Path:
+    """The file of an adapted tile."""
+    return folder / f"tile_{number}.ply"
+
+
 def open_starts(scene: TiledScene, folder: Path) -> Splats:
     """The splats that all tiles begin with, tile after tile."""
-    return open_round(scene, folder, 0)
+    return Splats.of(scene.kind, [PlyRows(start_file(folder, number)) for number in range(len(scene.cores))])
 
 
-def round_file(folder: Path, finished: int, number: int) -> Path:
-    """The file of a tile after so many rounds."""
-    return folder / f"tile_{number}_round_{finished}.ply" if finished else start_file(folder, number)
-
-
-def open_round(scene: TiledScene, folder: Path, finished: int) -> Splats:
-    """All tiles after so many rounds, one after the other; 0: as they begin."""
-    return Splats.of(scene.kind, [PlyRows(round_file(folder, finished, number)) for number in range(len(scene.cores))])
+def open_tiles(scene: TiledScene, folder: Path) -> Splats:
+    """All adapted tiles, one after the other."""
+    return Splats.of(scene.kind, [PlyRows(tile_file(folder, number)) for number in range(len(scene.cores))])
 
 
 def write_base(scene: TiledScene, folder: Path) -> None:
@@ -130,8 +131,7 @@ class StartSearch:
         opacities = matched_opacities(opacities, wanted, weights_of)
         for number, (first, end) in enumerate(zip(splats.starts, splats.starts[1:], strict=False)):
             model = self.scene.for_target(splats.parameters(torch.arange(first, end)))
-            scales = model.gaussians().detach().scales
-            model.reshape(lambda _, scales=scales, new=opacities[first:end]: (scales, new))
+            _set_opacities(model, opacities[first:end])
             model.save(start_file(self.folder, number), provenance={}, overwrite=True)
 
     def _take_base(self, weights: Tensor) -> None:
@@ -141,6 +141,10 @@ class StartSearch:
     def _done(self, name: str, weights: Tensor) -> None:
         facts: dict[str, Any] = {"name": name, "weights": weights}
         save_torch(self.folder / "start.pt", facts, overwrite=True)
+
+
+def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:
+    model.reshape(lambda gaussians: (gaussians.scales, opacities))
 
 
 @torch.no_grad()

@@ -5,7 +5,7 @@ front of it, and all that is farther is one picture behind it; both are drawn on
 the core in each step, and only within the core's box. The image is the one that drawing all splats would give, as long as the core keeps
 its range of depths: for that the range is a little wider than the core's.
 
-Memory: 14 bytes for each pixel of the boxes, 4 for each splat and view that is drawn with the core, and those splats themselves.
+Memory: 22 bytes for each pixel of the boxes with its truth, 4 for each splat and view that is drawn with the core, and those splats.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Surroundings:
         is_halo = torch.ones(len(splats), dtype=torch.bool)
         is_halo[core] = False
         self._views = {crop.camera.name: self._surrounding(splats, core, crop.camera, is_halo) for crop in counted(crops, len(crops), "halo", "view")}
-        rows, beside = torch.cat([view.beside for view in self._views.values()]).unique(return_inverse=True)
+        rows, beside = torch.cat([torch.empty(0, dtype=torch.int32), *(view.beside for view in self._views.values())]).unique(return_inverse=True)
         self._halo = splats.gaussians(rows.long())
         splats.release()
         places = beside.to(torch.int32).split([len(view.beside) for view in self._views.values()])
@@ -88,17 +88,25 @@ class Surroundings:
 
 
     @torch.no_grad()
-    def share(self, core: Gaussians, camera: Camera) -> Tensor:
+    def wanted(self, core: Gaussians, camera: Camera, truth: Tensor) -> Tensor:
+        """[h, w, 3] half: what the core should look like in front of, behind and among a halo that is not right yet either.
+
+        The other tiles learn too, and each pixel's error must not be mended once by every tile that it shows: a tile mends the fraction
+        of the error that it has of the pixel's blend weights. All tiles together then mend all of it, to first order.
+        """
+        error = self.render(core, camera) - truth
+        return (truth + (1 - self._share(core, camera)) * error).half()
+
+    def _share(self, core: Gaussians, camera: Camera) -> Tensor:
         """[h, w, 1]: the core's fraction of the blend weights of all splats in each pixel of a crop."""
-        view = self._views[camera.name]
+        view, settings = self._views[camera.name], self._painter.effects.settings.without_color_rounding()
         halo = self._halo[view.beside.long()]
         white, black = (torch.full((len(splats), 1, 3), (color - 0.5) / C0) for splats, color in ((core, 1.0), (halo, 0.0)))
-        both = _joined(replace(core, sh=white), replace(halo, sh=black))
-        settings = self._painter.effects.settings.without_color_rounding()
-        rendered = self._painter.backend.render(both, camera, replace(self._painter.effects, background=BLACK, sh_degree=0, settings=settings))
+        effects = replace(self._painter.effects, background=BLACK, sh_degree=0, settings=settings)
+        rendered = self._painter.backend.render(_joined(replace(core, sh=white), replace(halo, sh=black)), camera, effects)
         through = view.through.float()
-        own = through * rendered.image[..., :1]
-        return own / (1 - through * (1 - rendered.alpha)[..., None] * view.clear.float()).clamp_min(INVISIBLE)
+        all_weights = 1 - through * (1 - rendered.alpha)[..., None] * view.clear.float()
+        return through * rendered.image[..., :1] / all_weights.clamp_min(INVISIBLE)
 
 
 def _joined(first: Gaussians, second: Gaussians) -> Gaussians:
