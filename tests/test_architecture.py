@@ -27,7 +27,7 @@ STOREYS = [
     {"levels"},
     {"evaluation", "models.conformance"},
     {"pages", "jobs"},
-    {"viewing"},
+    {"tiles", "viewing"},
     {"demo"},
     {"commands"},
     {"cli"},

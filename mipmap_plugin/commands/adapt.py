@@ -14,6 +14,7 @@ from mipmap_plugin.commands.many import Many, Request, adapt_many
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
+from mipmap_plugin.commands.tiled import adapt_tiled
 from mipmap_plugin.commands.types import Background, Checkpoints, Scale, ScreenFilter, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
@@ -89,6 +90,10 @@ def adapt(
         json: Print the reports as JSON.
     """
     settings = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed)
+    if many.tiles is not None:
+        _refuse_for_many(scale, bytes, report)
+        request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
+        return adapt_tiled(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
     if many.asked(checkpoints):
         _refuse_for_many(scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
@@ -107,9 +112,9 @@ def adapt(
 def _refuse_for_many(scales: Sequence[float], size: str | None, page: bool) -> None:
     """Raise SettingsError for what only one checkpoint can have."""
     if not scales:
-        raise SettingsError("several checkpoints need a scale; give --scale")
+        raise SettingsError("several checkpoints, and tiles, need a scale; give --scale")
     if size is not None or page:
-        raise SettingsError("--bytes and --report are for one checkpoint at a time; leave them out, or adapt the checkpoints one by one")
+        raise SettingsError("--bytes and --report are for one checkpoint at a time, without tiles; leave them out, or adapt them one by one")
 
 
 def _check(

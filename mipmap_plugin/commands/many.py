@@ -37,6 +37,9 @@ class Many:
     skip_existing: bool = False
     """Do nothing where the output was already made, from the same base with the same settings. Several checkpoints do so by default."""
 
+    tiles: int | None = None
+    """Cut one large checkpoint into so many parts for a zoom-out, each of which is adapted as a job of its own, with less memory."""
+
     def asked(self, checkpoints: Sequence[Path]) -> bool:
         """Whether these are jobs, rather than one checkpoint."""
         options = (self.jobs, self.dask, self.shard)
@@ -67,7 +70,7 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
     jobs = make_jobs(many, given, request, base)
     outcomes: list[Outcome] = []
     try:
-        with closing(_engine(many, jobs, threads)) as running:
+        with closing(engine(many, jobs, threads)) as running:
             for outcome in counted(running, len(jobs), "adapting", "job"):
                 outcomes.append(outcome)
                 note(str(outcome))
@@ -139,7 +142,7 @@ def _part(text: str | None) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _engine(many: Many, jobs: Sequence[Job], threads: int | None) -> Generator[Outcome, None, None]:
+def engine(many: Many, jobs: Sequence[Job], threads: int | None) -> Generator[Outcome, None, None]:
     """The outcomes of the jobs, from where they are to run. Raises SettingsError."""
     from mipmap_plugin.jobs.engines import in_this_process, in_workers
 

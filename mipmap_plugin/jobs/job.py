@@ -31,6 +31,10 @@ class Job:
         """The settings to adapt with, unless the model calls for others. Raises SettingsError."""
         return recipe(self.recipe, self.scale, **self.settings)
 
+    def own_work(self, threads: int | None) -> Outcome | None:
+        """What a kind of job does in place of adapting a checkpoint, such as a tile's; None for a job that adapts one."""
+        return None
+
     def __str__(self) -> str:
         return f"{self.base.checkpoint} x{self.scale:g}{f' in {self.viewer}' if self.viewer else ''}"
 

@@ -23,7 +23,7 @@ def run(job: Job, threads: int | None = None) -> Outcome:
 
 def _attempt(job: Job, threads: int | None) -> Outcome:
     try:
-        return _finished_before(job) or _adapt(job, threads)
+        return job.own_work(threads) or _finished_before(job) or _adapt(job, threads)
     except OutputExists as error:
         # Another process may have finished the same job meanwhile.
         return _finished_before(job) or Outcome(job, "failed", reason=str(error))

@@ -1,0 +1,70 @@
+"""The jobs of a scene in tiles: some of its truths, its start, or one tile. Each can be sent to any process, and done again without harm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mipmap_plugin import threads as thread_pool
+from mipmap_plugin.formats.atomic import together, write_json
+from mipmap_plugin.jobs.job import Job, Outcome
+
+CUT, START = "cut.pt", "start.pt"
+
+
+@dataclass(frozen=True)
+class TileJob(Job):
+    """A job of one scene; its target is the file that it leaves in the scene's folder."""
+
+    work: Literal["truth", "start", "tile"] = "tile"
+    number: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.base.checkpoint.name} x{self.scale:g}: {self.work}{'' if self.work == 'start' else f' {self.number + 1}'}"
+
+    def own_work(self, threads: int | None) -> Outcome:
+        """Do the work, unless its file is there already. Raises what `TiledScene` raises."""
+        if self.target.exists():
+            return Outcome(self, "finished before", self.target, _facts(self.target))
+        from mipmap_plugin.tiles.scene import opened
+
+        folder = self.target.parent
+        scene = opened(self.base, self.scale, self.viewer, self.config(), folder / CUT)
+        with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
+            self._do(scene, folder)
+        return Outcome(self, "done", self.target, _facts(self.target))
+
+    def _do(self, scene: Any, folder: Path) -> None:
+        if self.work == "truth":
+            from mipmap_plugin.tiles.truth import draw_truths
+
+            draw_truths(scene, self.number, folder)
+        elif self.work == "start":
+            from mipmap_plugin.tiles.start import StartSearch
+
+            StartSearch(scene, folder).run()
+        else:
+            self._adapt(scene, folder)
+
+    def _adapt(self, scene: Any, folder: Path) -> None:
+        from mipmap_plugin.tiles.tile import Tile
+        from mipmap_plugin.wrapped import state_path
+
+        model, facts, keeper = Tile(scene, self.number, folder).adapt(state_path(self.target))
+        with together(self.target):
+            model.save(self.target, provenance={}, overwrite=True)
+            write_json(facts_file(self.target), facts, overwrite=True)
+        if keeper is not None and (state := keeper.remaining_file()) is not None:
+            state.remove()
+
+
+def facts_file(target: Path) -> Path:
+    """Where a tile's job leaves what there is to say of it."""
+    return target.with_name(target.name + ".json")
+
+
+def _facts(target: Path) -> dict[str, Any]:
+    from mipmap_plugin.formats.json_file import read_json
+
+    return dict(read_json(facts_file(target))) if facts_file(target).exists() else {}

@@ -1,0 +1,40 @@
+"""The report of a scene that was adapted in tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.adaptation.report import Report, filters, versions
+from mipmap_plugin.effects import explain
+from mipmap_plugin.formats.ply import read_header
+from mipmap_plugin.models.base import effects_of
+from mipmap_plugin.tiles.scene import TiledScene
+
+
+def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, float], validation: dict[str, float], returned: str) -> Report:
+    """The report of the whole. `files`: what it is made of; `validation`: dB of each state on views that nothing was adapted to."""
+    after = sum(read_header(file).vertex.count for file in files)
+    model, config = scene.wrapped.model, scene.config
+    effects = explain(scene.target, model.gaussians(scene.wrapped.any_camera()), effects_of(model), config, scene.scale)
+    psnr = validation.get(returned, 0.0)
+    return Report(
+        scale=scene.scale,
+        base=scene.digest,
+        inputs=scene.wrapped.asked,
+        settings=config,
+        backend=scene.backend_note,
+        views=f"{scene.views.note}, in {len(files)} tiles",
+        viewer=scene.viewer,
+        filters=filters(scene.scale, config, scene.base_effects, [scene.target]),
+        effects=list(effects),
+        gaussians_before=sum(map(len, scene.cores)),
+        gaussians_after=after,
+        seconds=seconds,
+        ended_by=f"{len(files)} tiles",
+        returned=returned,
+        validation=validation,
+        curve=[CurvePoint(step=config.steps, seconds=seconds["total"], psnr_db=None, validation_db=psnr, gaussians=after)],
+        versions=versions(),
+    )

@@ -1,0 +1,179 @@
+"""A scene adapted in tiles, from the cut to the file: the jobs of each stage, one stage after the other, and the concatenation of their cores."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin import threads as thread_pool
+from mipmap_plugin.adaptation.report import AS_IT_IS, Report
+from mipmap_plugin.errors import JobsFailed, SettingsError
+from mipmap_plugin.formats.atomic import named, new_file, refuse_output, sha256, together, write_json
+from mipmap_plugin.formats.ply_rows import concatenate
+from mipmap_plugin.formats.tags import with_tags
+from mipmap_plugin.jobs.engines import in_this_process
+from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
+from mipmap_plugin.models.outputs import REPORT, parts_of
+from mipmap_plugin.progress import announced, counted
+from mipmap_plugin.splatting.viewers import viewers_for
+from mipmap_plugin.tiles.job import CUT, START, TileJob
+from mipmap_plugin.tiles.judge import JOINED, judged
+from mipmap_plugin.tiles.report import make_report
+from mipmap_plugin.tiles.scene import TiledScene, find_splats, make_cut, opened
+from mipmap_plugin.tiles.start import start_file, tile_file, write_base
+from mipmap_plugin.tiles.truth import parts, truth_file
+
+# Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
+Engine = Callable[[Sequence[Job]], Generator[Outcome, None, None]]
+
+# What the folder's tiles belong to.
+PLAN = "plan.json"
+
+
+@dataclass(frozen=True)
+class Joined:
+    """A scene that was adapted in tiles."""
+
+    file: Path
+    report: Report
+    tiles: list[dict[str, Any]]  # what there is to say of each
+
+    def facts(self) -> dict[str, Any]:
+        """The content of the report's file."""
+        return {**self.report.model_dump(), "tiles": self.tiles}
+
+
+def work_folder(target: Path) -> Path:
+    """Where the parts of a scene lie until it is whole, beside its file."""
+    target = named(target)
+    return target.with_name(target.name + ".tiles")
+
+
+def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threads: int | None = None) -> Joined:
+    """Adapt a checkpoint in `tiles` tiles, each a job that `engine` runs, and write it to `job.target`, a .ply or a model folder.
+
+    What is done stays in a folder beside the target until all is: the same call goes on from there. `threads`: for what is done between
+    the jobs. Raises SettingsError and OutputExists before any work, JobsFailed if a job failed, and what loading raises.
+    """
+    began = time.perf_counter()
+    folder = work_folder(job.target)
+    _refuse(job, tiles)
+    _claim(folder, job, tiles)
+    if not (folder / CUT).exists():
+        with announced("cutting"):
+            make_cut(job.base.checkpoint, tiles, folder / CUT)
+    scene = opened(job.base, job.scale, job.viewer, job.config(), folder / CUT)
+    scene.wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
+    seconds = {"cutting": time.perf_counter() - began}
+
+    def do(work: str, targets: list[Path]) -> list[Outcome]:
+        stage = time.perf_counter()
+        jobs = [
+            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number)  # type: ignore[arg-type]
+            for number, target in enumerate(targets)
+        ]
+        outcomes = _done(jobs, engine, work)
+        seconds[{"truth": "pseudo truth", "start": "start", "tile": "optimization"}[work]] = time.perf_counter() - stage
+        return outcomes
+
+    do("truth", [truth_file(folder, part) for part in range(parts(scene.views.all))])
+    do("start", [folder / START])
+    files = [tile_file(folder, number) for number in range(tiles)]
+    outcomes = do("tile", files)
+    outcomes.sort(key=lambda outcome: outcome.job.number)  # type: ignore[attr-defined]
+    last = time.perf_counter()
+    with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
+        validation, returned = judged(scene, folder)
+    seconds["validation"] = time.perf_counter() - last
+    seconds["total"] = time.perf_counter() - began
+    facts = [outcome.report for outcome in outcomes]
+    if returned != JOINED:
+        files = [start_file(folder, number) for number in range(tiles)]
+    if returned == AS_IT_IS:
+        write_base(scene, folder)
+    report = make_report(scene, files, seconds, validation, returned)
+    saved = _save(scene, job, files, Joined(job.target, report, facts))
+    shutil.rmtree(folder)
+    return saved
+
+
+def _refuse(job: Job, tiles: int) -> None:
+    """Raise SettingsError for what cannot be done in tiles."""
+    find_splats(job.base.checkpoint)
+    config = job.config()
+    if tiles < 2:
+        raise SettingsError(f"tiles: give at least 2, got {tiles}; a scene that is not cut needs no tiles")
+    if job.images is not None or job.scale > 1:
+        raise SettingsError(f"x{job.scale:g}: a scene is cut into tiles for a zoom-out, without photographs; adapt it without tiles")
+    if config.most_splats is not None or config.band != (1, 1):
+        raise SettingsError("tiles are adapted to one scale, and to no number of splats; leave most_splats (--splats) and band out")
+    if job.viewer is not None and len(viewers_for(job.viewer)) > 1:
+        raise SettingsError(f"tiles are adapted for one viewer at a time, and {job.viewer} stands for several; give one of them")
+    if job.target.suffix not in ("", ".ply"):
+        raise SettingsError(f"{job.target}: tiles are joined to a .ply or a model folder; give one of these, and convert it afterwards")
+    refuse_output(job.target, job.overwrite, parts_of(find_splats(job.base.checkpoint)[0].path, None))
+
+
+def _claim(folder: Path, job: Job, tiles: int) -> None:
+    """Make the folder for this scene, these settings and this number of tiles. Raises SettingsError if it holds those of others."""
+    base = job.base
+    plan = {
+        "base": sha256(find_splats(base.checkpoint)[0].path), "tiles": tiles, "scale": job.scale, "viewer": job.viewer,
+        "settings": job.config().model_dump(mode="json"), "cameras": base.cameras and str(base.cameras), "background": base.background,
+        "screen_filter": base.screen_filter, "backend": base.backend,
+    }  # fmt: skip
+    file = folder / PLAN
+    if file.exists():
+        if json.loads(file.read_text(encoding="utf-8")) != json.loads(json.dumps(plan)):
+            raise SettingsError(f"{folder} holds tiles of another base, settings or number of tiles; repeat those, or delete it to start anew")
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise SettingsError(f"{folder} is needed for the tiles, but holds other things; move it, or choose another output")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(file, plan, overwrite=False)
+
+
+def _done(jobs: Sequence[Job], engine: Engine, what: str) -> list[Outcome]:
+    """The outcomes of jobs that all succeeded. Raises JobsFailed, KeyboardInterrupt."""
+    outcomes = []
+    running = engine(jobs)
+    try:
+        for outcome in counted(running, len(jobs), f"tiles: {what}", "job"):
+            outcomes.append(outcome)
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt("interrupted; run the same command again to go on where it stopped") from interrupt
+    finally:
+        running.close()
+    if failed := [outcome for outcome in outcomes if outcome.status not in ("done", "finished before")]:
+        reasons = "; ".join(dict.fromkeys(outcome.reason for outcome in failed))
+        raise JobsFailed(f"{len(failed)} of {len(jobs)} jobs ({what}) failed: {reasons}; the same command does these again, and no other")
+    return outcomes
+
+
+def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) -> Joined:
+    """Write the cores one after the other, as a .ply or within a model folder, and the report beside it."""
+    provenance = {**joined.report.provenance(), "tiles": len(files)}
+    comments = with_tags(scene.base.parts[0].header.comments, scene.target.screen_filter, provenance)
+
+    def write(ply: Path) -> None:
+        with new_file(ply, overwrite=True) as temporary, temporary.open("xb") as out:
+            concatenate(files, comments, out)
+
+    with together(job.target):
+        if job.target.suffix == ".ply":
+            with new_file(job.target, job.overwrite) as temporary, temporary.open("xb") as out:
+                concatenate(files, comments, out)
+            saved = job.target
+        else:
+            trained = replace(scene.wrapped.model.trained, screen_filter=scene.target.screen_filter, eps2d=scene.target.eps2d)
+            degree = scene.wrapped.model.gaussians(scene.wrapped.any_camera()).sh_degree
+            folder, iteration = scene.checkpoint.folder, scene.checkpoint.iteration
+            saved = write_folder(job.target, folder, cfg_args_for(folder, job.target, trained, degree), iteration, job.overwrite, write)
+        write_json(saved.with_name(saved.name + REPORT), joined.facts(), overwrite=True)
+    return replace(joined, file=saved)

@@ -1,0 +1,177 @@
+"""A scene that is adapted in tiles, as each of its jobs opens it: the base on the disk, the cores, the views, and how all is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.optimization.validation import split_validation
+from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.backends import choose_backend
+from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.formats.atomic import sha256
+from mipmap_plugin.formats.ply_rows import PlyRows
+from mipmap_plugin.formats.tags import render_mode
+from mipmap_plugin.formats.torch_file import load_torch, save_torch
+from mipmap_plugin.jobs.base import COLORS, Base
+from mipmap_plugin.models import Checkpoint, detect
+from mipmap_plugin.models.exposure import read_exposures
+from mipmap_plugin.models.health import examine
+from mipmap_plugin.models.inria_folder import read_options, trained_scale
+from mipmap_plugin.models.surfels import SurfelModel, flat_trained
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
+from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.tiles.cut import cut
+from mipmap_plugin.tiles.slabs import Painter
+from mipmap_plugin.tiles.splats import CHUNK, Splats
+from mipmap_plugin.wrap import wrap_model
+from mipmap_plugin.wrapped import Wrapped
+
+# The families whose splats lie in a PLY row by row, each the same for all views.
+KINDS: dict[str, type[VanillaModel]] = {"3dgs": VanillaModel, "2dgs": SurfelModel}
+
+# Splats from which is told what the scene needs of a backend.
+SAMPLE = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """The views of the base scale, each with its number as its name."""
+
+    adapted: Sequence[Camera]
+    steering: Sequence[Camera]
+    choosing: Sequence[Camera]
+    note: str
+
+    @property
+    def all(self) -> list[Camera]:
+        return [*self.adapted, *self.steering, *self.choosing]
+
+
+def find_splats(path: Path) -> tuple[Checkpoint, type[VanillaModel]]:
+    """The checkpoint at `path`, and what reads its columns. Raises CheckpointError; SettingsError for a family that cannot be cut."""
+    checkpoint = detect(path)
+    kind = KINDS.get(checkpoint.family)
+    if kind is None or checkpoint.path.suffix.lower() != ".ply":
+        raise SettingsError(
+            f"{checkpoint.path}: a checkpoint of {checkpoint.family} cannot be cut into tiles, only the PLY of 3DGS or 2DGS, whose splats are"
+            " the same for all views and stand by themselves; leave --tiles out"
+        )
+    return checkpoint, kind
+
+
+def make_cut(path: Path, tiles: int, file: Path) -> None:
+    """Read the splats at `path` once, cut them into cores, and write what all jobs need of them to `file`. Raises CheckpointError."""
+    checkpoint, kind = find_splats(path)
+    part = PlyRows(checkpoint.path)
+    splats = Splats.of(kind, [part])
+    valid, degree_at = _examined(splats)
+    rows = valid.nonzero()[:, 0]
+    if len(rows) < tiles:
+        raise CheckpointError(f"{checkpoint.path} has {len(rows):,} splats, which cannot be cut into {tiles} tiles; give fewer")
+    cores = cut(splats.places, rows, tiles)
+    sample = torch.cat([rows[:: -(-len(rows) // SAMPLE)], torch.tensor([degree_at])]).unique()
+    places = torch.where(valid[:, None], splats.places, torch.nan)  # an invalid splat is seen by no camera
+    digest = sha256(checkpoint.path)
+    save_torch(file, {"places": places, "cores": cores, "sample": sample, "digest": digest}, overwrite=True)
+
+
+def _examined(splats: Splats) -> tuple[Tensor, int]:
+    """Which splats are finite, [N] bool, and a row that has the highest SH band of all that are not zero."""
+    valid, at, highest = torch.ones(len(splats), dtype=torch.bool), 0, -1
+    for rows in torch.arange(len(splats)).split(CHUNK):
+        model = splats.kind(splats.parameters(rows))
+        valid[rows] = ~examine(model).invalid
+        used = (model.parameters()["shN"].abs().amax(dim=2) > 0) & valid[rows, None]
+        if used.any():
+            row, band = used.nonzero()[used.nonzero()[:, 1].argmax()].tolist()
+            at, highest = (int(rows[row]), band) if band > highest else (at, highest)
+    if highest < 0 and valid.any():
+        at = int(valid.nonzero()[0])
+    splats.release()
+    return valid, at
+
+
+class TiledScene:
+    """A scene and its cores."""
+
+    def __init__(self, base: Base, scale: float, viewer: str | None, config: AdaptConfig, cut_file: Path) -> None:
+        """`cut_file`: what `make_cut` wrote. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
+        self.scale, self.viewer, self.config = scale, viewer, config
+        self.checkpoint, self.kind = find_splats(base.checkpoint)
+        stored: dict[str, Any] = load_torch(cut_file)
+        self.base = Splats(self.kind, [PlyRows(self.checkpoint.path)], stored["places"])
+        self.cores: list[Tensor] = stored["cores"]
+        self.digest: str = stored["digest"]
+        self.options, _ = read_options(self.checkpoint.folder)
+        self.wrapped = self._wrapped(base, stored["sample"])
+        targets = self.wrapped.targets(viewer)
+        self.target: Effects = next(iter(targets.values()))
+        self.backend, self.backend_note = self._backend(base.backend)
+
+    def _wrapped(self, base: Base, sample: Tensor) -> Wrapped:
+        """Some of the splats with the cameras of all."""
+        checkpoint, options = self.checkpoint, self.options
+        comments = self.base.parts[0].header.comments
+        origin = Origin(
+            checkpoint.path, self.digest, checkpoint.folder, checkpoint.iteration, comments, {}, read_exposures(checkpoint.folder)
+        )  # fmt: skip
+        trained = trained_scale(options, render_mode(comments))
+        if self.kind is SurfelModel:
+            trained = flat_trained(trained)
+        model = self.kind(self.base.parameters(sample), trained, origin)
+        scene = None if base.cameras is None else load_scene(base.cameras, options)
+        color = COLORS[base.background]
+        return wrap_model(model, cameras=scene, backend="auto", background=color, screen_filter=base.screen_filter)
+
+    def _backend(self, name: str) -> tuple[Any, str]:
+        splats = self.wrapped.model.gaussians(self.wrapped.any_camera())
+        return choose_backend(name, Needs.of(splats, self.base_effects, gradients=True), Needs.of(splats, self.target, gradients=True))
+
+    @cached_property
+    def base_effects(self) -> Effects:
+        """How the base is rendered at its own scale."""
+        return self.wrapped.effects()
+
+    @cached_property
+    def views(self) -> Views:
+        """The views of the whole scene, the same as without tiles."""
+        cameras, means = self.wrapped.cameras, self.base.places[:, :3]
+        if not cameras or self.config.views == "orbit":  # which surrounds the splats
+            means = means[means.isfinite().all(1)]
+        chosen, note = choose_views(cameras, means, self.config)
+        adapted, validation = split_validation(cameras, chosen, means, self.scale, self.config)
+        note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""
+        named = [replace(view, name=str(number)) for number, view in enumerate([*adapted, *validation])]
+        judged = named[len(adapted) :]
+        return Views(named[: len(adapted)], judged[::2], judged[1::2], note)
+
+    def for_target(self, parameters: dict[str, Tensor]) -> VanillaModel:
+        """A model of some splats, as it is saved for the target; its parameters are leaves that require gradients."""
+        trained = replace(self.wrapped.model.trained, screen_filter=self.target.screen_filter, eps2d=self.target.eps2d)
+        return self.kind(parameters, trained).copy()
+
+    def painter(self, effects: Effects) -> Painter:
+        """What draws splats from the disk."""
+        return Painter(self.backend, effects)
+
+
+def opened(base: Base, scale: float, viewer: str | None, config: AdaptConfig, cut_file: Path) -> TiledScene:
+    """A scene, kept open for the next job of the same process."""
+    status = cut_file.stat()
+    return _opened(base, scale, viewer, config.model_dump_json(), cut_file, (status.st_mtime_ns, status.st_ino))
+
+
+@lru_cache(maxsize=1)
+def _opened(base: Base, scale: float, viewer: str | None, config: str, cut_file: Path, _: tuple[int, int]) -> TiledScene:
+    return TiledScene(base, scale, viewer, AdaptConfig.model_validate_json(config), cut_file)

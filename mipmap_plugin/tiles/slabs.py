@@ -1,0 +1,82 @@
+"""Pictures of splats that do not fit into memory: drawn slab after slab, front to back.
+
+A renderer blends splats in the order of their depth. So a picture is exact if splats of rising depth are drawn some at a time, each
+slab behind what the slabs before it let through: C = C_1 + T_1 (C_2 + T_2 (...)). What is behind an opaque slab is not read at all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.splatting.harmonics import C0
+from mipmap_plugin.tiles.splats import Splats
+
+# Splats of a slab: about 100 MB while it is drawn.
+SLAB = 200_000
+
+BLACK = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A picture of some splats, with what they let through."""
+
+    image: Tensor  # [H, W, 3], on black
+    transmittance: Tensor  # [H, W, 1]
+
+    def over(self, background: Tensor) -> Tensor:
+        """The picture [H, W, 3] in front of a color [3] or another picture."""
+        return self.image + self.transmittance * background
+
+
+@dataclass(frozen=True, eq=False)
+class Painter:
+    """Draws splats from the disk."""
+
+    backend: Backend
+    effects: Effects
+
+    @torch.no_grad()
+    def draw(self, splats: Splats, camera: Camera, rows: Tensor | None = None) -> Layer:
+        """The picture of `rows` of the splats, in rising depth (None: of all that the camera sees)."""
+        effects = replace(self.effects, background=BLACK)
+        rows = splats.seen_by(camera, effects.near_plane)[0] if rows is None else rows
+        image, through = torch.zeros(*camera.size, 3), torch.ones(*camera.size, 1)
+        for slab in rows.split(SLAB):
+            rendered = self.backend.render(splats.gaussians(slab), camera, effects)
+            image += through * rendered.image
+            through *= (1 - rendered.alpha)[..., None]
+            if float(through.max()) < effects.settings.min_transmittance:
+                break
+        return Layer(image, through)
+
+    def image(self, splats: Splats, camera: Camera) -> Tensor:
+        """The picture [H, W, 3] of all splats in front of the background."""
+        return self.draw(splats, camera).over(torch.tensor(self.effects.background))
+
+    def blend_weights(self, splats: Splats, cameras: list[Camera]) -> Tensor:
+        """The mean blend weight [N] of each splat over views, in pixels (`start.blend_weights`, for splats on the disk)."""
+        settings = self.effects.settings.without_color_rounding()
+        effects = replace(self.effects, background=BLACK, sh_degree=0, settings=settings)
+        weights = torch.zeros(len(splats))
+        for camera in cameras:
+            through = torch.ones(*camera.size, 1)
+            for slab in splats.seen_by(camera, effects.near_plane)[0].split(SLAB):
+                gaussians = splats.gaussians(slab)
+                color = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_()
+                with torch.enable_grad():
+                    rendered = self.backend.render(replace(gaussians, sh=color), camera, effects)
+                    (through * rendered.image).sum().backward()
+                assert color.grad is not None
+                weights[slab] += color.grad[:, 0].mean(dim=1) / (C0 * len(cameras))
+                through = through * (1 - rendered.alpha.detach())[..., None]
+                if float(through.max()) < effects.settings.min_transmittance:
+                    break
+            splats.release()
+        return weights

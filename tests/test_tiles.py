@@ -1,0 +1,320 @@
+"""One scene in tiles: every splat in one core, exact pictures from the disk, a halo that stays as it is, whole results, resumed runs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import anchor_checkpoints
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
+from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.cli import main
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import CheckpointError, JobsFailed, OutputExists, SettingsError
+from mipmap_plugin.formats.ply import read_header, read_ply, write_ply
+from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.engines import in_this_process
+from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+from mipmap_plugin.tiles import run, slabs, tile
+from mipmap_plugin.tiles.crops import crops
+from mipmap_plugin.tiles.cut import cut
+from mipmap_plugin.tiles.run import adapt_in_tiles, work_folder
+from mipmap_plugin.tiles.slabs import Painter
+from mipmap_plugin.tiles.splats import Splats
+from mipmap_plugin.tiles.surroundings import Surroundings
+
+EFFECTS = Effects(1, background=(0.2, 0.4, 0.6))
+
+
+@pytest.fixture
+def on_disk(tmp_path):
+    """300 splats in two files, and the same splats in memory."""
+    models = [tiny.model(150, seed=seed) for seed in (0, 1)]
+    parts = [PlyRows(model.save(tmp_path / f"part_{number}.ply", provenance={})) for number, model in enumerate(models)]
+    parameters = {name: torch.cat([model.parameters()[name].detach() for model in models]) for name in models[0].parameters()}
+    return Splats.of(VanillaModel, parts), VanillaModel(parameters).gaussians().detach()
+
+
+@pytest.fixture
+def job(tmp_path):
+    """A scene that is adapted in tiles in a moment."""
+    folder = tiny.folder(tmp_path / "scene", tiny.cameras(3, width=20, height=16), count=80)
+    settings = {"steps": 4, "seed": 0, "views": "given", "validation_views": 2, "views_per_step": 1, "merge_to": 1.0}
+    return Job(Base(folder, backend="reference"), tmp_path / "out.ply", 0.5, settings=settings)
+
+
+# Cuts
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 8])
+def test_every_splat_lies_in_exactly_one_core_of_equal_size(count):
+    means = torch.randn(1003, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([3.0, 1.0, 2.0])
+    rows = torch.arange(1003)[torch.arange(1003) % 7 != 0]
+    cores = cut(means, rows, count)
+    assert torch.equal(torch.cat(cores).sort().values, rows)
+    assert max(map(len, cores)) - min(map(len, cores)) <= 1
+    assert all(torch.equal(core, core.sort().values) for core in cores)
+
+
+def test_a_cut_is_a_plane_across_the_longest_axis():
+    means = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 9.0, 1.0])
+    low, high = cut(means, torch.arange(500), 2)
+    assert means[low, 1].max() <= means[high, 1].min()
+
+
+def test_far_strays_do_not_decide_the_axis():
+    means = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 9.0, 1.0])
+    means[:5, 0] += 1e4
+    low, high = cut(means, torch.arange(500), 2)
+    assert means[low, 1].max() <= means[high, 1].min()
+
+
+# Splats on the disk
+
+
+def test_rows_are_read_in_any_order(on_disk):
+    splats, in_memory = on_disk
+    rows = torch.tensor([299, 3, 150, 149, 3])
+    assert torch.equal(splats.gaussians(rows).sh, in_memory[rows].sh)
+    assert torch.equal(splats.places[:, :3], in_memory.means)
+    assert len(splats.gaussians(rows[:0])) == 0
+
+
+def test_slabs_give_the_picture_of_all_splats(on_disk, monkeypatch):
+    splats, in_memory = on_disk
+    camera, backend = tiny.cameras(1)[0], ReferenceBackend()
+    whole = backend.render(in_memory, camera, EFFECTS)
+    monkeypatch.setattr(slabs, "SLAB", 37)
+    assert torch.allclose(Painter(backend, EFFECTS).image(splats, camera), whole.image, atol=2e-4)
+    assert torch.allclose(1 - Painter(backend, EFFECTS).draw(splats, camera).transmittance[..., 0], whole.alpha, atol=2e-4)
+
+
+def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch):
+    splats, in_memory = on_disk
+    views, backend = tiny.cameras(3), ReferenceBackend()
+    monkeypatch.setattr(slabs, "SLAB", 37)
+    expected = blend_weights(in_memory, views, backend, EFFECTS)
+    assert torch.allclose(Painter(backend, EFFECTS).blend_weights(splats, views), expected, atol=1e-3, rtol=1e-3)
+
+
+def test_a_plain_text_file_is_refused(tmp_path):
+    path = tmp_path / "text.ply"
+    path.write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    with pytest.raises(CheckpointError, match="only a binary PLY is read part by part"):
+        PlyRows(path)
+
+
+# The concatenation
+
+
+def test_a_concatenation_has_the_bytes_of_its_parts_in_their_order(tmp_path, on_disk):
+    splats, _ = on_disk
+    with (tmp_path / "whole.ply").open("wb") as out:
+        assert concatenate([part.path for part in splats.parts], ["of two parts"], out) == 300
+    bodies = b"".join(part.path.read_bytes()[part.header.body :] for part in splats.parts)
+    header = read_header(tmp_path / "whole.ply")
+    assert (tmp_path / "whole.ply").read_bytes()[header.body :] == bodies
+    assert header.vertex.count == 300 and header.comments == ("of two parts",) and not header.notes
+
+
+def test_parts_of_other_columns_are_refused(tmp_path, on_disk):
+    other = tiny.model(degree=2).save(tmp_path / "other.ply", provenance={})
+    with (tmp_path / "whole.ply").open("wb") as out, pytest.raises(CheckpointError, match="has other columns than"):
+        concatenate([on_disk[0].parts[0].path, other], [], out)
+
+
+# The halo
+
+
+def surroundings(splats, core, zoom=0.5):
+    found = crops(splats, core, torch.ones(len(core)), [view.zoomed(zoom) for view in tiny.cameras(4)], EFFECTS.near_plane)
+    return Surroundings(splats, core, found, Painter(ReferenceBackend(), EFFECTS)), found
+
+
+def test_a_core_in_its_halo_looks_as_in_the_whole_scene(on_disk):
+    splats, in_memory = on_disk
+    core = cut(splats.places, torch.arange(300), 4)[1]
+    halo, found = surroundings(splats, core)
+    for crop in found:
+        whole = ReferenceBackend().render(in_memory, crop.camera, EFFECTS).image
+        assert torch.allclose(halo.render(in_memory[core], crop.camera), whole, atol=3e-3)  # the halo's pictures have 16 bits
+    assert 0 < halo.beside < 225
+
+
+def test_boxes_are_parts_of_their_views(on_disk):
+    splats, _ = on_disk
+    core = cut(splats.places, torch.arange(300), 8)[0]
+    _, found = surroundings(splats, core, zoom=4.0)
+    views = {view.name: view.zoomed(4.0) for view in tiny.cameras(4)}
+    for crop in found:
+        left, top, right, bottom = crop.box
+        view = views[crop.camera.name]
+        assert 0 <= left < right <= view.width and 0 <= top < bottom <= view.height and 0 < crop.share <= 1
+        assert (crop.camera.width, crop.camera.height) == (right - left, bottom - top)
+        assert crop.camera.cx == view.cx - left and crop.camera.fx == view.fx
+    assert any(crop.camera.width < views[crop.camera.name].width for crop in found)
+
+
+def test_all_tiles_together_are_asked_to_mend_the_whole_error(on_disk):
+    splats, in_memory = on_disk
+    cores = cut(splats.places, torch.arange(300), 3)
+    mended = {}
+    for core in cores:
+        halo, found = surroundings(splats, core)
+        for crop in found:
+            left, top, right, bottom = crop.box
+            image = halo.render(in_memory[core], crop.camera)
+            asked = mended.setdefault(crop.camera.name, torch.zeros(12, 16, 3))
+            asked[top:bottom, left:right] += halo.wanted(in_memory[core], crop.camera, image - 0.1).float() - image
+    middle = mended[tiny.cameras(1)[0].name][4:8, 6:10]
+    assert torch.allclose(middle, torch.full_like(middle, -0.1), atol=0.01)
+
+
+# The whole
+
+
+def test_a_scene_in_tiles_is_whole_and_better_than_its_base(job, monkeypatch):
+    bodies = []
+    keep = SimpleNamespace(rmtree=lambda folder: bodies.extend((folder / f"tile_{n}.ply").read_bytes() for n in range(3)))
+    monkeypatch.setattr(run, "shutil", keep)
+    joined = adapt_in_tiles(replace(job, settings=job.settings | {"merge_to": 0.6}), 3)
+    report = joined.report
+    assert len(load_vanilla(joined.file)) == report.gaussians_after == sum(tile["splats_after"] for tile in joined.tiles)
+    assert report.gaussians_after < report.gaussians_before == 80
+    assert report.psnr_after() > report.psnr_before() and report.returned == "the joined tiles"
+    sidecar = json.loads(joined.file.with_name("out.ply.adaptation.json").read_text())
+    assert [tile["tile"] for tile in sidecar["tiles"]] == [0, 1, 2] and sidecar["validation"] == report.validation
+    assert '"tiles": 3' in " ".join(read_header(joined.file).comments)
+    # The cores stand in the file as their jobs wrote them, each once; the halo, which was drawn with them, does not.
+    assert sum(tile["drawn_beside"] for tile in joined.tiles) > 0
+    cores = b"".join(body[body.index(b"end_header\n") + 11 :] for body in bodies)
+    assert joined.file.read_bytes()[read_header(joined.file).body :] == cores
+
+
+def test_a_model_folder_is_written_as_one(job, tmp_path):
+    joined = adapt_in_tiles(replace(job, target=tmp_path / "out"), 2)
+    assert (tmp_path / "out" / "cameras.json").is_file() and (tmp_path / "out" / "cfg_args").is_file()
+    assert joined.file == tmp_path / "out" / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    assert len(load_vanilla(tmp_path / "out")) == joined.report.gaussians_after
+
+
+def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
+    """A run that fails in its second tile goes on there, and leaves the same bytes as one that is not disturbed."""
+    undisturbed = adapt_in_tiles(replace(job, target=job.target.with_name("other.ply")), 3).file
+    begun = []
+
+    def fail_once(run, *rest):
+        begun.append(run)
+        if len(begun) == 2:
+            raise OSError("no space left")
+        return real_adapt(run, *rest)
+
+    monkeypatch.setattr(tile, "adapt", fail_once)
+    with pytest.raises(JobsFailed, match=r"1 of 3 jobs \(tile\) failed: no space left; the same command does these again"):
+        adapt_in_tiles(job, 3)
+    outcomes = []
+
+    def engine(jobs):
+        for outcome in in_this_process(jobs):
+            outcomes.append(outcome)
+            yield outcome
+
+    joined = adapt_in_tiles(job, 3, engine)
+    tiles = [outcome.status for outcome in outcomes if outcome.job.work == "tile"]
+    assert tiles == ["finished before", "done", "finished before"]
+    assert {outcome.status for outcome in outcomes if outcome.job.work != "tile"} == {"finished before"}
+    assert [*read_ply(joined.file).columns["x"]] == [*read_ply(undisturbed).columns["x"]]
+
+
+def test_an_interrupted_tile_is_resumed(job, monkeypatch):
+    def interrupt_early(run, task, config, on_interrupt, observe):
+        return real_adapt(run, task, config, on_interrupt, lambda run: on_interrupt(run) if run.step == 2 else observe(run))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(tile, "adapt", interrupt_early)
+        with pytest.raises(KeyboardInterrupt, match="run the same command again"):
+            adapt_in_tiles(job, 2)
+    first_steps = []
+    monkeypatch.setattr(tile, "adapt", lambda run, *rest: (first_steps.append(run.step), real_adapt(run, *rest))[1])
+    assert adapt_in_tiles(job, 2).file.exists() and first_steps == [2, 0]
+
+
+def test_invalid_splats_are_left_out(tmp_path, job):
+    ply = next(job.base.checkpoint.rglob("*.ply"))
+    columns = dict(read_ply(ply).columns)
+    columns["opacity"] = columns["opacity"].copy()
+    columns["opacity"][5] = float("nan")
+    write_ply(ply, columns, overwrite=True)
+    assert adapt_in_tiles(job, 2).report.gaussians_before == 79
+
+
+# What cannot be
+
+
+@pytest.mark.parametrize(
+    ("changes", "tiles", "reason"),
+    [
+        ({}, 1, "give at least 2, got 1"),
+        ({"scale": 4.0}, 2, "cut into tiles for a zoom-out"),
+        ({"viewer": "portable"}, 2, "stands for several; give one of them"),
+        ({"settings": {"most_splats": 10}}, 2, "to no number of splats"),
+    ],
+)
+def test_requests_that_no_tiles_serve(job, changes, tiles, reason):
+    with pytest.raises(SettingsError, match=reason):
+        adapt_in_tiles(replace(job, **changes), tiles)
+    assert not work_folder(job.target).exists()
+
+
+def test_anchors_cannot_be_cut(tmp_path, job):
+    folder = anchor_checkpoints.write(tmp_path / "anchors")
+    with pytest.raises(SettingsError, match="a checkpoint of scaffold cannot be cut into tiles"):
+        adapt_in_tiles(replace(job, base=replace(job.base, checkpoint=folder)), 2)
+
+
+def test_more_tiles_than_splats(job):
+    with pytest.raises(CheckpointError, match="has 80 splats, which cannot be cut into 90 tiles"):
+        adapt_in_tiles(job, 90)
+
+
+def test_tiles_of_another_request_are_not_touched(job):
+    work_folder(job.target).mkdir()
+    (work_folder(job.target) / "plan.json").write_text("{}")
+    with pytest.raises(SettingsError, match="holds tiles of another base, settings or number of tiles"):
+        adapt_in_tiles(job, 2)
+
+
+def test_an_output_is_not_replaced_unasked(job):
+    job.target.write_text("here")
+    with pytest.raises(OutputExists):
+        adapt_in_tiles(job, 2)
+    assert job.target.read_text() == "here" and not work_folder(job.target).exists()
+
+
+# The command
+
+
+def test_the_command(job, capsys):
+    options = ["--scale", "1/2", "--steps", "0", "--views", "given", "--backend", "reference", "--output", str(job.target)]
+    assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2"]) == 0
+    out = capsys.readouterr().out
+    assert "x0.5, 2 tiles:" in out and str(job.target) in out
+    assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2", "--skip-existing", "--overwrite"]) == 0
+    assert "finished before" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [("a.ply b.ply --scale 1/2 --tiles 2", "--tiles cuts one checkpoint"), ("a.ply --scale 1/2 --tiles 2 --report", "without tiles")],
+)
+def test_commands_that_cannot_be(words, reason, capsys):
+    assert main(["adapt", *words.split()]) == 2
+    assert reason in capsys.readouterr().err
