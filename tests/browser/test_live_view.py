@@ -149,6 +149,9 @@ def test_pixels_are_enlarged_and_levels_follow_the_zoom(page: LivePage) -> None:
 
 def test_the_screen_is_adapted_for_with_a_curve_and_saved(page: LivePage, base: Wrapped) -> None:
     source = base.model.source.read_bytes()
+    page.choose("Enlarge pixels", "8")
+    page.choose("Go to view", base.cameras[3].name)  # at about x0.6, wherever the tests before have flown to
+    page.still()
     assert page.page.locator(".uplot").count() == 0 and page.page.get_by_role("button", name="Save", exact=True).is_disabled()
     page.page.get_by_label("Seconds", exact=True).fill("6")
     page.page.keyboard.press("Enter")
