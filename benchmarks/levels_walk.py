@@ -41,6 +41,7 @@ from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.request import Band, LadderRequest
 from mipmap_plugin.levels.streamed import CANVAS, distances, progression
+from mipmap_plugin.models.outputs import REPORT
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.wrap import Wrapped, state_path
 
@@ -48,7 +49,7 @@ BASES = ("flowers_r8", "bases/lego_200")
 VIEWER = "playcanvas"
 
 # Frames of a walk, until what was nearest is COARSEST as large, in equal ratios; and walks, from random views that nothing was adapted to.
-FRAMES, COARSEST = 25, 1 / 8
+FRAMES, COARSEST = 13, 1 / 8
 WALKS, SEED = 2, 271_828
 
 # Samples of the truth per pixel along each side.
@@ -184,8 +185,8 @@ def page(results: Sequence[dict[str, Any]]) -> str:
 
 def section(result: dict[str, Any]) -> str:
     head = ["", "worst, dB", "mean, dB", "first, dB", "x1/2", "x1/4", "last", "flicker, mean", "worst", "splats", "switches", "least likeness, dB"]
-    facts = f"{result['chunks']} chunks of at most {result['extent']} world units; levels of {result['counts']} splats."
-    return f"## {result['base']} in {result['viewer']}\n\n{facts}\n\n{markdown(head, [row(film) for film in result['films']])}\n"
+    facts = f"{result['chunks']} chunks of at most {result['extent']} world units; levels of {result['counts']} splats, {result['steps']} steps each."
+    return f"## {result['base']} in {result['viewer']}\n\n{facts} {result['note']}\n\n{markdown(head, [row(film) for film in result['films']])}\n"
 
 
 def row(film: dict[str, Any]) -> list[str]:
@@ -204,6 +205,7 @@ def main(
     ladders: Path,
     output: Path = Path("benchmarks/results"),
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    note: str = "",
 ) -> None:
     """Measure, and write the tables.
 
@@ -212,6 +214,7 @@ def main(
         ladders: Folder for the ladders.
         output: Where the results go; those of the same base are replaced.
         only: Which bases; all by default.
+        note: What a reader of the page should know about the ladders.
     """
     torch.set_num_threads(1)
     for path in only or BASES:
@@ -223,8 +226,9 @@ def main(
         with tempfile.TemporaryDirectory() as folder:
             shown = mixtures(scene, base, ladders, name, Path(folder))
             films = [film(scene, each, mixture, walked) for each, mixture in shown.items()]
+        report = json.loads((ladders / f"{name}_{VIEWER}_distance" / f"level_1.ply{REPORT}").read_text())
         facts = {
-            "base": name, "viewer": VIEWER, "chunks": len(scene.chunks), "extent": scene.extent,
+            "base": name, "note": note, "steps": report["settings"]["steps"], "viewer": VIEWER, "chunks": len(scene.chunks), "extent": scene.extent,
             "counts": ", ".join(f"{count:,}" for count in films[0].splats), "films": [asdict(one) for one in films],
         }  # fmt: skip
         write_json(output / "levels_walk" / f"{name}_{VIEWER}.json", facts, overwrite=True)

@@ -316,6 +316,11 @@ def test_auto_is_by_distance_for_streaming_viewers_of_unbounded_scenes(viewer, b
     assert by_distance(wrapped(far=far) if far else wrap_model(tiny.model(), cameras=tiny.cameras(6)), LadderRequest(viewer, by=by)) is expected
 
 
+def test_auto_is_by_zoom_where_a_bound_asks_for_it():
+    assert not by_distance(wrapped(), LadderRequest("supersplat", by="auto", least_db=30.0))
+    assert by_distance(wrapped(), LadderRequest("supersplat", by="auto"))
+
+
 @pytest.mark.parametrize(
     ("options", "reason"), [({"by": "size"}, "by: must be one of"), ({"by": "distance", "least_db": 30.0}, "leave both out")]
 )

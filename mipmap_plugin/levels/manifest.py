@@ -82,7 +82,7 @@ def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:
         "splats": level.splats,
         "bytes": file.stat().st_size,
         "sha256": sha256(file),
-        "seconds": level.adapted.report.seconds["total"],
+        "seconds": level.adapted.report.seconds.get("total", 0.0),
         "holds": level.adapted.report.returned,
         "psnr_db": {f"{point.zoom:.4g}": point.psnr_db for point in ladder.curve if point.level == number},
     }

@@ -68,9 +68,12 @@ def progression(rising: Sequence[float], ratio: float) -> tuple[float, float]:
 
 def viewer_settings(manifest: dict[str, Any], chunks: Sequence[Chunk], canvas: int = CANVAS) -> dict[str, Any]:
     """What a page has to set on its PlayCanvas splat component (the first two) and on `scene.gsplat`, and the zooms at which levels then change."""
-    rising, offset = distances(manifest, canvas), nearer(chunks)
+    by_distance = manifest.get("by") == "distance"  # such levels are made for distances from chunks, not from splats
+    rising, offset = distances(manifest, canvas), 0.0 if by_distance else nearer(chunks)
     scales = [level["scale"] for level in manifest["levels"]]
     base, multiplier = progression([max(distance - offset, distance / 2) for distance in rising], scales[0] / scales[1])
+    if by_distance:
+        base, multiplier = manifest["lodBaseDistance"] * canvas / manifest["canvas"], manifest["lodMultiplier"]
     shown = [base * multiplier**number + offset for number in range(len(rising))]
     return {
         "lodBaseDistance": base,
@@ -94,6 +97,7 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
         raise SettingsError("this ladder has a single level, which needs no streaming; give a smaller --coarsest")
     with new_folder(folder / STREAMED, overwrite) as temporary:
         made = temporary / META
-        write_streamed_sog([folder / level["file"] for level in manifest["levels"]], made, int(EXTENT * rising[0]))
+        extent = manifest.get("chunk_extent", int(EXTENT * rising[0]))
+        write_streamed_sog([folder / level["file"] for level in manifest["levels"]], made, extent)
         write_json(temporary / SETTINGS, viewer_settings(manifest, read_chunks(made), canvas), overwrite=False)
     return folder / STREAMED / META

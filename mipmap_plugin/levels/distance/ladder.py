@@ -70,6 +70,8 @@ def by_distance(base: Wrapped, request: LadderRequest) -> bool:
     """Whether the levels of a request are made by distance."""
     if request.by != "auto":
         return request.by == "distance"
+    if request.least_db is not None or request.until_splats is not None:
+        return False
     mergeable = base.model.traits.same_for_all_views and base.effects().screen_filter not in INTEGRATED
     return mergeable and request.viewer in STREAMING and is_unbounded(base.model.parameters()["means"].detach(), base.views())
 
