@@ -78,7 +78,9 @@ def test_the_lead_of_a_count_is_over_the_better_rival():
 
 def test_a_strip_has_a_row_for_each_way_and_a_column_for_each_zoom(tmp_path):
     red, blue = torch.tensor([1.0, 0, 0]), torch.tensor([0, 0, 1.0])
-    strip(tmp_path / "strip.png", {"ours": [red.expand(4, 4, 3), red.expand(2, 2, 3)], "base": [blue.expand(4, 4, 3), red.expand(2, 2, 3)]}, (1.0, 0.5))
+    ours, base = ([color.expand(4, 4, 3), red.expand(2, 2, 3)] for color in (red, blue))
+    strip(tmp_path / "strip.png", {"ours": ours, "base": base}, (1.0, 0.5))
     with Image.open(tmp_path / "strip.png") as sheet:
-        middles = [[sheet.getpixel((x, row * (HEIGHT + WORDS) + WORDS + HEIGHT // 2)) for x in (HEIGHT // 2, sheet.width - HEIGHT // 2)] for row in (0, 1)]
+        columns, rows = (HEIGHT // 2, sheet.width - HEIGHT // 2), (WORDS + HEIGHT // 2, 2 * WORDS + HEIGHT + HEIGHT // 2)
+        middles = [[sheet.getpixel((x, y)) for x in columns] for y in rows]
     assert middles == [[(255, 0, 0), (255, 0, 0)], [(0, 0, 255), (255, 0, 0)]]

@@ -17,6 +17,8 @@ from mipmap_plugin.formats.splat_transform import refuse_exchange
 
 if TYPE_CHECKING:
     from mipmap_plugin.levels.contents import Contents
+    from mipmap_plugin.levels.request import LadderRequest
+    from mipmap_plugin.wrap import Wrapped
 
 
 def levels(
@@ -69,25 +71,15 @@ def levels(
         overwrite: Replace a ladder that exists.
         json: Print levels.json.
     """
-    from mipmap_plugin.levels.ladder import make_levels
-    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.request import LadderRequest
-    from mipmap_plugin.wrap import state_path
 
     exports = Exports(streamed_sog, tiles, canvas, report)
     exports.check(output)
     settings = {"seed": seed, **without_none(views=views, steps=steps)}
     request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, settings)
-    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
-    refuse_ladder(output, wrapped, overwrite=overwrite)
-    ladder = make_levels(wrapped, request, resume=state_path(output))
-    saved = ladder.save(output, overwrite=overwrite)
-    files = exports.write(saved, ladder.contents, checkpoint.resolve().name)
-    manifest = read_manifest(saved)
-    if json:
-        print_facts(manifest, json)
-    else:
-        print_summary(output, manifest, files)
+    base = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    manifest, files = _saved(base, request, output, exports, checkpoint.resolve().name, overwrite)
+    print_facts(manifest, json) if json else print_summary(output, manifest, files)
 
 
 @dataclass(frozen=True)
@@ -116,6 +108,20 @@ class Exports:
         from mipmap_plugin.levels.tiles import write_tiles
 
         return ([write_streamed(ladder, self.canvas)] if self.streamed_sog else []) + ([write_tiles(ladder)] if self.tiles else [])
+
+
+def _saved(
+    wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, title: str, overwrite: bool
+) -> tuple[dict[str, Any], list[Path]]:
+    """Make and save a ladder; return its manifest and what was exported."""
+    from mipmap_plugin.levels.ladder import make_levels
+    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
+    from mipmap_plugin.wrap import state_path
+
+    refuse_ladder(output, wrapped, overwrite=overwrite)
+    ladder = make_levels(wrapped, request, resume=state_path(output))
+    ladder.save(output, overwrite=overwrite)
+    return read_manifest(output), exports.write(output, ladder.contents, title)
 
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = ()) -> None:
