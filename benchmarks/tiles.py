@@ -3,8 +3,8 @@
     python benchmarks/tiles.py SCENE --scale 1/4 --tiles 8
     python benchmarks/tiles.py SCENE --cameras FILE --tiles 4 --steps 300
 
-Untiled with two seeds, and in tiles, each in a process of its own. Seams: PSNR between the tiled and the untiled result over held-out views; beside it
-stands that between the two seeds, below which no difference is a seam. Quality: dB against the base, supersampled. Memory is the
+Untiled with two seeds, and in tiles, each in a process of its own. Seams: PSNR between the tiled and the untiled result over held-out views; beside
+it stands that between the two seeds, below which no difference is a seam. Quality: dB against the base, supersampled. Memory is the
 peak of one process (of tiles: of the largest of its workers), with what Python and torch take, CPU time that of all processes. Adds the row
 of the scene to results/tiles.json, and writes results/tiles.md from all rows.
 """
@@ -82,7 +82,9 @@ def compared(base: Wrapped, files: dict[str, Path], scale: float) -> dict[str, f
     return {name: fmean(values) for name, values in rows.items()}
 
 
-def run(scene: Path, scale: str = "1/4", tiles: int = 8, cameras: Path | None = None, steps: int | None = None, name: str | None = None) -> None:
+def run(
+    scene: tyro.conf.Positional[Path], scale: str = "1/4", tiles: int = 8, cameras: Path | None = None, steps: int | None = None, name: str = ""
+) -> None:
     """Measure a scene, and write the page."""
     further = ["--backend", "cpu", *(["--cameras", str(cameras)] if cameras else []), *(["--steps", str(steps)] if steps is not None else [])]
     row: dict[str, Any] = {"scene": name or scene.stem, "scale": scale, "tiles": tiles, "steps": steps}
