@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, ShapeError
 from mipmap_plugin.splatting.harmonics import C0
 
 # Number of f_rest columns -> SH degree.
@@ -119,3 +119,17 @@ def stacked(columns: Mapping[str, np.ndarray], names: tuple[str, ...]) -> Tensor
             for i, name in enumerate(names):
                 block[start : start + CHUNK, i] = columns[name][start : start + CHUNK]
     return torch.from_numpy(block)
+
+
+def check_parameters(parameters: Mapping[str, Tensor]) -> None:
+    """Raise ShapeError unless these are the raw parameters of N splats, by gsplat's names and in its shapes."""
+    if set(parameters) != {"means", "scales", "quats", "opacities", "sh0", "shN"}:
+        raise ShapeError(f"parameters: expected means, scales, quats, opacities, sh0 and shN, got {', '.join(parameters)}")
+    n = len(parameters["means"])
+    bands = parameters["shN"].shape[1] if parameters["shN"].dim() == 3 else 0
+    expected = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, bands, 3)}
+    for name, shape in expected.items():
+        if tuple(parameters[name].shape) != shape:
+            raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(parameters[name].shape)}")
+    if 3 * bands not in SH_DEGREES:
+        raise ShapeError(f"shN: {bands} coefficients fit no SH degree; 0, 3, 8, 15 or 24 do")

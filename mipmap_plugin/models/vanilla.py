@@ -20,7 +20,7 @@ from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, w
 from mipmap_plugin.formats.tags import render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.models.columns import SH_DEGREES, extra_columns, joined, to_columns, to_parameters
+from mipmap_plugin.models.columns import check_parameters, extra_columns, joined, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, drop, examine
@@ -69,7 +69,7 @@ class VanillaModel:
         self, parameters: dict[str, Tensor], trained: TrainedScale = TrainedScale(), origin: Origin = Origin(), notes: Iterable[str] = ()  # noqa: B008
     ) -> None:
         """A model over these tensors, which are not copied. Raises ShapeError."""
-        _check(parameters)
+        check_parameters(parameters)
         self._parameters = dict(parameters)
         self._origin = origin
         if origin.host:
@@ -126,7 +126,7 @@ class VanillaModel:
         return self._with(leaves, replace(self._origin, digest=""))
 
     def shared(self: Model) -> Model:
-        """A copy that takes no memory until it is reshaped or rebuilt: it shares this model's tensors, which it never changes."""
+        """A copy that shares this model's tensors, which it never changes, until it is rebuilt."""
         model = self._with(self._parameters, replace(self._origin, digest=""))
         model.shares = True
         return model
@@ -143,7 +143,7 @@ class VanillaModel:
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
         """Use these tensors themselves as leaves, as an optimizer requires. Extra columns are dropped, since rows may differ. Raises ShapeError."""
-        _check(parameters)
+        check_parameters(parameters)
         leaves = {name: tensor if tensor.is_leaf else tensor.detach() for name, tensor in parameters.items()}
         self._parameters, self.shares = {name: leaf.requires_grad_() for name, leaf in leaves.items()}, False
         if self._origin.extras:
@@ -160,15 +160,13 @@ class VanillaModel:
         In place, so that an optimizer keeps its leaves, unless they are shared. Raises ShapeError.
         """
         scales, opacities = form(self._activated(self._parameters["sh0"]).detach())
-        for name, values in {"scales": _log(scales), "opacities": _logit(opacities)}.items():
+        for name, values in _stored(scales, opacities).items():
             leaf = self._parameters[name]
             if values.shape != leaf.shape:
                 raise ShapeError(f"{name}: expected shape {list(leaf.shape)}, got {list(values.shape)}")
-            if self.shares:
-                self._parameters[name] = values
-            else:
-                with torch.no_grad():
-                    leaf.copy_(values)
+            self._parameters[name] = values if self.shares else leaf
+            with torch.no_grad():
+                self._parameters[name].copy_(values)
 
     def rebuild(self, form: Callable[[Gaussians], Gaussians]) -> None:
         """Replace the splats by those that `form` returns for them, of any number."""
@@ -284,32 +282,17 @@ def without_invalid(model: Model) -> Model:
     return model
 
 
-def _check(parameters: dict[str, Tensor]) -> None:
-    if set(parameters) != {"means", "scales", "quats", "opacities", "sh0", "shN"}:
-        raise ShapeError(f"parameters: expected means, scales, quats, opacities, sh0 and shN, got {', '.join(parameters)}")
-    n = len(parameters["means"])
-    bands = parameters["shN"].shape[1] if parameters["shN"].dim() == 3 else 0
-    expected = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "opacities": (n,), "sh0": (n, 1, 3), "shN": (n, bands, 3)}
-    for name, shape in expected.items():
-        if tuple(parameters[name].shape) != shape:
-            raise ShapeError(f"{name}: expected shape {list(shape)}, got {list(parameters[name].shape)}")
-    if 3 * bands not in SH_DEGREES:
-        raise ShapeError(f"shN: {bands} coefficients fit no SH degree; 0, 3, 8, 15 or 24 do")
-
-
 def _raw(gaussians: Gaussians) -> dict[str, Tensor]:
     """The raw parameters of splats, as copies."""
     g = gaussians.detach()
-    named = {"means": g.means, "scales": _log(g.scales), "quats": g.quats, "opacities": _logit(g.opacities)}
+    stored = _stored(g.scales, g.opacities)
+    named = {"means": g.means, "scales": stored["scales"], "quats": g.quats, "opacities": stored["opacities"]}
     return {name: tensor.clone() for name, tensor in {**named, "sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}.items()}
 
 
-def _log(scales: Tensor) -> Tensor:
-    return scales.detach().clamp_min(MIN_SCALE).log()
-
-
-def _logit(opacities: Tensor) -> Tensor:
-    return opacities.detach().logit(eps=OPACITY_MARGIN)
+def _stored(scales: Tensor, opacities: Tensor) -> dict[str, Tensor]:
+    """The raw scales and opacities of activated ones."""
+    return {"scales": scales.detach().clamp_min(MIN_SCALE).log(), "opacities": opacities.detach().logit(eps=OPACITY_MARGIN)}
 
 
 def _moved(tensor: Tensor, device: torch.device | str) -> Tensor:
