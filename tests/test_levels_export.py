@@ -100,6 +100,12 @@ def test_a_page_is_told_to_keep_the_distances():
     assert settings["lodUpdateDistance"] < 0.05 * settings["lodBaseDistance"]
 
 
+def test_levels_by_distance_are_shown_at_the_distances_that_they_were_made_for():
+    made = LADDER | {"by": "distance", "lodBaseDistance": 3.0, "lodMultiplier": 1.7, "canvas": 500, "chunk_extent": 4}
+    settings = viewer_settings(made, CHUNKS, 1000)
+    assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (6.0, 1.7)
+
+
 def test_a_ladder_of_one_level_is_not_streamed(ladder, tool):
     write_json(ladder / MANIFEST, LADDER | {"switches": []}, overwrite=True)
     with pytest.raises(SettingsError, match="a single level"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import multiprocessing
 import os
 import resource
@@ -12,6 +13,7 @@ import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -195,3 +197,22 @@ def test_a_state_that_is_none_is_refused(tmp_path, content):
     model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
     with pytest.raises(SettingsError, match="state: this state belongs to another base, settings or views"):
         model.adapt(1 / 4, steps=1, resume=tmp_path / "state")
+
+
+def test_a_state_that_takes_long_to_save_is_saved_less_often(tmp_path, monkeypatch):
+    clock, saves = [0.0], []
+
+    def save(*_: object) -> None:
+        saves.append(clock[0])
+        clock[0] += 4 * resume.QUICK_SAVE_S
+
+    monkeypatch.setattr(resume, "save_run", save)
+    monkeypatch.setattr(resume, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    keeper = resume.StateKeeper(tmp_path / "state", "")
+    keeper.file = SimpleNamespace(path=tmp_path / "state")
+    while clock[0] < 1000:
+        keeper.save_if_due(None)
+        clock[0] += 1
+    assert saves[0] == resume.SAVE_EVERY_S
+    assert all(later - earlier >= 4 * resume.SAVE_EVERY_S for earlier, later in itertools.pairwise(saves))
+    assert len(saves) == 4

@@ -27,18 +27,21 @@ from mipmap_plugin.models.base import SplatModel
 # with growth on trial.
 SAVE_EVERY_S = 60.0
 
+# Seconds that saving may take for that pace. A larger state is saved less often, so that a thirtieth of a run at most is spent on it.
+QUICK_SAVE_S = 2.0
+
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C during adaptation; the message names the file that the run can be resumed from."""
 
 
 class StateKeeper:
-    """Saves the state of one run to a file, if one was requested: every minute, and when the run is interrupted."""
+    """Saves the state of one run to a file, if one was requested: every minute, large ones less often, and when the run is interrupted."""
 
     def __init__(self, path: Path | None, fingerprint: str) -> None:
         self._requested, self._fingerprint = path, fingerprint
         self.file: StateFile | None = None  # where this run saves its state
-        self._saved_at = time.monotonic()
+        self._saved_at, self._took = time.monotonic(), 0.0
 
     def start_or_resume(self, student: SplatModel, task: Task, config: AdaptConfig, spent: float) -> Run:
         """Return the run in the file, or a new one; `spent`: seconds used so far.
@@ -74,13 +77,15 @@ class StateKeeper:
 
     def save_if_due(self, run: Run) -> None:
         """Save the state if the last save was long ago. A full disk does not end the run."""
-        if self._path is None or time.monotonic() - self._saved_at < SAVE_EVERY_S:
+        began = time.monotonic()
+        if self._path is None or began - self._saved_at < SAVE_EVERY_S * max(1.0, self._took / QUICK_SAVE_S):
             return
         try:
             save_run(run, self._path, self._fingerprint)
         except OutputError as error:
             warnings.warn(f"the run continues, but could not be resumed if it were killed: {error}", stacklevel=2)
         self._saved_at = time.monotonic()
+        self._took = self._saved_at - began
 
     def remaining_file(self) -> StateFile | None:
         """The state file of a run that has ended, which is needed until its model is saved; None if none was written."""
