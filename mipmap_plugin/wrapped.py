@@ -94,11 +94,6 @@ class Wrapped:
             eps2d = trained.eps2d * scale**2
         return Effects(degree, screen_filter, eps2d, self.background, supersampling, trained.near_plane)
 
-    @property
-    def asked_backend(self) -> str:
-        """The backend's name as it was asked for; "auto" for the fastest."""
-        return self._backend
-
     def backend(self, *, gradients: bool = False, screen_filter: str | None = None, viewer: str | None = None) -> tuple[Backend, str]:
         """Return the backend that renders this model, and why it was chosen."""
         effects = self.effects(screen_filter=screen_filter, viewer=viewer)

@@ -105,7 +105,7 @@ class _Results:
         gallery = evaluation_gallery(wrapped, self._protocol) if self._page else None
         lpips = self._perceptual and self._perceptual.label
         asked = {"protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings, "page": self._page is not None}
-        made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "scene": scene.digest(), "backend": wrapped.asked_backend}
+        made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "scene": scene.digest(), "backend": wrapped.backend()[0].name}
         cells = Cells(self._kept, asked | made_from)
         judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, gallery, cells)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
