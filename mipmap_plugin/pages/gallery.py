@@ -67,8 +67,9 @@ class Gallery:
         pictures = [Picture(shot.row, self._role(shot, in_viewer), shot.image, _quality(shot), means.get(shot.row, {})) for shot in shots]
         pictures.append(Picture("truth", "truth", shots[0].truth, note=self._truth))
         label = f"{shots[0].scene} {zoom_name(scale)}" if named else zoom_name(scale)
-        restored = why_not(self._base) or "It was adapted before an interruption, after which viewers' pictures are not drawn again."
-        reason = restored if any(each == scale for each in self._adapted.values()) else "Nothing was adapted: give --recipe default."
+        reason = "Nothing was adapted: give --recipe default."
+        if any(each == scale for each in self._adapted.values()):
+            reason = why_not(self._base) or "It was adapted before an interruption, after which viewers' pictures are not drawn again."
         return Zoom(
             label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", self._viewers.get(scale, ()),
             "" if scale in self._viewers else reason,
