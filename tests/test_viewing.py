@@ -27,7 +27,7 @@ from mipmap_plugin.viewing.around import BASE_PIXELS, NEAR, PIXELS, views_for_sc
 from mipmap_plugin.viewing.controls import figures, words
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
 from mipmap_plugin.viewing.page import NO_VISER, _check_address
-from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, inside, pose_of, up_of, zoomed_by_distance, zoomed_by_lens
+from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
 from mipmap_plugin.viewing.stage import AMPLIFIED, Look, Stage
 
@@ -78,22 +78,27 @@ def test_a_camera_that_sees_nothing_has_a_zoom(sampling, base):
     away = pose_of(base.cameras[0], 1.0)
     away = replace(away, position=(100.0, 100.0, 100.0))
     assert sampling.of(away.camera(8, 8)).splats == 0 and sampling.of(away.camera(8, 8)).zoom == 1
-    assert zoomed_by_distance(away, 0.25, sampling, (8, 8)) == away
+    assert zoomed(away, 0.25, sampling, (8, 8), by_distance) == away
 
 
 @pytest.mark.parametrize("zoom", [1 / 8, 1 / 2, 1.5])
 def test_zooming_by_distance_moves_the_eye_to_that_zoom(base, sampling, zoom):
     before = pose_of(base.cameras[0], sampling.of(base.cameras[0]).depth)
-    after = zoomed_by_distance(before, zoom, sampling, SIZE)
+    after = zoomed(before, zoom, sampling, SIZE, by_distance)
     assert sampling.of(after.camera(SIZE[1], SIZE[0])).zoom == pytest.approx(zoom, rel=0.05)
     assert (after.look_at, after.wxyz, after.fov) == (before.look_at, before.wxyz, before.fov)
 
 
-def test_zooming_by_focal_length_changes_the_lens_alone(base):
+@pytest.mark.parametrize("zoom", [3 / 4, 3.0])
+def test_zooming_by_focal_length_changes_the_lens_alone(base, sampling, zoom):
     before = pose_of(base.cameras[0], 2.0)
-    after = zoomed_by_lens(before, 2.0)
-    assert after.camera(64, 48).fy == pytest.approx(2 * before.camera(64, 48).fy) and after.position == before.position
-    assert zoomed_by_lens(before, 1e-3).fov == LARGEST_FOV
+    after = zoomed(before, zoom, sampling, SIZE, by_lens)
+    assert sampling.of(after.camera(SIZE[1], SIZE[0])).zoom == pytest.approx(zoom, rel=0.05)
+    assert replace(after, fov=before.fov) == before
+
+
+def test_the_field_of_view_stays_below_a_half_circle(base):
+    assert by_lens(pose_of(base.cameras[0], 2.0), 1e-3).fov == LARGEST_FOV
 
 
 def test_up_is_what_the_views_have_in_common(base):

@@ -34,6 +34,7 @@ class Controls:
 
     def __init__(self, gui: Any, names: Sequence[str], viewers: Sequence[str], views: Sequence[str], recipes: Sequence[str]) -> None:
         """`gui`: viser's; `names` of what can be shown; `viewers`, the chosen one first, None as AS_TRAINED."""
+        self._stops = 0.0, 0.0  # of the slider: for the last picture, and where it was then
         self.figures = gui.add_markdown("drawing the first picture ...")
         with gui.add_folder("Show"):
             self.source = gui.add_dropdown("Show", names, initial_value=names[0])
@@ -72,11 +73,15 @@ class Controls:
         self.against.value = against if against in names else NOTHING
         self.source.value = shown
 
-    def tell_picture(self, picture: Picture, *, follow: bool) -> None:
-        """Show a picture's figures; `follow`: set the slider to its zoom."""
+    def tell_picture(self, picture: Picture) -> None:
+        """Show a picture's figures."""
         self.figures.content = figures(picture)
-        stop = round(min(max(math.log2(picture.zoom), STOPS[0]), STOPS[1]), 1)
-        if follow and abs(stop - self.zoom.value) > STOPS[2] / 2:
+        self._stops = round(min(max(math.log2(picture.zoom), STOPS[0]), STOPS[1]), 1), self.zoom.value
+
+    def follow(self) -> None:
+        """Set the slider to the zoom of the last picture, unless a hand has moved it since; then there will be another picture."""
+        stop, then = self._stops
+        if self.zoom.value == then and abs(stop - then) > STOPS[2] / 2:
             self.zoom.value = stop
 
     def tell_progress(self, progress: Progress) -> None:

@@ -20,7 +20,7 @@ from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.viewing.adapting import Adapter, Live, Wish
 from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, Controls
 from mipmap_plugin.viewing.pace import STILL_S, Pace
-from mipmap_plugin.viewing.screen import Pose, pose_of, up_of, zoomed_by_distance, zoomed_by_lens
+from mipmap_plugin.viewing.screen import Pose, by_distance, by_lens, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.sources import File, of_adapted
 from mipmap_plugin.viewing.stage import Look, Stage, smaller
 
@@ -82,8 +82,9 @@ class Page:
         while True:
             self._changed.wait(PERIOD_S)
             self._changed.clear()
-            for number, client in self._server.get_clients().items():
-                self._serve(number, client)
+            still = [self._serve(number, client) for number, client in self._server.get_clients().items()]
+            if all(still) and time.monotonic() - self._slid > HANDS_OFF_S:
+                self._controls.follow()
 
     def close(self) -> None:
         """End a run that is adapting, and the server."""
@@ -125,20 +126,21 @@ class Page:
     def _pose(self, view: Camera) -> Pose:
         return pose_of(view, self._stage.sampling.of(view).depth)
 
-    def _serve(self, number: int, client: Any) -> None:
-        """Draw what a browser's camera sees, if that is something new: coarsely while it moves, in full once it is still."""
+    def _serve(self, number: int, client: Any) -> bool:
+        """Draw what a browser's camera sees, if that is something new: coarsely while it moves, in full once it is still; whether nothing was."""
         view, look, now, seen = _view(client), self._controls.look(), time.monotonic(), self._seen.get(number)
         moved = seen is None or seen.view != view
         version = self._version
         if seen is not None and not moved and seen.whole and (seen.look, seen.version) == (look, version):
-            return
+            return True
         since = now if seen is None or moved else seen.since
         pose, width, height = view
         coarse = self._pace.fraction(width * height // look.pixel**2) if now - since < STILL_S else 1.0
         if seen is not None and not moved and coarse < 1 and (seen.look, seen.version) == (look, version):
-            return
+            return False
         self._seen[number] = _Seen(view, look, version, since, coarse == 1)
         self._draw(client, look, pose.camera(width, height), coarse)
+        return False
 
     def _draw(self, client: Any, look: Look, screen: Camera, coarse: float) -> None:
         try:
@@ -149,7 +151,7 @@ class Page:
         self._pace.learn(picture.drawn.width * picture.drawn.height, picture.seconds)
         client.scene.set_background_image(_bytes(picture.image), format="png" if coarse == 1 else "jpeg", jpeg_quality=QUALITY)
         if coarse == 1:
-            self._controls.tell_picture(picture, follow=time.monotonic() - self._slid > HANDS_OFF_S)
+            self._controls.tell_picture(picture)
 
     def _zoom(self, event: Any) -> None:
         """Move the camera whose slider was moved by hand."""
@@ -160,10 +162,8 @@ class Page:
             pose, width, height = _view(event.client)
             look, zoom = self._controls.look(), 2.0**self._controls.zoom.value
             screen = smaller(pose.camera(width, height), 1 / look.pixel)
-            if self._controls.by.value == DISTANCE:
-                _move(event.client, zoomed_by_distance(pose, zoom, self._stage.sampling, screen.size))
-            else:
-                _move(event.client, zoomed_by_lens(pose, zoom / self._stage.sampling.of(screen).zoom))
+            change = by_distance if self._controls.by.value == DISTANCE else by_lens
+            _move(event.client, zoomed(pose, zoom, self._stage.sampling, screen.size, change))
 
     def _go(self, event: Any) -> None:
         """Move the camera to a view of the scene."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,7 +18,7 @@ from mipmap_plugin.splatting.rotations import quaternions, rotations
 # Vertical fields of view, radians: below the first nothing is left of a scene, above the second splats are stretched beyond recognition.
 LEAST_FOV, LARGEST_FOV = math.radians(0.5), math.radians(110)
 
-# Rounds in which a distance is found: depths, and so the zoom, change almost in proportion to it.
+# Rounds in which a zoom is found: it is that of the median splat in the picture, and another picture has another one.
 ROUNDS = 8
 
 # The median of at most so many splats, evenly spread, is that of all; and that of so many views.
@@ -96,23 +96,23 @@ def up_of(views: Sequence[Camera]) -> tuple[float, ...]:
     return tuple((mean / mean.norm()).tolist()) if mean.norm() > 0 else (0.0, 0.0, 1.0)
 
 
-def zoomed_by_lens(pose: Pose, factor: float) -> Pose:
+def zoomed(pose: Pose, zoom: float, sampling: Sampling, size: tuple[int, int], change: Callable[[Pose, float], Pose]) -> Pose:
+    """The pose whose picture of `size` (height, width) px has this zoom, as nearly as can be; `change`: `by_distance` or `by_lens`."""
+    for _ in range(ROUNDS):
+        now = sampling.of(pose.camera(size[1], size[0]))
+        if now.splats == 0:
+            break
+        pose = change(pose, zoom / now.zoom)
+    return pose
+
+
+def by_lens(pose: Pose, factor: float) -> Pose:
     """The pose with `factor` times the focal length, as far as the field of view may go."""
     fov = 2 * math.atan(math.tan(pose.fov / 2) / factor)
     return replace(pose, fov=min(max(fov, LEAST_FOV), LARGEST_FOV))
 
 
-def zoomed_by_distance(pose: Pose, zoom: float, sampling: Sampling, size: tuple[int, int]) -> Pose:
-    """The pose at the distance from `look_at` at which its picture of `size` (height, width) px has this zoom, as nearly as can be."""
-    for _ in range(ROUNDS):
-        now = sampling.of(pose.camera(size[1], size[0]))
-        if now.splats == 0:
-            break
-        pose = at_distance(pose, now.zoom / zoom)
-    return pose
-
-
-def at_distance(pose: Pose, factor: float) -> Pose:
-    """The pose at `factor` times its distance from `look_at`."""
-    moved = tuple(target + factor * (eye - target) for eye, target in zip(pose.position, pose.look_at, strict=True))
+def by_distance(pose: Pose, factor: float) -> Pose:
+    """The pose at the `factor`-th part of its distance from `look_at`."""
+    moved = tuple(target + (eye - target) / factor for eye, target in zip(pose.position, pose.look_at, strict=True))
     return replace(pose, position=moved)

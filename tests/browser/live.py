@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.resources import files
 from importlib.util import find_spec
@@ -28,6 +28,9 @@ PATIENCE = 240_000
 
 # The process of the command, in which Ctrl-C is heard also where a shell that started it in the background said not to.
 COMMAND = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); from mipmap_plugin.cli import main; sys.exit(main())"
+
+# Looks in a row, half a second apart, at which a picture is the same that is called still.
+LOOKS = 4
 
 WINDOW = {"width": 1200, "height": 800}
 
@@ -84,9 +87,20 @@ class LivePage:
             time.sleep(0.1)
         return found[0]
 
+    def becomes(self, condition: Callable[[], bool]) -> bool:
+        """Whether something holds sooner or later; what is done on the page takes a while to show, longer on a busy machine."""
+        end = time.monotonic() + PATIENCE / 1000
+        while not (holds := condition()) and time.monotonic() < end:
+            time.sleep(0.2)
+        return holds
+
     def zoom(self) -> float:
         """The zoom of the picture."""
         return float(re.search(r"×([\d.e-]+) ·", self.text())[1])
+
+    def stop(self) -> float:
+        """Where the slider of zooms is, in powers of two."""
+        return float(self.page.get_by_role("slider").first.get_attribute("aria-valuenow"))
 
     def choose(self, label: str, option: str) -> None:
         """Choose from a list."""
@@ -107,13 +121,17 @@ class LivePage:
         """Where the picture is, px."""
         return self.page.locator("canvas").first.bounding_box()
 
+    def picture(self) -> bytes:
+        """The picture as a PNG, as it is now."""
+        return self.page.screenshot(clip=self.box())
+
     def still(self) -> bytes:
-        """The picture as a PNG, once it does not change any more."""
-        before, now = b"", self.page.screenshot(clip=self.box())
-        while before != now:
-            time.sleep(0.7)
-            before, now = now, self.page.screenshot(clip=self.box())
-        return now
+        """The picture as a PNG, once neither it nor the words beside it change any more."""
+        looks: list[tuple[bytes, str]] = []
+        while len(looks) < LOOKS or len(set(looks[-LOOKS:])) > 1:
+            looks.append((self.picture(), self.text()))
+            time.sleep(0.5)
+        return looks[-1][0]
 
 
 def take(path: Path) -> None:
