@@ -1,7 +1,7 @@
 """A dolly: a camera that zooms out continuously from x1 to x1/16, over a ladder of levels, over rivals' and over single files.
 
     python benchmarks/levels.py DATA --ladders DIR
-    python benchmarks/levels.py DATA --ladders DIR --only lego_200 --viewer spark
+    python benchmarks/levels.py DATA --ladders DIR --only bases/lego_200 --viewer spark
 
 Ladders that are not in DIR yet are made there (minutes each). The rival is splat-transform's --decimate, to the splats of each of our levels, in the
 same file format; its levels are shown at the same zooms. It is left out where splat-transform is not found. Writes levels/<base>_<viewer>.json
@@ -37,14 +37,18 @@ from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.splat_transform import TOOL, find_tool
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.wrap import Wrapped, state_path
 
-BASES = ("lego_200", "chair_400")
+BASES = ("bases/lego_200", "bases/chair_400", "flowers_r8")
 VIEWERS = ("spark", "playcanvas")
 
 # Frames of the dolly, from x1 to COARSEST in equal ratios, and the test views that it is seen from.
 FRAMES, COARSEST = 49, 1 / 16
 VIEWS = slice(3, 25, 12)
+
+# A base without test views is seen from as many random ones; the seed is of none that anything was adapted to.
+RANDOM_VIEWS, SEED = 2, 271_828
 
 # Zooms of the strip of frames.
 STRIP = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
@@ -170,6 +174,13 @@ def changes(dolly: Dolly, ours: Show, viewer: str) -> list[Change]:
     return found
 
 
+def views_of(base: Wrapped, images: Path) -> list[Camera]:
+    """The cameras of the dolly: test views where the images lie there, else random ones between the base's own."""
+    if images.is_dir():
+        return [view.camera for view in test_views(base.place(load_scene(images)), base.cameras[0], base.background)[VIEWS]]
+    return jittered(base.views(), RANDOM_VIEWS, torch.Generator().manual_seed(SEED))
+
+
 def ladder_of(base: Wrapped, viewer: str, folder: Path) -> Path:
     """The ladder in a folder, made there if it is not yet."""
     if not (folder / MANIFEST).is_file():
@@ -223,10 +234,9 @@ def main(
     """
     torch.set_num_threads(1)
     (output / "levels").mkdir(parents=True, exist_ok=True)
-    for name in only or BASES:
-        base = wrap_model(data / "checkpoints" / "bases" / name, threads=1)
-        views = test_views(base.place(load_scene(data / "images" / name.split("_")[0])), base.cameras[0], base.background)[VIEWS]
-        dolly = Dolly(base, [view.camera for view in views])
+    for path in only or BASES:
+        base, name = wrap_model(data / "checkpoints" / path, threads=1), Path(path).name
+        dolly = Dolly(base, views_of(base, data / "images" / name.split("_")[0]))
         truths = dolly.truths() if measure else {}
         for each in viewer or VIEWERS:
             ladder = ladder_of(base, each, ladders / f"{name}_{each}")

@@ -17,9 +17,10 @@ from mipmap_plugin.formats.atomic import new_file
 INTRO = """# A dolly over a ladder of levels
 
 Made by `python benchmarks/levels.py DATA --ladders DIR`: a camera that zooms out continuously from x1 to x1/16, drawn by our renderer as the viewer
-draws; two test views that nothing was adapted to, 49 frames each; dB against the supersampled base of each frame. *levels*: ours. *base*: alone. *one
-file*: the default recipe at x1/4. *splat-transform*: its `--decimate` to the splats of each of our levels, in the same format, at the same zooms.
-*Flicker*: RMS of the change between neighboring frames that the truth does not have, in 8-bit levels; *worst* is of one pair of frames.
+draws; two views that nothing was adapted to, of the test set or else random, 49 frames each; dB against the supersampled base of each frame.
+*levels*: ours. *base*: alone. *one file*: the default recipe at x1/4. *splat-transform*: its `--decimate` to the splats of each of our levels,
+in the same format, at the same zooms. *Flicker*: RMS of the change between neighboring frames that the truth does not have, in 8-bit levels; *worst*
+is of one pair of frames.
 
 ![dB over zoom](levels.png)
 """

@@ -24,9 +24,6 @@ MERGE_TO = 0.8
 # The scale up to which a zoom-out uses its full learning rates. Above it there is less to learn, and rates fall as 1 / scale.
 FULL_RATES_SCALE = 0.25
 
-# A file of fewer splats at the base's own scale has as much to learn as one just below it.
-JUST_BELOW = 1 - 1e-3
-
 # A band ends at the base's scale, up to rounding.
 HIGHEST = 1 + 1e-6
 
@@ -61,12 +58,12 @@ THOROUGH_UPSAMPLED = dict(
 
 def default(scale: float, network: bool) -> dict[str, Any]:
     """For most uses: closed form, merging and a short optimization, minutes at most."""
-    return DEFAULT_OUT | _zoom_out_settings(scale) if scale < 1 else DEFAULT_UPSAMPLED if network else DEFAULT_IN
+    return DEFAULT_OUT | _zoom_out_settings(scale) if scale <= 1 else DEFAULT_UPSAMPLED if network else DEFAULT_IN
 
 
 def thorough(scale: float, network: bool) -> dict[str, Any]:
     """Better quality in several times the time; at zoom-in without a network the same as `default`."""
-    return THOROUGH_OUT | _zoom_out_settings(scale) if scale < 1 else THOROUGH_UPSAMPLED if network else DEFAULT_IN
+    return THOROUGH_OUT | _zoom_out_settings(scale) if scale <= 1 else THOROUGH_UPSAMPLED if network else DEFAULT_IN
 
 
 def paper(scale: float, network: bool) -> dict[str, Any]:
@@ -99,8 +96,7 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     if not callable(function):
         raise PluginError(f"recipe {name!r} is of type {type(function).__name__}; make it a function (scale, network) -> settings")
     try:
-        at = JUST_BELOW if scale == 1 and overrides.get("most_splats") else scale
-        settings = {**function(at, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)}
+        settings = {**function(scale, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)}
     except Exception as error:  # third-party code may fail in any way
         raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
     try:
@@ -118,7 +114,7 @@ def scale_of_fraction(kept: float) -> float:
 
 
 def _zoom_out_settings(scale: float) -> dict[str, Any]:
-    """The settings of a zoom-out that depend on the scale."""
+    """The settings that depend on the scale, of a zoom-out or of a conversion to a viewer at the base's own scale."""
     factor = min(1.0, FULL_RATES_SCALE / scale)
     splat_rates = ("means", "scales", "quats", "opacities", "sh0", "shN")  # not those of anchors and networks, which were not tested with it
     rates = RATES_OUT.model_copy(update={name: factor * getattr(RATES_OUT, name) for name in splat_rates})

@@ -39,8 +39,8 @@ def test_as_many_splats_as_fit_into_a_file_do_fit(tmp_path):
         splats_within(model, HEADER, "file.ply")
 
 
-def test_a_file_of_fewer_splats_at_the_bases_own_scale_is_optimized_as_a_zoom_out():
-    assert recipe("default", 1.0, most_splats=5).rates.means > 0 == recipe("default", 1.0).rates.means
+def test_a_file_of_fewer_splats_at_the_bases_own_scale_is_optimized():
+    assert recipe("default", 1.0, most_splats=5).rates.means > 0
 
 
 def test_the_command_makes_a_file_of_so_many_splats(tmp_path, capsys):

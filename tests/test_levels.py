@@ -144,6 +144,17 @@ def test_the_ratio_suits_the_viewer():
     assert request(ratio=1.5).first_ratio(effects) == 1.5
 
 
+def test_levels_below_a_half_are_denser_unless_a_ratio_is_asked_for():
+    usual = LadderRequest("spark")
+    assert usual.next_ratio(0.7, WIDE) == WIDE and usual.next_ratio(0.4, WIDE) == NARROW and usual.next_ratio(0.4, FINEST_RATIO) == FINEST_RATIO
+    assert request(ratio=1.5).next_ratio(0.4, 1.5) == 1.5
+
+
+def test_a_level_that_starts_from_a_finer_one_takes_a_third_of_the_steps():
+    assert LadderRequest("spark").steps(1 / 4) == recipe("default", 1 / 4).steps / 3
+    assert LadderRequest("spark", recipe="instant").steps(1 / 4) == 0
+
+
 @pytest.mark.parametrize(
     ("options", "reason"),
     [({"coarsest": 2.0}, "goes down"), ({"ratio": 1.0}, "ratio: must be"), ({"until_splats": 0}, "until_splats"), ({"band": (0.5, 1)}, "band: set")],

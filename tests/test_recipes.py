@@ -39,3 +39,10 @@ def test_what_is_no_recipe_is_named():
     register_recipe("mine", lambda scale, network: dict(stepps=3), replace=True)
     with pytest.raises(SettingsError, match="setting stepps"):
         recipe("mine", 2)
+
+
+@pytest.mark.parametrize("name", ["default", "thorough"])
+def test_a_conversion_to_a_viewer_learns_as_a_zoom_out_does_and_merges_nothing(name):
+    converting, below = recipe(name, 1.0), recipe(name, 0.999)
+    assert converting.rates.means == pytest.approx(below.rates.means, rel=0.01) and converting.steps == below.steps
+    assert converting.merge_to == 1

@@ -89,10 +89,11 @@ class _Work:
     def next(self, levels: Sequence[Level], ratio: float) -> tuple[Level, float]:
         """The level below the last one, and the ratio of its band; a level that is not good enough is made again for a narrower band."""
         last = levels[-1]
-        start = FinerLevel(last.adapted.model, last.band.scale)
+        start, ratio = FinerLevel(last.adapted.model, last.band.scale), self.request.next_ratio(last.band.low, ratio)
         while True:
             band = last.band.next(ratio, self.request.coarsest)
-            level = self._made(f"level_{len(levels)}_x{band.scale:.6g}", band, band.settings() | {"start": start})
+            settings = band.settings() | {"start": start, "steps": self.request.steps(band.scale)}
+            level = self._made(f"level_{len(levels)}_x{band.scale:.6g}", band, settings)
             narrower = ratio**0.5
             if self._suffices(level) or narrower * SAME < FINEST_RATIO:
                 return level, ratio

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 from mipmap_plugin.effects import COMPENSATED, Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_scale
+from mipmap_plugin.recipes import recipe
 
-# The ratio of neighboring scales: five steps, or eight, from x1 to x1/16. A level that was adapted to its band loses 3 to 4 dB at the ends of an
-# octave where the viewer compensates or hardly dilates, and 8 dB where it dilates by 0.3 px² (lego at x1/4); there half an octave costs 6 dB.
-# With octaves lego in Spark falls to 30.5 dB, with five steps to 31.2.
-WIDE, NARROW = 2**0.8, 2**0.5
+# The ratio of neighboring scales: WIDE or NARROW down to DENSE_BELOW, then NARROW, because small levels cost little. A level that was adapted to its
+# band loses 3 to 4 dB at the ends of an octave where the viewer compensates or hardly dilates, and 8 dB where it dilates by 0.3 px² (lego at x1/4);
+# there half an octave costs 6 dB. Lego in Spark never falls below 31.1 dB with WIDE alone, and 32.1 with NARROW below, at as many bytes.
+WIDE, NARROW, DENSE_BELOW = 2**0.8, 2**0.5, 0.5
 
 # px²: up to this dilation the wide ratio suits viewers without compensation too.
 SMALL_DILATION = 0.1
@@ -28,6 +30,9 @@ BASE_REACH = 0.93
 # A level's splats are in proportion to this power of its scale, and all levels below x1 together have this fraction of the base's. At x1/4, an
 # eighth of lego's splats are 2 dB worse at the upper end of an octave than all of them in Spark, and no worse in PlayCanvas.
 POWER, KEPT = 2 / 3, 0.5
+
+# The part of a recipe's steps for a level that starts from a finer one, which is nearly right: lego in Spark has as many dB as with all of them.
+STEPS_KEPT = 1 / 3
 
 # dB: merging may cost this much before the first step, most of which steps regain: of 7 dB on lego at x1/2, all. Of 14 dB, on the demo scene,
 # whose splats are few for its pixels, they regain 4, so that more splats are kept there.
@@ -78,6 +83,14 @@ class LadderRequest:
         if self.ratio is not None:
             return self.ratio
         return WIDE if target.screen_filter in COMPENSATED or target.eps2d <= SMALL_DILATION else NARROW
+
+    def next_ratio(self, shown_down_to: float, ratio: float) -> float:
+        """The ratio below a level that is shown down to this zoom, after levels of the given ratio."""
+        return min(ratio, NARROW) if self.ratio is None and shown_down_to < DENSE_BELOW else ratio
+
+    def steps(self, scale: float) -> int:
+        """The steps of a level that starts from a finer one. Raises SettingsError for a setting that is unknown or out of range."""
+        return math.ceil(STEPS_KEPT * recipe(self.recipe, scale).steps)
 
     @property
     def seed(self) -> int:

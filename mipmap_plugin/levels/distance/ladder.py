@@ -101,8 +101,8 @@ def chunk_extent(distance: float) -> int:
 
 
 def _first(base: Wrapped, request: LadderRequest, band: Band, state: Path | None) -> Adapted:
-    """x1: the base, converted to the viewer with the settings of a zoom-out unless that draws it as its training did."""
+    """x1: the base, converted to the viewer unless that draws it as its training did."""
     as_it_is = base.target(request.viewer) == base.effects()
-    converted = {} if as_it_is else {**band.settings(), "most_splats": len(base.model.parameters()["means"])}
+    converted = {} if as_it_is else band.settings()
     return base.adapt(1.0, resume=state, **{"recipe": request.recipe, "viewer": request.viewer, **converted, **request.settings})
 
