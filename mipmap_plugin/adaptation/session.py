@@ -34,6 +34,7 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
+from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.progress import announced
@@ -110,14 +111,14 @@ class Session:
             effects = (self.base_effects, *self.targets.values())
             warm_up_backend(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0)
         as_it_is = self._for_target(self._base_in_viewer, shared=True)
-        student, start = StartSearch(self._start_problem()).best()
-        initial = student.copy()
+        initial, start = StartSearch(self._start_problem()).best()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps"
+        return_freed_memory()
         self.seconds["total"] = time.perf_counter() - began
         if self.config.steps:
-            run, ended_by = self._optimize(student, resume, observe)
+            run, ended_by = self._optimize(initial.copy(), resume, observe)
             curve, states = run.curve, states | self._run_states(run, initial)
         return self._select(states, curve, ended_by)
 
