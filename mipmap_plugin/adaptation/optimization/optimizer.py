@@ -12,6 +12,7 @@ from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import CARRIED, SplatModel
+from mipmap_plugin.splatting.bands import neighbors
 
 # INRIA's value: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
 ADAM_EPS = 1e-15
@@ -59,16 +60,13 @@ def change_rows(
     model: SplatModel, optimizer: Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
 ) -> None:
     """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in the model and in the optimizer."""
-    fresh, moves = {}, {}
-    names = model.parameters().keys()
-    for group in (group for group in optimizer.param_groups if group["name"] in names):
-        old = group["params"][0]
-        new = parameter(group["name"], old.detach()).clone().requires_grad_()
-        moves[group["name"]] = old.requires_grad
+    groups = {group["name"]: group for group in optimizer.param_groups if group["name"] in model.parameters()}
+    before = {name: group["params"][0] for name, group in groups.items()}
+    fresh = neighbors({name: parameter(name, old.detach()).clone() for name, old in before.items()})
+    for name, old in before.items():
         state = optimizer.state.pop(old, {})
-        optimizer.state[new] = {k: moment(v) if torch.is_tensor(v) and v.shape == old.shape else v for k, v in state.items()}
-        group["params"] = [new]
-        fresh[group["name"]] = new
+        optimizer.state[fresh[name]] = {k: moment(v) if torch.is_tensor(v) and v.shape == old.shape else v for k, v in state.items()}
+        groups[name]["params"] = [fresh[name]]
     model.replace_parameters(fresh)
     for name, tensor in fresh.items():
-        tensor.requires_grad_(moves[name])
+        tensor.requires_grad_(before[name].requires_grad)
