@@ -181,6 +181,7 @@ class Session:
             return observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
 
         ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
+        run.optimizer.state.clear()  # frees the memory for the choice among the states
         self.state = keeper.remaining_file()
         self.seconds["pseudo truth"] = sum(run.costs.truths.values())
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
