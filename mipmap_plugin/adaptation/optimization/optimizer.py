@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping
 import torch
 from torch import Tensor
 
+from mipmap_plugin import pool
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
@@ -51,7 +52,7 @@ def restore_parameters(model: SplatModel, optimizer: Adam, before: Mapping[str, 
 
     If only the moments were reset and not the step count, the first step would be three times too long.
     """
-    change_rows(model, optimizer, lambda name, _: before[name], torch.zeros_like)
+    change_rows(model, optimizer, lambda name, _: before[name].clone(), torch.zeros_like)
     for tensor in model.parameters().values():
         optimizer.state.pop(tensor, None)
 
@@ -59,13 +60,19 @@ def restore_parameters(model: SplatModel, optimizer: Adam, before: Mapping[str, 
 def change_rows(
     model: SplatModel, optimizer: Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
 ) -> None:
-    """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in the model and in the optimizer."""
+    """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in the model and in the optimizer.
+
+    Both functions return new tensors.
+    """
+    pool.release()  # what a step needs, which is of no use for this
     groups = {group["name"]: group for group in optimizer.param_groups if group["name"] in model.parameters()}
     before = {name: group["params"][0] for name, group in groups.items()}
-    fresh = neighbors({name: parameter(name, old.detach()).clone() for name, old in before.items()})
+    fresh = neighbors({name: parameter(name, old.detach()) for name, old in before.items()})
     for name, old in before.items():
         state = optimizer.state.pop(old, {})
-        optimizer.state[fresh[name]] = {k: moment(v) if torch.is_tensor(v) and v.shape == old.shape else v for k, v in state.items()}
+        for key, value in state.items():
+            state[key] = moment(value) if torch.is_tensor(value) and value.shape == old.shape else value
+        optimizer.state[fresh[name]] = state
         groups[name]["params"] = [fresh[name]]
     model.replace_parameters(fresh)
     for name, tensor in fresh.items():
