@@ -10,6 +10,12 @@ TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 KEPT_BLOCK, KEPT_IN_ALL = 32 << 20, 1 << 30
 
 
+def return_freed_memory() -> None:
+    """Give the system what is freed, after a phase that needed more than the next one does (glibc; milliseconds)."""
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def keep_freed_memory() -> bool:
     """Let this process keep what it frees for its next tensors; return whether the C library can (glibc). For commands, not for libraries.
 

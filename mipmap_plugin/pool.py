@@ -56,6 +56,11 @@ class Pool:
             while self.spare_bytes > self._most_used:
                 self._spare.popleft()
 
+    def release(self) -> None:
+        """Free the spare blocks."""
+        with self._lock:
+            self._spare.clear()
+
     @property
     def spare_bytes(self) -> int:
         return sum(map(len, self._spare))
@@ -66,6 +71,11 @@ def _new_block(size: int) -> np.ndarray:
 
 
 _pool = Pool()
+
+
+def release() -> None:
+    """Free the spare memory of this process's pool, before work that needs memory of other sizes."""
+    _pool.release()
 
 
 def empty(*shape: int, dtype: type = np.float32) -> np.ndarray:

@@ -18,7 +18,7 @@ from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
-from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.views import choose_views
@@ -64,6 +64,7 @@ class Wrapped:
         self.loading_s = 0.0  # seconds that loading the model took
         self.asked: dict[str, str] = {}  # what was given beside the checkpoint (`Report.inputs`); "" for what was not
         self.images: BaseImages | None = None  # of the base, drawn so far for all scales; None: the next call draws all of its own
+        self.keeps_images = True  # for further scales, up to 1 GiB; False saves that memory where `adapt` is called once
 
     def __repr__(self) -> str:
         return notebook.line("Wrapped", notebook.base_facts(self.model, self.cameras, self.trained))
@@ -192,7 +193,7 @@ class Wrapped:
         in_viewer = self.read_by(viewer)
         base_in_viewer = model if in_viewer is self.model else in_viewer
         if self.images is None or not self.images.are_of(model, backend, self.effects()):
-            self.images = BaseImages(model, backend, self.effects())
+            self.images = BaseImages(model, backend, self.effects(), LIMIT if self.keeps_images else 0)
         request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs)
         with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
             adapted = Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)

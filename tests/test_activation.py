@@ -22,6 +22,7 @@ def gradients(model, views, *, share):
         seen = splats(view)
         backend.render(seen, view, Effects(1)).image.square().sum().backward()
         splats.accumulate(seen)
+        assert not share or splats._splats is None or seen.sh.grad is None  # at most the sum and one view's are in memory
     splats.backward()
     return {name: tensor.grad for name, tensor in student.parameters().items()}, len(asked)
 

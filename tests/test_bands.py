@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mipmap_plugin.pool import LARGE
-from mipmap_plugin.splatting.bands import joined
+from mipmap_plugin.splatting.bands import joined, neighbors
 
 
 @pytest.mark.parametrize("count", [3, LARGE // 4 // 45 + 1], ids=["small", "large"])
@@ -17,6 +17,20 @@ def test_values_and_gradients_are_those_of_cat(count, frozen):
     assert torch.equal(joined(sh0, shN), expected)
     (joined(sh0, shN) * weights).sum().backward()
     assert torch.equal(sh0.grad, weights[:, :1]) and sh0.grad.is_contiguous()
+    assert shN.grad is None if frozen else torch.equal(shN.grad, weights[:, 1:])
+
+
+@pytest.mark.parametrize("frozen", [False, True], ids=["all", "shN frozen"])
+def test_large_neighbors_are_joined_without_a_copy_and_have_gradients(frozen):
+    count = LARGE // 4 // 45 + 1
+    apart = {"means": torch.rand(count, 3), "sh0": torch.rand(count, 1, 3), "shN": torch.rand(count, 15, 3)}
+    held = neighbors(apart)
+    assert all(torch.equal(held[name], tensor) for name, tensor in apart.items()) and held["sh0"].data_ptr() != apart["sh0"].data_ptr()
+    sh0, shN, weights = held["sh0"].requires_grad_(), held["shN"].requires_grad_(not frozen), torch.rand(count, 16, 3)
+    whole = joined(sh0, shN)
+    assert whole.data_ptr() == sh0.data_ptr() and torch.equal(whole, torch.cat([sh0, shN], dim=1))
+    (whole * weights).sum().backward()
+    assert torch.equal(sh0.grad, weights[:, :1])
     assert shN.grad is None if frozen else torch.equal(shN.grad, weights[:, 1:])
 
 

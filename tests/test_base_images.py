@@ -95,6 +95,19 @@ def test_a_scale_is_adapted_alike_whether_or_not_another_came_before():
     assert all(torch.equal(tensor, after[name]) for name, tensor in alone.items())
 
 
+def test_a_base_that_is_adapted_once_keeps_no_images(drawn):
+    def adapted(keeps):
+        wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3), backend="reference")
+        wrapped.keeps_images = keeps
+        parameters = wrapped.adapt(1 / 2, steps=4, extra_views=1, validation_views=2).model.parameters()
+        return wrapped.images._store._bytes, parameters
+
+    (kept, usual), first = adapted(True), len(drawn)
+    none, once = adapted(False)
+    assert kept > 0 == none and len(drawn) == 2 * first  # no image is drawn twice for one scale
+    assert all(torch.equal(tensor, once[name]) for name, tensor in usual.items())
+
+
 def test_views_that_are_not_used_any_more_make_room(drawn):
     first, second = tiny.cameras(2)
     images = BaseImages(tiny.model(), ReferenceBackend(), TRAINED, limit=32 * 24 * 3 * 2)

@@ -30,6 +30,18 @@ def test_memory_is_not_used_again_while_a_tensor_shows_it():
     assert (tensor == 1).all()
 
 
+def test_spare_memory_is_released_and_memory_in_use_is_not():
+    pool = Pool()
+    used = pool.empty((2 * LARGE,), np.uint8)
+    used.fill(1)
+    pool.empty((2 * LARGE,), np.uint8)
+    assert pool.spare_bytes > 0
+    pool.release()
+    assert pool.spare_bytes == 0 and (used == 1).all()
+    del used
+    assert pool.spare_bytes > 0  # it came back after that
+
+
 def test_a_much_larger_block_is_left_for_others():
     pool = Pool()
     pool.empty((4 * LARGE,), np.uint8)

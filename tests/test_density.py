@@ -9,7 +9,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.adam import Adam
+from mipmap_plugin.adaptation.optimization.adam import ROWS, Adam
 from mipmap_plugin.adaptation.optimization.density import (
     HALF_APART,
     SPLIT_SHRINK,
@@ -322,6 +322,19 @@ def test_a_step_is_that_of_torchs_adam_bit_by_bit():
             adam.step()
             adam.zero_grad()
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
+
+
+def test_a_step_of_a_part_of_a_tensor_is_that_of_the_same_numbers_alone():
+    generator = torch.Generator().manual_seed(0)
+    start, weights = (torch.randn(2 * ROWS + 5, 16, 3, generator=generator) for _ in range(2))
+    alone, part = start[:, 1:].clone().requires_grad_(), start.clone()[:, 1:].requires_grad_()
+    for tensor in (alone, part):
+        adam = Adam([dict(params=[tensor], lr=0.1)], (0.8, 0.99), 1e-15)
+        for _ in range(3):
+            (tensor.sin() * weights[:, 1:]).sum().backward()
+            adam.step()
+            adam.zero_grad()
+    assert alone.is_contiguous() and not part.is_contiguous() and torch.equal(alone, part)
 
 
 def test_adapting_loads_no_compiler_of_torch():

@@ -40,6 +40,25 @@ def test_a_snapshot_does_not_follow_the_model():
     assert torch.equal(taken.rows["means"], before) and not taken.rows["means"].requires_grad
 
 
+def test_a_renewed_snapshot_takes_no_further_memory():
+    model = tiny.model(5).copy()
+    first = Snapshot.of(model)
+    change(model)
+    second = first.renewed(model, rows_changed=True)
+    assert second.rows_changed and all(second.rows[name] is held for name, held in first.rows.items())
+    assert all(torch.equal(second.rows[name], tensor) for name, tensor in model.parameters().items())
+    network = Snapshot.of(Shared(4, 0.0)).renewed(Shared(4, 2.0)).shared["weight"]
+    assert network.tolist() == [2.0, 2.0]
+
+
+def test_a_renewed_snapshot_of_other_rows_leaves_the_first_alone():
+    first, other = Snapshot.of(tiny.model(5)), tiny.model(3, seed=1)
+    before = first.rows["means"].clone()
+    second = first.renewed(other)
+    assert torch.equal(first.rows["means"], before)
+    assert all(torch.equal(second.rows[name], tensor) for name, tensor in other.parameters().items())
+
+
 def test_as_many_rows_keep_their_leaves():
     model = tiny.model(5).copy()
     before, taken = dict(model.parameters()), Snapshot.of(model)

@@ -24,6 +24,22 @@ def test_the_closed_form_is_where_a_run_starts():
     assert start_of(adapted().report) == "the closed form"
 
 
+@pytest.mark.parametrize("steps", [0, 2])
+def test_a_start_takes_no_memory_for_what_it_has_of_the_base_and_what_is_returned_has_its_own(monkeypatch, steps):
+    seen, choose = {}, Validation.choose
+    monkeypatch.setattr(Validation, "choose", lambda self, states: (seen.update(states), ("the start, the closed form", choose(self, states)[1]))[1])
+    base = wrap_model(tiny.model(COUNT), cameras=tiny.cameras(), backend="reference")
+    returned = base.adapt(SCALE, steps=steps, merge_to=1.0, extra_views=4).model
+
+    def places(model):
+        return {name: tensor.data_ptr() for name, tensor in model.parameters().items()}
+
+    shared = places(base.model).items() & places(seen["the start, the closed form"]).items()
+    assert {name for name, _ in shared} == {"means", "quats", "sh0", "shN"}
+    assert not set(places(returned).values()) & set(places(base.model).values())
+    assert torch.equal(returned.parameters()["shN"], base.model.parameters()["shN"])  # no step has changed it
+
+
 def test_the_base_is_chosen_where_the_closed_form_is_worse(monkeypatch):
     monkeypatch.setattr(start, "closed_form", lambda gaussians, *_: (10 * gaussians.scales, gaussians.opacities))
     result = adapted(scale=4)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from mipmap_plugin import threads
+from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.growing import growth_note
@@ -34,6 +34,7 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
+from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.progress import announced
@@ -110,14 +111,14 @@ class Session:
             effects = (self.base_effects, *self.targets.values())
             warm_up_backend(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0)
         as_it_is = self._for_target(self._base_in_viewer, shared=True)
-        student, start = StartSearch(self._start_problem()).best()
-        initial = student.copy()
+        initial, start = StartSearch(self._start_problem()).best()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps"
+        _free_memory()
         self.seconds["total"] = time.perf_counter() - began
         if self.config.steps:
-            run, ended_by = self._optimize(student, resume, observe)
+            run, ended_by = self._optimize(initial.copy(), resume, observe)
             curve, states = run.curve, states | self._run_states(run, initial)
         return self._select(states, curve, ended_by)
 
@@ -180,6 +181,8 @@ class Session:
             return observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
 
         ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
+        run.optimizer.state.clear()
+        _free_memory()
         self.state = keeper.remaining_file()
         self.seconds["pseudo truth"] = sum(run.costs.truths.values())
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
@@ -269,6 +272,12 @@ def _renderer(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera
 def _unrounded(effects: Effects) -> Effects:
     """The effects without the rounding of a viewer's file and picture, which is noise to an optimizer step and a third of its time."""
     return replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
+
+
+def _free_memory() -> None:
+    """Give the system what one phase needed and the next one does not."""
+    pool.release()
+    return_freed_memory()
 
 
 def _rows(model: SplatModel) -> int:

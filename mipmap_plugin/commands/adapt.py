@@ -134,6 +134,7 @@ def _adapted(
     """Yield each model as soon as it is adapted, and the path to save it to."""
     from mipmap_plugin.wrap import state_path
 
+    wrapped.keeps_images = len(requests) > 1
     for (scale, viewer), target in zip(requests, targets, strict=True):
         yield wrapped.adapt(scale, viewer=viewer, resume=state_path(target), **settings), target
 

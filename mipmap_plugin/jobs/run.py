@@ -42,6 +42,7 @@ def _finished_before(job: Job) -> Outcome | None:
 
 def _adapt(job: Job, threads: int | None) -> Outcome:
     base = job.base.load(threads)
+    base.keeps_images = False
     config = job.config()
     base.targets(job.viewer)
     networks_move = config.steps > 0 and config.rates.networks > 0

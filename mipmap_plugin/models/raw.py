@@ -33,8 +33,9 @@ def check(parameters: dict[str, Tensor]) -> None:
 def raw_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
     """The raw parameters of splats, as copies."""
     g = gaussians.detach()
-    named = {"means": g.means, "scales": log(g.scales), "quats": g.quats, "opacities": logit(g.opacities)}
-    return {name: tensor.clone() for name, tensor in {**named, "sh0": g.sh[:, :1], "shN": g.sh[:, 1:]}.items()}
+    sh = g.sh.clone(memory_format=torch.contiguous_format)  # one tensor: joined without a copy
+    own = {"means": g.means.clone(), "scales": log(g.scales), "quats": g.quats.clone(), "opacities": logit(g.opacities)}
+    return {**own, "sh0": sh[:, :1], "shN": sh[:, 1:]}
 
 
 def log(scales: Tensor) -> Tensor:

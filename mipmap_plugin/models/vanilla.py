@@ -28,7 +28,7 @@ from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts
 from mipmap_plugin.models.raw import check, log, logit, moved, raw_parameters
-from mipmap_plugin.splatting.bands import joined
+from mipmap_plugin.splatting.bands import joined, neighbors
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
 Model = TypeVar("Model", bound="VanillaModel")
@@ -118,8 +118,9 @@ class VanillaModel:
 
     def copy(self: Model) -> Model:
         """An independent model whose parameters are leaves that require gradients; it has no digest, because it may change."""
-        leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in self._parameters.items()}
-        return self._with(leaves, replace(self._origin, digest=""))
+        held = {name: tensor.detach() for name, tensor in self._parameters.items()}
+        copies = {name: copied.clone() if copied is held[name] else copied for name, copied in neighbors(held).items()}
+        return self._with({name: tensor.requires_grad_() for name, tensor in copies.items()}, replace(self._origin, digest=""))
 
     def shared(self: Model) -> Model:
         """A copy that takes no memory until it is reshaped or rebuilt: it shares this model's tensors, which it never changes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -14,14 +15,31 @@ from mipmap_plugin.pool import LARGE, empty
 def joined(sh0: Tensor, shN: Tensor) -> Tensor:
     """[N, K, 3] from the constant band sh0 [N, 1, 3] and the others shN [N, K - 1, 3].
 
-    No copy is made of neighbors in memory that need no gradient. Other large tensors on a CPU lie in memory that is used again, and so do
-    their gradients: above a million splats, joining and splitting them in fresh memory takes a third of an optimization step.
+    No copy is made of neighbors in memory (`neighbors`) that are large or need no gradient. Other large tensors on a CPU lie in memory that
+    is used again, and so do their gradients: above a million splats, joining and splitting them in fresh memory takes a third of an
+    optimization step.
     """
     if _are_neighbors(sh0, shN) and not (sh0.requires_grad or shN.requires_grad):
-        count, others, channels = shN.shape
-        return torch.as_strided(sh0.detach(), (count, 1 + others, channels), shN.stride(), sh0.storage_offset())
+        return _whole(sh0, shN)
     large = sh0.device.type == "cpu" and sh0.dtype == torch.float32 and 4 * shN.numel() >= LARGE
     return _Joined.apply(sh0, shN) if large else torch.cat([sh0, shN], dim=1)  # type: ignore[no-untyped-call]  # torch's
+
+
+def neighbors(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The parameters, with copies of sh0 and shN, if there are both, that are parts of one tensor: `joined` need not copy them again.
+
+    The copies require no gradient.
+    """
+    if not {"sh0", "shN"} <= parameters.keys():
+        return dict(parameters)
+    whole = torch.cat([parameters["sh0"].detach(), parameters["shN"].detach()], dim=1)
+    return {**parameters, "sh0": whole[:, :1], "shN": whole[:, 1:]}
+
+
+def _whole(sh0: Tensor, shN: Tensor) -> Tensor:
+    """The tensor that both neighbors are parts of, without a gradient."""
+    count, others, channels = shN.shape
+    return torch.as_strided(sh0.detach(), (count, 1 + others, channels), shN.stride(), sh0.storage_offset())
 
 
 def _are_neighbors(sh0: Tensor, shN: Tensor) -> bool:
@@ -34,6 +52,8 @@ def _are_neighbors(sh0: Tensor, shN: Tensor) -> bool:
 class _Joined(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, sh0: Tensor, shN: Tensor) -> Tensor:
+        if _are_neighbors(sh0, shN):
+            return _whole(sh0, shN)
         count, bands, channels = shN.shape
         return torch.cat([sh0, shN], dim=1, out=torch.from_numpy(empty(count, bands + 1, channels)))
 

@@ -39,15 +39,16 @@ class Activation:
         return replace(self._splats, **leaves)
 
     def accumulate(self, splats: Gaussians) -> None:
-        """Add the gradients of the `splats` that one view was rendered from."""
+        """Take the gradients of the `splats` that one view was rendered from, and add them up."""
         if self._splats is None:
             return
         for name, leaf in _tensors(splats).items():
             if leaf.grad is not None:
                 self._gradients[name] = self._gradients[name].add_(leaf.grad) if name in self._gradients else leaf.grad
+                leaf.grad = None  # makes room for the next view's
 
     def means_gradient(self, splats: Gaussians) -> tuple[Tensor, Tensor]:
-        """Return the means [N, 3] and their gradient in the latest view, which was rendered from `splats`."""
+        """Return the means [N, 3] and their gradient in the latest view, which was rendered from `splats` and not accumulated yet."""
         if self._splats is not None:
             return splats.means, torch.zeros_like(splats.means) if splats.means.grad is None else splats.means.grad
         means = self._model.parameters()["means"]
@@ -60,9 +61,12 @@ class Activation:
         if self._splats is None:
             return
         splats = _tensors(self._splats)
-        gradients, self._splats, self._gradients = self._gradients, None, {}  # free the memory for the optimizer and density control
+        gradients, self._splats, self._gradients = self._gradients, None, {}
         if gradients:
-            _WithGradients.apply(list(gradients.values()), *(splats[name] for name in gradients)).backward()  # type: ignore[no-untyped-call]  # torch's
+            end = _WithGradients.apply(list(gradients.values()), *(splats[name] for name in gradients))  # type: ignore[no-untyped-call]  # torch's
+            splats.clear()  # frees the memory of the joined colors for their gradients
+            gradients.clear()
+            end.backward()
 
 
 class _WithGradients(torch.autograd.Function):
@@ -75,7 +79,8 @@ class _WithGradients(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, _: Tensor) -> tuple[Tensor | None, ...]:
-        return None, *ctx.gradients
+        gradients, ctx.gradients = ctx.gradients, None  # the colors' can be freed as soon as they are split
+        return None, *gradients
 
 
 def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:

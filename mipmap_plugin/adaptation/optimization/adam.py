@@ -11,6 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+# Rows that are moved together where they are copied for it: a few hundred kB, and a multiple of what a processor computes at once.
+ROWS = 2048
+
 
 class Adam:
     """Adam over groups of tensors: dictionaries with `params`, `lr` and any other entries. Tensors without a gradient do not move."""
@@ -26,13 +29,35 @@ class Adam:
             moving = [tensor for tensor in group["params"] if tensor.grad is not None]
             if not moving:
                 continue
-            states = [self._state_of(tensor) for tensor in moving]
-            first, second, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
-            torch._foreach_add_(steps, 1)
+            torch._foreach_add_([self._state_of(tensor)["step"] for tensor in moving], 1)
+            whole = [tensor for tensor in moving if tensor.is_contiguous()]
+            self._move(whole, [self._values_of(tensor) for tensor in whole], group["lr"])
+            for tensor in (tensor for tensor in moving if not tensor.is_contiguous()):
+                self._move_parts(tensor, group["lr"])
+
+    def _values_of(self, tensor: Tensor) -> tuple[Tensor, ...]:
+        """The gradient of a tensor, the number of its steps and its moments."""
+        state = self._state_of(tensor)
+        assert tensor.grad is not None  # since it is to move
+        return tensor.grad, state["step"], state["exp_avg"], state["exp_avg_sq"]
+
+    def _move(self, tensors: list[Tensor], values: list[tuple[Tensor, ...]], rate: float) -> None:
+        """Move contiguous tensors by the `values` of each (`_values_of`)."""
+        if tensors:
+            grads, steps, first, second = (list(column) for column in zip(*values, strict=True))
             torch._fused_adam_(
-                moving, [tensor.grad for tensor in moving], first, second, [], steps, lr=group["lr"], beta1=self.betas[0], beta2=self.betas[1],
-                weight_decay=0.0, eps=self.eps, amsgrad=False, maximize=False,
+                tensors, grads, first, second, [], steps, lr=rate, beta1=self.betas[0], beta2=self.betas[1], weight_decay=0.0, eps=self.eps,
+                amsgrad=False, maximize=False,
             )  # fmt: skip
+
+    def _move_parts(self, tensor: Tensor, rate: float) -> None:
+        """Move a tensor whose rows do not follow each other in memory, which torch's kernel requires: some rows at a time, as copies."""
+        gradient, steps, *moments = self._values_of(tensor)
+        size = ROWS if tensor.device.type == "cpu" else len(tensor)
+        for rows, grad, first, second in zip(*(each.split(size) for each in (tensor, gradient, *moments)), strict=True):
+            moved = rows.contiguous()
+            self._move([moved], [(grad.contiguous(), steps, first, second)], rate)
+            rows.copy_(moved)
 
     def zero_grad(self) -> None:
         """Set all gradients to None."""

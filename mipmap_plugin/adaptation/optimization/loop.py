@@ -102,9 +102,10 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if splats.shares else 1
     for gaussians, camera, square_error in side_by_side(render_and_compare, draws, threads):
         run.square_error = run.square_error + square_error.double() / len(views)
-        splats.accumulate(gaussians)
         if run.gradients is not None:
             run.gradients.add(*splats.means_gradient(gaussians), camera)
+        splats.accumulate(gaussians)
+    del gaussians  # shares the colors' memory, which is needed for their gradients
     splats.backward()
     run.optimizer.step()
     run.optimizer.zero_grad()

@@ -8,10 +8,12 @@ from collections.abc import Callable, Collection, Mapping
 import torch
 from torch import Tensor
 
+from mipmap_plugin import pool
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import CARRIED, SplatModel
+from mipmap_plugin.splatting.bands import neighbors
 
 # INRIA's value: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
 ADAM_EPS = 1e-15
@@ -50,7 +52,7 @@ def restore_parameters(model: SplatModel, optimizer: Adam, before: Mapping[str, 
 
     If only the moments were reset and not the step count, the first step would be three times too long.
     """
-    change_rows(model, optimizer, lambda name, _: before[name], torch.zeros_like)
+    change_rows(model, optimizer, lambda name, _: before[name].clone(), torch.zeros_like)
     for tensor in model.parameters().values():
         optimizer.state.pop(tensor, None)
 
@@ -58,17 +60,20 @@ def restore_parameters(model: SplatModel, optimizer: Adam, before: Mapping[str, 
 def change_rows(
     model: SplatModel, optimizer: Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
 ) -> None:
-    """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in the model and in the optimizer."""
-    fresh, moves = {}, {}
-    names = model.parameters().keys()
-    for group in (group for group in optimizer.param_groups if group["name"] in names):
-        old = group["params"][0]
-        new = parameter(group["name"], old.detach()).clone().requires_grad_()
-        moves[group["name"]] = old.requires_grad
+    """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in the model and in the optimizer.
+
+    Both functions return new tensors.
+    """
+    pool.release()  # what a step needs, which is of no use for this
+    groups = {group["name"]: group for group in optimizer.param_groups if group["name"] in model.parameters()}
+    before = {name: group["params"][0] for name, group in groups.items()}
+    fresh = neighbors({name: parameter(name, old.detach()) for name, old in before.items()})
+    for name, old in before.items():
         state = optimizer.state.pop(old, {})
-        optimizer.state[new] = {k: moment(v) if torch.is_tensor(v) and v.shape == old.shape else v for k, v in state.items()}
-        group["params"] = [new]
-        fresh[group["name"]] = new
+        for key, value in state.items():
+            state[key] = moment(value) if torch.is_tensor(value) and value.shape == old.shape else value
+        optimizer.state[fresh[name]] = state
+        groups[name]["params"] = [fresh[name]]
     model.replace_parameters(fresh)
     for name, tensor in fresh.items():
-        tensor.requires_grad_(moves[name])
+        tensor.requires_grad_(before[name].requires_grad)

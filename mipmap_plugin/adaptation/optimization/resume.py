@@ -22,6 +22,7 @@ from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.splatting.bands import neighbors
 
 # Seconds between two saved states: the most that a killed process loses. A state is about three times as large as the model, four times
 # with growth on trial.
@@ -131,7 +132,8 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     device = student.parameters()["means"].device
     # A GPU sums blend weights in any order, so that merging again may leave another number of splats.
     if state["rows_changed"] or state["parameters"]["means"].shape != student.parameters()["means"].shape:
-        student.replace_parameters({name: tensor.to(device).requires_grad_() for name, tensor in state["parameters"].items()})
+        rows = neighbors({name: tensor.to(device) for name, tensor in state["parameters"].items()})
+        student.replace_parameters({name: tensor.requires_grad_() for name, tensor in rows.items()})
     else:  # the rows are those that the run began with, so that the model's other data by row still match them
         with torch.no_grad():
             for name, tensor in student.parameters().items():

@@ -25,6 +25,16 @@ class Snapshot:
         rows, shared = ({name: tensor.detach().clone() for name, tensor in group.items()} for group in groups)
         return cls(rows, shared, rows_changed)
 
+    @torch.no_grad()
+    def renewed(self, model: SplatModel, rows_changed: bool = False) -> Snapshot:
+        """A snapshot of the model as it is now, in this one's memory where it has as many rows; this one is not to be used any more."""
+        if len(model.parameters()["means"]) != len(self.rows["means"]):
+            return Snapshot.of(model, rows_changed)
+        for held, group in ((self.rows, model.parameters()), (self.shared, model.shared_parameters())):
+            for name, tensor in group.items():
+                held[name].copy_(tensor)
+        return Snapshot(self.rows, self.shared, rows_changed)
+
     def over(self, initial: SplatModel) -> SplatModel:
         """A model with the snapshot's parameters; `initial`: the model at the start of the run.
 

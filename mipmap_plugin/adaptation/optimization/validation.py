@@ -162,4 +162,4 @@ class Steering:
     def update_best(self, psnr: float, step: int, student: SplatModel, rows_changed: bool = False) -> None:
         """Keep the student's state as the best one, unless it is worse."""
         if psnr >= self.best_db - TIE_DB:
-            self.best_db, self.best_step, self.best = max(psnr, self.best_db), step, Snapshot.of(student, rows_changed)
+            self.best_db, self.best_step, self.best = max(psnr, self.best_db), step, self.best.renewed(student, rows_changed)

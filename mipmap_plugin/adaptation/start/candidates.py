@@ -74,11 +74,7 @@ class StartSearch:
 
     @torch.no_grad()
     def best(self) -> tuple[SplatModel, str]:
-        """Return the model to begin with, which shares no tensors, and its name."""
-        model, name = self._best()
-        return (model.copy() if getattr(model, "shares", False) else model), name
-
-    def _best(self) -> tuple[SplatModel, str]:
+        """Return the model to begin with, which may share tensors with the base, and its name."""
         problem, config, base = self._problem, self._problem.config, self._problem.base()
         too_many = config.most_splats is not None and len(base.parameters()["means"]) > config.most_splats
         if not (config.closed_form or config.merge_to < 1 or too_many):
