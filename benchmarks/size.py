@@ -48,6 +48,7 @@ Made by `python benchmarks/size.py DATA`, in pieces: seconds, CPU seconds and th
 themselves take, as a multiple of the PLY's size) of whole commands and of their phases, `adapt` at x1/4, on flowers with its splats split into so
 many, 173 cameras of 1256 x 828 px. *Silence*: the longest time without a sign on the terminal, and in brackets until the first. Five others used the
 two cores, so that seconds and silences are several times those of a quiet machine: compare CPU seconds. *before*: 6867b30.
+*f209cd6*, *89d0881* and *70a6b79*: later ones, from before `adapt` took less memory.
 `evaluate`: the base and everything that needs no adapting, on {photographs} photographs. {machine}
 """
 HEAD = "| splats | command | version | phase | seconds | CPU s | peak / file | silence |\n|" + "---|" * 8

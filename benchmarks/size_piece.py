@@ -38,12 +38,14 @@ class Meter:
         """Count what happens inside under `name`; of phases inside one another the outermost counts."""
         self._reset_peak()
         wall, cpu = time.perf_counter(), time.process_time()
-        yield
-        entry = self.phases.setdefault(name, {"seconds": 0.0, "cpu": 0.0, "peak": 0})
-        entry["seconds"] += time.perf_counter() - wall
-        entry["cpu"] += time.process_time() - cpu
-        entry["peak"] = max(entry["peak"], memory("VmHWM") - self.before)
-        self._reset_peak()
+        try:
+            yield
+        finally:  # a run that Ctrl-C ends, to go on later, tells what it took
+            entry = self.phases.setdefault(name, {"seconds": 0.0, "cpu": 0.0, "peak": 0})
+            entry["seconds"] += time.perf_counter() - wall
+            entry["cpu"] += time.process_time() - cpu
+            entry["peak"] = max(entry["peak"], memory("VmHWM") - self.before)
+            self._reset_peak()
 
     def counted(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """The function, whose calls are a phase."""
