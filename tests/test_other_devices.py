@@ -25,6 +25,8 @@ from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.splatting.filters import USUAL_EPS2D
 
+VIEWS = tiny.cameras(2, width=16, height=12)
+
 # Older torch takes more operations apart there than the products of networks.
 EXACT = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 10)
 
@@ -59,11 +61,11 @@ FAMILIES = {
 def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
     model = load_model(FAMILIES[family](tmp_path / "base"))
     settings = dict(steps=2, extra_views=2, prune_every=1, check_every=1)
-    here = wrap_model(model, cameras=tiny.cameras(), backend="reference").adapt(scale, **settings)
+    here = wrap_model(model, cameras=VIEWS, backend="reference").adapt(scale, **settings)
     with pretended.pretending():
-        there = wrap_model(model.to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference").adapt(scale, **settings)
+        there = wrap_model(model.to(pretended.DEVICE), cameras=VIEWS, backend="reference").adapt(scale, **settings)
         there.save(tmp_path / "there")
-        write_image(tmp_path / "there.png", there.render(tiny.cameras()[0]).image)
+        write_image(tmp_path / "there.png", there.render(VIEWS[0]).image)
         parameters = {name: tensor.cpu() for name, tensor in there.model.parameters().items()}
     assert [point.psnr_db for point in there.report.curve] == pytest.approx([point.psnr_db for point in here.report.curve], abs=1e-3)
     if family == "3dgs" and EXACT:  # networks' products of matrices are taken apart in another way there
@@ -77,7 +79,7 @@ def test_harmful_growth_is_undone_there(enough, monkeypatch):
     monkeypatch.setattr(run, "decibel", lambda _: next(agreements))
     grown = dict(recipe="thorough", upsampler="mine", steps=5, prune_every=2, densify_gradient=1e-12, min_opacity=0.0, returns="last")
     with pretended.pretending():
-        model = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference")
+        model = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
         there = model.adapt(2, **grown)
     assert (there.report.gaussians_after > len(tiny.model())) == enough
 
@@ -106,14 +108,14 @@ def test_the_reference_draws_there(screen_filter):
 def test_cloning_and_splitting_there():
     settings = dict(recipe="paper", steps=4, prune_every=2, densify_gradient=1e-9)
     with pretended.pretending():
-        adapted = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference").adapt(1 / 2, **settings)
+        adapted = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference").adapt(1 / 2, **settings)
     assert adapted.report.gaussians_after > adapted.report.gaussians_before
 
 
 def test_photographs_and_evaluation_there(tmp_path):
-    scene = load_scene(tiny.scene(tmp_path / "scene", train=tiny.cameras(3)))
+    scene = load_scene(tiny.scene(tmp_path / "scene", test=VIEWS[:1], train=VIEWS))
     with pretended.pretending():
-        wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference")
+        wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
         wrapped.adapt(2, steps=2, images=scene)
         rows = evaluate(wrapped, scene, (1 / 2,), ("default",), "P3", steps=2, extra_views=2)
     assert all(row.psnr_db > 10 for row in rows)
@@ -137,7 +139,7 @@ def test_no_step_waits_for_the_device(scale):
     counts = []
     for steps in (3, 6):
         with pretended.pretending() as device:
-            wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(), backend="reference")
+            wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
             wrapped.adapt(scale, steps=steps, extra_views=2, check_every=100, prune_every=100)
         counts.append({line: count for line, count in device.waits.items() if not line.startswith(("backends/", "splatting/"))})
     assert counts[0] == counts[1]

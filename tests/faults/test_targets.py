@@ -53,7 +53,7 @@ def test_a_base_is_never_overwritten_by_what_is_adapted_from_it(tmp_path, refuse
     before, name = base.read_bytes(), names_of(base, tmp_path)[which]
     assert "is the base checkpoint itself" in refused("adapt", base, "--scale", "1/2", "--output", name, "--overwrite", *INSTANT)
     with pytest.raises(OutputExists, match="is the base checkpoint itself"):
-        wrap_model(base, backend="reference").adapt(1 / 2, recipe="instant").save(name, overwrite=True)
+        adapted(base, 1 / 2).save(name, overwrite=True)
     with pytest.raises(OutputExists, match="is the base checkpoint itself"):
         load_model(base).save(name, provenance={}, overwrite=True)
     assert base.read_bytes() == before
