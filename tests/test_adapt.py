@@ -118,7 +118,7 @@ def test_densifying_adds_splats_and_pruning_takes_them_away():
 
 
 def test_the_file_is_classic_whatever_the_base_was_trained_with():
-    adapted = wrapped(screen_filter="antialiased").adapt(4)
+    adapted = wrapped(screen_filter="antialiased").adapt(4, recipe="instant")
     assert (adapted.effects.screen_filter, adapted.effects.eps2d) == ("classic", 0.3)
     assert adapted.model.trained.screen_filter == "classic"
     assert "base antialiased 0.3 px²; file classic 0.3 px²" in adapted.report.filters
@@ -443,14 +443,14 @@ def test_any_classic_viewer_shows_the_file_as_the_adapted_model_shows_itself(tmp
 
 
 def test_a_model_folder_becomes_a_model_folder(tmp_path):
-    saved = wrap_model(tiny.folder(tmp_path / "base"), backend="reference").adapt(4).save(tmp_path / "new")
+    saved = wrap_model(tiny.folder(tmp_path / "base"), backend="reference").adapt(4, recipe="instant").save(tmp_path / "new")
     assert saved == tmp_path / "new/point_cloud/iteration_30000/point_cloud.ply"
     assert saved.with_name("point_cloud.ply.adaptation.json").is_file()
     assert len(wrap_model(tmp_path / "new").cameras) == 4
 
 
 def test_an_output_that_exists_is_not_overwritten_unless_asked(tmp_path):
-    adapted = wrapped().adapt(4)
+    adapted = wrapped().adapt(4, recipe="instant")
     (tmp_path / "new.ply").write_text("precious")
     with pytest.raises(OutputExists, match=r"new\.ply exists already; pass --overwrite"):
         adapted.save(tmp_path / "new.ply")

@@ -193,7 +193,8 @@ def test_held_out_views_of_a_capture_come_in_the_order_of_names(tmp_path):
     assert [view.name for view in judged] == ["view_0", "view_4", "view_8"] and len(others) == 6
 
 
-def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_draws():
+def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_draws(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
     base = wrap_model(tiny.model(), cameras=[], backend="reference")
     judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,)))
     adapted = base.adapt(0.25, recipe="instant", cameras=others)

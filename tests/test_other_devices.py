@@ -25,7 +25,9 @@ from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.splatting.filters import USUAL_EPS2D
 
+# Few views and small ones: each operation there is many times as slow.
 VIEWS = tiny.cameras(2, width=16, height=12)
+FEW = dict(extra_views=0, views_per_step=1, validation_views=2)
 
 # Older torch takes more operations apart there than the products of networks.
 EXACT = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 10)
@@ -60,7 +62,7 @@ FAMILIES = {
 @pytest.mark.parametrize(("family", "scale"), [*((family, 1 / 2) for family in FAMILIES), ("3dgs", 2), ("2dgs", 2)])
 def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
     model = load_model(FAMILIES[family](tmp_path / "base"))
-    settings = dict(steps=2, extra_views=2, prune_every=1, check_every=1)
+    settings = dict(FEW, steps=2, prune_every=1, check_every=1)
     here = wrap_model(model, cameras=VIEWS, backend="reference").adapt(scale, **settings)
     with pretended.pretending():
         there = wrap_model(model.to(pretended.DEVICE), cameras=VIEWS, backend="reference").adapt(scale, **settings)
@@ -77,7 +79,7 @@ def test_harmful_growth_is_undone_there(enough, monkeypatch):
     register_upsampler("mine", lambda image, size: resize(image, size, "lanczos"), replace=True)
     agreements = iter([0.0, *[0.0 if enough else -1.0] * 9])
     monkeypatch.setattr(run, "decibel", lambda _: next(agreements))
-    grown = dict(recipe="thorough", upsampler="mine", steps=5, prune_every=2, densify_gradient=1e-12, min_opacity=0.0, returns="last")
+    grown = dict(recipe="thorough", upsampler="mine", steps=5, prune_every=2, densify_gradient=1e-12, min_opacity=0.0, returns="last", **FEW)
     with pretended.pretending():
         model = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
         there = model.adapt(2, **grown)
@@ -106,7 +108,7 @@ def test_the_reference_draws_there(screen_filter):
 
 
 def test_cloning_and_splitting_there():
-    settings = dict(recipe="paper", steps=4, prune_every=2, densify_gradient=1e-9)
+    settings = dict(FEW, recipe="paper", steps=4, prune_every=2, densify_gradient=1e-9)
     with pretended.pretending():
         adapted = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference").adapt(1 / 2, **settings)
     assert adapted.report.gaussians_after > adapted.report.gaussians_before
@@ -116,8 +118,8 @@ def test_photographs_and_evaluation_there(tmp_path):
     scene = load_scene(tiny.scene(tmp_path / "scene", test=VIEWS[:1], train=VIEWS))
     with pretended.pretending():
         wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
-        wrapped.adapt(2, steps=2, images=scene)
-        rows = evaluate(wrapped, scene, (1 / 2,), ("default",), "P3", steps=2, extra_views=2)
+        wrapped.adapt(2, steps=2, images=scene, **FEW)
+        rows = evaluate(wrapped, scene, (1 / 2,), ("default",), "P3", steps=2, **FEW)
     assert all(row.psnr_db > 10 for row in rows)
 
 
@@ -140,7 +142,7 @@ def test_no_step_waits_for_the_device(scale):
     for steps in (3, 6):
         with pretended.pretending() as device:
             wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=VIEWS, backend="reference")
-            wrapped.adapt(scale, steps=steps, extra_views=2, check_every=100, prune_every=100)
+            wrapped.adapt(scale, steps=steps, **FEW, check_every=100, prune_every=100)
         counts.append({line: count for line, count in device.waits.items() if not line.startswith(("backends/", "splatting/"))})
     assert counts[0] == counts[1]
 

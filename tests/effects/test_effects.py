@@ -111,7 +111,7 @@ def test_why_no_upsampler_is_called_for(scale, settings, reason):
 def on(path) -> dict[str, Effect]:
     """The effects of a family that are on, beside what rendering calls for."""
     known = {effect.name for effect in MODEL_EFFECTS}
-    model = wrap_model(path, cameras=tiny.cameras(1))
+    model = wrap_model(path, cameras=tiny.cameras(1), backend="reference")
     return {effect.name: effect for effect in model.render(tiny.cameras(1)[0]).effects if effect.on and effect.name in known}
 
 
@@ -170,7 +170,7 @@ def test_images_and_reports_list_effects():
 
 
 def test_inspect_prints_effects(tmp_path, capsys):
-    assert cli.main(["inspect", str(tiny.folder(tmp_path / "plain")), "--all"]) == 0
+    assert cli.main(["inspect", str(tiny.folder(tmp_path / "plain")), "--all", "--no-viewers"]) == 0
     out = capsys.readouterr().out
     assert all(f"{effect.name}: " in out for effect in explain(Effects(), tiny.gaussians(1)))
     assert "time: off, the scene does not move (saves a pass through a deformation field per image)" in out

@@ -131,7 +131,7 @@ def test_a_run_killed_at_any_point_is_finished_by_the_same_command(tmp_path, mon
     adapting = Adapting(tmp_path, name)
     adapting()
     whole = made(adapting.out)
-    for number in numbers(request, few=17):
+    for number in numbers(request, few=37):
         shutil.rmtree(adapting.out.parent, ignore_errors=True)
         if not kill_points.killed(number, adapting):
             break

@@ -21,7 +21,7 @@ from mipmap_plugin.models import load_model
 
 COLMAP = importlib.util.find_spec("pycolmap") is not None
 NAMES = [*(name for name in SAMPLES if COLMAP or not name.startswith("COLMAP")), "command line"]
-BY_DEFAULT = 12  # inputs of each kind
+BY_DEFAULT = 6  # inputs of each kind
 ALL = 20_000  # inputs
 WORKER = Path(__file__).with_name("worker.py")
 

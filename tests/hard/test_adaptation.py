@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+from itertools import product
 
 import pytest
 import tiny
@@ -51,8 +52,15 @@ def digest(folder) -> str:
     return hashlib.sha256(b"".join(path.name.encode() + path.read_bytes() for path in files)).hexdigest()
 
 
-@pytest.mark.parametrize("situation", SITUATIONS)
-@pytest.mark.parametrize("family", FAMILIES)
+def some(others, families=("3dgs", "scaffold"), common=("everything pruned", "reference")):
+    """Each family with `others`: two with all of them, and the rest, but for what is common, only among the slow tests."""
+    return [
+        pytest.param(family, other, marks=[] if family in families or other in common else [pytest.mark.slow])
+        for family, other in product(FAMILIES, others)
+    ]
+
+
+@pytest.mark.parametrize(("family", "situation"), some(SITUATIONS))
 def test_it_ends_finite_and_leaves_the_base_unchanged(folders, family, situation):
     cameras, scale, settings = SITUATIONS[situation]
     base, files = wrapped(folders[family], cameras), digest(folders[family])
@@ -69,8 +77,7 @@ def test_it_ends_finite_and_leaves_the_base_unchanged(folders, family, situation
     assert all(torch.equal(before[name], after[name]) for name in before) and digest(folders[family]) == files
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(("family", "backend"), some(["reference", "cpu"]))
 def test_the_same_seed_gives_the_same_numbers(folders, family, backend):
     if backend == "cpu" and importlib.util.find_spec("numba") is None:
         pytest.skip("numba, the extra `cpu`, is not installed")

@@ -67,7 +67,7 @@ cases = given(splats=st.lists(rows(), min_size=1, max_size=3), screen_filter=st.
 known = settings(derandomize=True, database=None, deadline=None)
 
 
-@settings(known, max_examples=300)
+@settings(known, max_examples=100)
 @cases
 def test_any_finite_checkpoint_gives_a_finite_image_and_gradients_or_a_sentence(tmp_path_factory, splats, screen_filter, camera):
     check(tmp_path_factory.getbasetemp(), splats, screen_filter, camera)

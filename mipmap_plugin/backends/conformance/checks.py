@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -86,7 +86,7 @@ def draw(backend: Backend, case: HardCase, *, differentiate: bool = True) -> Ans
     return Answer(_plain(image), _plain(alpha), gradients)
 
 
-@lru_cache(maxsize=256)
+@cache
 def expected_answer(build: Builder, dtype: torch.dtype) -> Answer:
     """The answer of the float64 reference to a case whose numbers were rounded to `dtype`.
 
