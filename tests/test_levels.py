@@ -25,7 +25,7 @@ from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.ladder import make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, WIDE, Band, LadderRequest
-from mipmap_plugin.levels.switching import crossing, zooms_between
+from mipmap_plugin.levels.switching import most_even, switching_zoom, zooms_between
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, state_path
 
@@ -173,14 +173,21 @@ def test_a_group_of_viewers_has_no_ladder():
 
 
 def test_switches_lie_where_both_levels_are_equally_good():
-    zooms = [0.25, 0.354, 0.5]
-    assert crossing(zooms, [30, 33, 36], [36, 33, 30]) == pytest.approx(0.354)
-    assert crossing(zooms, [30, 31, 36], [36, 33, 30]) == pytest.approx(0.354 * (0.5 / 0.354) ** 0.25)
+    def falls_and_rises(zoom):
+        return 30 + 10 * math.log2(zoom / 0.25), 36 - 10 * math.log2(zoom / 0.25)
+
+    assert switching_zoom(0.25, 0.5, falls_and_rises) == pytest.approx(0.25 * 2**0.3, rel=0.02)
 
 
 def test_of_two_crossings_the_better_is_taken_and_without_one_the_closest_zoom():
-    assert crossing([1, 2, 3, 4], [20, 24, 29, 31], [21, 23, 30, 30]) > 3
-    assert crossing([1, 2, 3], [10, 12, 12], [20, 20, 15]) == 3
+    assert most_even([(20, 20.2), (24, 21), (29, 29.4), (31, 30)]) == 2
+    assert most_even([(10, 20), (12, 20), (12, 15)]) == 2
+
+
+def test_a_switch_lies_on_the_better_side_of_a_step():
+    """Images of 15 and of 16 pixels, say."""
+    zoom = switching_zoom(0.5, 1.0, lambda zoom: (32.5, 32.9) if zoom < 0.7 else (34.3, 31.0))
+    assert 0.5 <= zoom < 0.7
 
 
 def test_zooms_include_both_ends():

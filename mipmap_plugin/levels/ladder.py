@@ -18,7 +18,7 @@ from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, ma
 from mipmap_plugin.levels.manifest import write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
-from mipmap_plugin.levels.switching import crossing, zooms_between
+from mipmap_plugin.levels.switching import switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.progress import announced
 from mipmap_plugin.wrap import Wrapped
@@ -123,9 +123,11 @@ def _switches(levels: Sequence[Level], yardstick: Yardstick) -> list[Switch]:
     """The best zooms to change between neighboring levels."""
     switches = []
     for finer, coarser in pairwise(levels):
-        zooms = zooms_between(coarser.band.scale, finer.band.scale, CURVE_STEP)
-        dbs = [[yardstick.psnr(each.adapted, zoom) for zoom in zooms] for each in (finer, coarser)]
-        zoom = crossing(zooms, *dbs)
+
+        def measure(zoom: float, pair: tuple[Level, Level] = (finer, coarser)) -> tuple[float, float]:
+            return yardstick.psnr(pair[0].adapted, zoom), yardstick.psnr(pair[1].adapted, zoom)
+
+        zoom = switching_zoom(coarser.band.scale, finer.band.scale, measure)
         switches.append(Switch(zoom, yardstick.psnr(finer.adapted, zoom), yardstick.likeness(finer.adapted, coarser.adapted, zoom)))
     return switches
 

@@ -1,27 +1,29 @@
-"""Where a viewer should change from one level to the next: where both are equally good, so that the worse of the two is as good as possible."""
+"""Where a viewer should change from one level to the next: where both are equally good, and the worse of the two as good as possible."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+# A switch is first sought among zooms that are this factor apart, and then about the best of them. Nothing is interpolated: an image has a
+# whole number of pixels, so that dB change in steps, which at x1/16 of 200 pixels are up to 3 dB high.
+FIRST_STEP, SECOND_STEP = 2**0.25, 2 ** (1 / 32)
+
+# dB: a smaller difference between two levels counts as none.
+EVEN = 0.5
 
 
-def crossing(zooms: Sequence[float], finer_db: Sequence[float], coarser_db: Sequence[float]) -> float:
-    """The zoom at which two levels, measured at rising `zooms`, are equally good.
+def switching_zoom(low: float, high: float, measure: Callable[[float], tuple[float, float]]) -> float:
+    """The zoom between `low` and `high` for a switch. `measure` returns the dB of the finer and of the coarser level at a zoom."""
+    zooms = zooms_between(low, high, FIRST_STEP)
+    best = most_even([measure(zoom) for zoom in zooms])
+    closer = zooms_between(zooms[max(best - 1, 0)], zooms[min(best + 1, len(zooms) - 1)], SECOND_STEP)
+    return closer[most_even([measure(zoom) for zoom in closer])]
 
-    Between two zooms, dB are interpolated along the logarithm of the zoom. Of several crossings the one of the highest dB is
-    returned; if there is none, the zoom at which the levels differ least.
-    """
-    gaps = [fine - coarse for fine, coarse in zip(finer_db, coarser_db, strict=True)]
-    found = []
-    for i in range(len(zooms) - 1):
-        if gaps[i] <= 0 < gaps[i + 1]:
-            part = gaps[i] / (gaps[i] - gaps[i + 1])
-            log_zoom = (1 - part) * math.log(zooms[i]) + part * math.log(zooms[i + 1])
-            found.append(((1 - part) * coarser_db[i] + part * coarser_db[i + 1], math.exp(log_zoom)))
-    if found:
-        return max(found)[1]
-    return min(zip(map(abs, gaps), zooms, strict=True))[1]
+
+def most_even(pairs: Sequence[tuple[float, float]]) -> int:
+    """Which of several pairs of dB differ least; of those that differ by at most `EVEN`, the one whose worse dB are best."""
+    return max(range(len(pairs)), key=lambda index: (-max(abs(pairs[index][0] - pairs[index][1]), EVEN), min(pairs[index])))
 
 
 def zooms_between(low: float, high: float, step: float) -> list[float]:
