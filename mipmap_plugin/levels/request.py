@@ -32,7 +32,7 @@ BASE_REACH = 0.93
 POWER, KEPT = 2 / 3, 0.5
 
 # The part of a recipe's steps for a level that starts from a finer one, which is nearly right: lego in Spark has as many dB as with all of them.
-STEPS_KEPT = 1 / 3
+STEPS_KEPT = 0.3
 
 # dB: merging may cost this much before the first step, most of which steps regain: of 7 dB on lego at x1/2, all. Of 14 dB, on the demo scene,
 # whose splats are few for its pixels, they regain 4, so that more splats are kept there.
