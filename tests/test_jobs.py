@@ -248,6 +248,36 @@ def test_a_model_folder_travels(tmp_path, suffix):
     assert here == there and finished(away) is not None
 
 
+def test_what_comes_back_never_replaces_the_base(tmp_path):
+    """The worker has copies of the base elsewhere, so that it cannot know."""
+    job = job_of(tmp_path)
+    delivery = do_parcel(pack(job), run_job)
+    onto_base = replace(job, target=job.base.checkpoint, overwrite=True)
+    before = job.base.checkpoint.read_bytes()
+    with pytest.raises(OutputExists, match="is the base checkpoint itself"):
+        pack(onto_base)  # before any work
+    with pytest.raises(OutputExists, match="is the base checkpoint itself"):
+        unpack(delivery, onto_base)
+    assert job.base.checkpoint.read_bytes() == before
+
+
+def test_a_model_folder_comes_back_as_a_whole(tmp_path):
+    folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
+    settings = {"steps": 0, "seed": 0, "views": "given"}
+    job = Job(Base(folder, backend="reference"), tmp_path / "away", 0.5, settings=settings, overwrite=True)
+    delivery = do_parcel(pack(job), run_job)
+    old = tmp_path / "away" / "point_cloud" / "iteration_99999" / "point_cloud.ply"
+    old.parent.mkdir(parents=True)
+    old.write_text("of an older run")
+    assert unpack(delivery, job).status == "done" and not old.exists()
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "letter.txt").write_text("mine")
+    delivery = do_parcel(pack(replace(job, target=tmp_path / "new" / "own")), run_job)
+    with pytest.raises(OutputExists, match="other things in it"):
+        unpack(delivery, replace(job, target=tmp_path / "own"))
+    assert (tmp_path / "own" / "letter.txt").exists()
+
+
 def test_a_damaged_report_is_not_finished(tmp_path):
     job = job_of(tmp_path)
     run_job(job)
