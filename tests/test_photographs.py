@@ -59,7 +59,8 @@ def test_adapting_to_images_says_so_and_leads_elsewhere(scene):
 
 def test_a_run_is_not_resumed_with_other_images(scene, tmp_path, monkeypatch):
     model, state = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference"), tmp_path / "state"
-    others = load_scene(tiny.scene(tmp_path / "others", train=list(scene.cameras), seed=6))
+    train = tiny.cameras(3, width=2 * tiny.WIDTH, height=2 * tiny.HEIGHT)
+    others = load_scene(tiny.scene(tmp_path / "others", train=train, seed=6))
     with monkeypatch.context() as patched:
         patched.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, task, config, stop, observe: stop(run))
         with pytest.raises(Interrupted):
