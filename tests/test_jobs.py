@@ -72,6 +72,20 @@ def test_a_broken_scene_does_not_stop_the_others(run, scenes):
     assert {path.name for path in scenes.iterdir()} >= {"chair_x0.5", "chair_x4", "lego_x0.5", "lego_x4"}
 
 
+def test_no_job_replaces_the_base_of_another(run, tmp_path):
+    for seed, name in enumerate(("a.ply", "a_x0.5.ply")):
+        tiny.ply(tmp_path / name, seed=seed)
+    before = (tmp_path / "a_x0.5.ply").read_bytes()
+    code, _, err = run("adapt", tmp_path / "a.ply", tmp_path / "a_x0.5.ply", "--scale", "1/2", "--overwrite", *NO_STEP)
+    assert code == 2 and "a_x0.5.ply holds a checkpoint that is to be adapted too" in err
+    assert (tmp_path / "a_x0.5.ply").read_bytes() == before
+
+
+def test_two_scales_of_one_name_are_refused(run, scenes):
+    code, _, err = run("adapt", scenes / "lego", "--scale", "1/3", "--scale", "0.3333333", *NO_STEP)
+    assert code == 2 and "would both be written to" in err and not (scenes / "lego_x0.333333").exists()
+
+
 def test_json_says_what_failed_and_why(run, scenes):
     code, out, _ = run("adapt", scenes / "nowhere", scenes / "lego", "--scale", "4", "--json", *NO_STEP)
     wrong, right = json.loads(out)

@@ -75,4 +75,5 @@ def _facts(base: Wrapped, request: LadderRequest) -> dict[str, Any]:
     poses = [[view.width, view.height, view.fx, view.fy, view.cx, view.cy, *view.viewmat.flatten().tolist()] for view in base.cameras]
     digest = hashlib.sha256(json.dumps([poses, base.background]).encode()).hexdigest()
     parameters = base.model.digest or [float(tensor.double().sum()) for tensor in base.model.parameters().values()]
-    return {"base": parameters, "cameras": digest, "trained": str(base.trained), "request": request.facts(), "versions": versions()}
+    made_with = {"backend": base.backend(viewer=request.viewer)[0].name, "versions": versions()}
+    return {"base": parameters, "cameras": digest, "trained": str(base.trained), "request": request.facts(), **made_with}
