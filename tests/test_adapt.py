@@ -254,6 +254,7 @@ def test_a_state_is_refused_with_anything_else_than_its_own_run(tmp_path, ctrl_c
         (wrapped(), 1 / 4, {**BRIEF, "seed": 1}),
         (wrapped(), 1 / 2, BRIEF),
         (wrapped(cameras=tiny.cameras(3)), 1 / 4, BRIEF),
+        (wrapped(cameras=[replace(camera, cx=camera.cx + 1) for camera in tiny.cameras()]), 1 / 4, BRIEF),
         (wrapped(background=WHITE), 1 / 4, BRIEF),
         (wrapped(screen_filter="antialiased"), 1 / 4, BRIEF),
         (wrapped(41), 1 / 4, BRIEF),

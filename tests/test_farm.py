@@ -5,6 +5,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -83,6 +84,19 @@ def test_files_that_are_sent_come_back_adapted(tmp_path):
     assert len({job.target.read_bytes() for job in jobs}) == 1
     assert jobs[0].target.read_bytes() == run(replace(jobs[0], target=tmp_path / "here.ply")).file.read_bytes()
     assert [outcome.status for outcome in on_dask(jobs[:1], "local:1", threads=1, send_files=True)] == ["finished before"]
+
+
+def test_a_checkpoint_that_cannot_be_sent_fails_alone(tmp_path):
+    from mipmap_plugin.jobs import farm
+
+    good, existing = tiny.folder(tmp_path / "base", tiny.cameras(3)), tmp_path / "existing.ply"
+    existing.write_text("here")
+    bases = [tmp_path / "nowhere", good, good]
+    jobs = [Job(Base(base, backend="reference"), target, 0.5) for base, target in zip(bases, [tmp_path / "a", tmp_path / "b", existing], strict=True)]
+    outcomes, sent = farm._sent(jobs, SimpleNamespace(scatter=lambda parcel, hash: parcel))
+    assert [job for job, _ in sent] == [jobs[1]]
+    assert [outcome.status for outcome in outcomes] == ["failed"] * 2
+    assert "nowhere does not exist" in outcomes[0].reason and "exists already" in outcomes[1].reason
 
 
 @pytest.mark.parametrize("place", ["tcp://127.0.0.1:1", "local:0", "nonsense"])

@@ -72,6 +72,20 @@ def test_a_broken_scene_does_not_stop_the_others(run, scenes):
     assert {path.name for path in scenes.iterdir()} >= {"chair_x0.5", "chair_x4", "lego_x0.5", "lego_x4"}
 
 
+def test_no_job_replaces_the_base_of_another(run, tmp_path):
+    for seed, name in enumerate(("a.ply", "a_x0.5.ply")):
+        tiny.ply(tmp_path / name, seed=seed)
+    before = (tmp_path / "a_x0.5.ply").read_bytes()
+    code, _, err = run("adapt", tmp_path / "a.ply", tmp_path / "a_x0.5.ply", "--scale", "1/2", "--overwrite", *NO_STEP)
+    assert code == 2 and "a_x0.5.ply holds a checkpoint that is to be adapted too" in err
+    assert (tmp_path / "a_x0.5.ply").read_bytes() == before
+
+
+def test_two_scales_of_one_name_are_refused(run, scenes):
+    code, _, err = run("adapt", scenes / "lego", "--scale", "1/3", "--scale", "0.3333333", *NO_STEP)
+    assert code == 2 and "would both be written to" in err and not (scenes / "lego_x0.333333").exists()
+
+
 def test_json_says_what_failed_and_why(run, scenes):
     code, out, _ = run("adapt", scenes / "nowhere", scenes / "lego", "--scale", "4", "--json", *NO_STEP)
     wrong, right = json.loads(out)
@@ -246,6 +260,36 @@ def test_a_model_folder_travels(tmp_path, suffix):
     assert unpack(do_parcel(pack(away), run_job), away).status == "done"
     here, there = (path.read_bytes() if suffix else next(path.rglob("*.ply")).read_bytes() for path in (job.target, away.target))
     assert here == there and finished(away) is not None
+
+
+def test_what_comes_back_never_replaces_the_base(tmp_path):
+    """The worker has copies of the base elsewhere, so that it cannot know."""
+    job = job_of(tmp_path)
+    delivery = do_parcel(pack(job), run_job)
+    onto_base = replace(job, target=job.base.checkpoint, overwrite=True)
+    before = job.base.checkpoint.read_bytes()
+    with pytest.raises(OutputExists, match="is the base checkpoint itself"):
+        pack(onto_base)  # before any work
+    with pytest.raises(OutputExists, match="is the base checkpoint itself"):
+        unpack(delivery, onto_base)
+    assert job.base.checkpoint.read_bytes() == before
+
+
+def test_a_model_folder_comes_back_as_a_whole(tmp_path):
+    folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
+    settings = {"steps": 0, "seed": 0, "views": "given"}
+    job = Job(Base(folder, backend="reference"), tmp_path / "away", 0.5, settings=settings, overwrite=True)
+    delivery = do_parcel(pack(job), run_job)
+    old = tmp_path / "away" / "point_cloud" / "iteration_99999" / "point_cloud.ply"
+    old.parent.mkdir(parents=True)
+    old.write_text("of an older run")
+    assert unpack(delivery, job).status == "done" and not old.exists()
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "letter.txt").write_text("mine")
+    delivery = do_parcel(pack(replace(job, target=tmp_path / "new" / "own")), run_job)
+    with pytest.raises(OutputExists, match="other things in it"):
+        unpack(delivery, replace(job, target=tmp_path / "own"))
+    assert (tmp_path / "own" / "letter.txt").exists()
 
 
 def test_a_damaged_report_is_not_finished(tmp_path):

@@ -20,7 +20,8 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.commands.ladders import print_summary
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import OutputExists, SettingsError
+from mipmap_plugin.errors import OutputExists, SceneError, SettingsError
+from mipmap_plugin.evaluation.tradeoff.points import on_backend
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.ladder import make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, write_ladder
@@ -268,6 +269,11 @@ def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
         make_levels(base, request(), resume=tmp_path / "state")
     with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
         make_levels(wrapped(), request(coarsest=1 / 8), resume=tmp_path / "state")
+    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
+        make_levels(on_backend(wrapped(), "cpu"), request(), resume=tmp_path / "state")
+    (tmp_path / "state" / "request.json").write_text("")
+    with pytest.raises(SceneError, match=r"request\.json: is not JSON"):
+        make_levels(wrapped(), request(), resume=tmp_path / "state")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "file").write_text("mine")
     with pytest.raises(SettingsError, match="it has other things in it"):

@@ -16,7 +16,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import wrap_model
+from mipmap_plugin.wrap import Interrupted, wrap_model
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -55,6 +55,19 @@ def test_adapting_to_images_says_so_and_leads_elsewhere(scene):
     adapted, alone = model.adapt(2, images=scene, **settings), model.adapt(2, **settings)
     assert adapted.report.views == "3 train views and 1 around them, 3 of them real images"
     assert not torch.equal(adapted.model.parameters()["sh0"], alone.model.parameters()["sh0"])
+
+
+def test_a_run_is_not_resumed_with_other_images(scene, tmp_path, monkeypatch):
+    model, state = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference"), tmp_path / "state"
+    train = tiny.cameras(3, width=2 * tiny.WIDTH, height=2 * tiny.HEIGHT)
+    others = load_scene(tiny.scene(tmp_path / "others", train=train, seed=6))
+    with monkeypatch.context() as patched:
+        patched.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, task, config, stop, observe: stop(run))
+        with pytest.raises(Interrupted):
+            model.adapt(2, images=scene, resume=state, steps=2)
+    with pytest.raises(SettingsError, match="belongs to another base, settings or views"):
+        model.adapt(2, images=others, resume=state, steps=2)
+    model.adapt(2, images=scene, resume=state, steps=2)
 
 
 def test_images_that_cannot_take_part_are_refused(scene):

@@ -78,6 +78,20 @@ def test_tradeoff_goes_on_where_it_was_killed(folder, capsys):
     assert len(points) >= 3 and all(timed[point["name"], point["step"]] == point["ms_per_frame"] for point in points)  # the same measurement
 
 
+@pytest.mark.parametrize("command", [evaluate, tradeoff])
+def test_a_folder_with_other_things_is_not_deleted(folder, capsys, command):
+    kept = folder / "rows.json.resume" if command is evaluate else folder / "rows.json" / "tradeoff.resume"
+    kept.mkdir(parents=True)
+    (kept / "letter.txt").write_text("mine")
+    assert main(command(folder, "rows.json")) == 2
+    assert "holds something else" in capsys.readouterr().err and (kept / "letter.txt").exists()
+
+
+def test_rows_and_page_are_two_files(folder, capsys):
+    assert main(evaluate(folder, "rows.html")) == 2
+    assert "give the rows another name" in capsys.readouterr().err and not (folder / "rows.html").exists()
+
+
 def test_a_finished_command_is_not_replaced(folder):
     assert main(tradeoff(folder, "new")) == 0
     (folder / "new" / "tradeoff.resume").mkdir()

@@ -12,17 +12,19 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
+from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import CheckpointError, JobsFailed, OutputExists, SettingsError
+from mipmap_plugin.errors import CheckpointError, JobsFailed, OutputExists, SceneError, SettingsError
 from mipmap_plugin.formats.ply import read_header, read_ply, write_ply
 from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles import run, slabs, tile
 from mipmap_plugin.tiles.crops import crops
 from mipmap_plugin.tiles.cut import cut
@@ -283,12 +285,46 @@ def test_anchors_cannot_be_cut(tmp_path, job):
 def test_more_tiles_than_splats(job):
     with pytest.raises(CheckpointError, match="has 80 splats, which cannot be cut into 90 tiles"):
         adapt_in_tiles(job, 90)
+    assert not work_folder(job.target).exists()  # so that fewer may be tried
 
 
 def test_tiles_of_another_request_are_not_touched(job):
     work_folder(job.target).mkdir()
     (work_folder(job.target) / "plan.json").write_text("{}")
     with pytest.raises(SettingsError, match="holds tiles of another base, settings or number of tiles"):
+        adapt_in_tiles(job, 2)
+
+
+def failing(*_):
+    raise OSError("no space left")
+
+
+def test_tiles_are_not_gone_on_with_for_other_cameras(job, monkeypatch):
+    """Whose path is the same."""
+    with monkeypatch.context() as patched, pytest.raises(JobsFailed):
+        patched.setattr(tile, "adapt", failing)
+        adapt_in_tiles(job, 2)
+    (job.base.checkpoint / "cameras.json").unlink()
+    write_cameras(job.base.checkpoint / "cameras.json", tiny.cameras(3, seed=5, width=20, height=16))
+    with pytest.raises(SettingsError, match="holds tiles of another base, settings or number of tiles"):
+        adapt_in_tiles(job, 2)
+
+
+def test_saving_the_base_leaves_the_starts_to_the_next_run(job, monkeypatch):
+    """A run that is killed while the base is saved comes to the same result when it goes on."""
+    folder = work_folder(job.target)
+    with monkeypatch.context() as patched, pytest.raises(OSError, match="no space left"):
+        patched.setattr(run, "judged", lambda scene, folder: ({}, AS_IT_IS))
+        patched.setattr(run, "_save", failing)
+        adapt_in_tiles(job, 2)
+    starts = load_vanilla(folder / "start_0.ply").parameters()["opacities"]
+    assert not torch.equal(starts, load_vanilla(folder / "base_0.ply").parameters()["opacities"])
+
+
+def test_a_damaged_plan_is_said_in_a_sentence(job):
+    work_folder(job.target).mkdir()
+    (work_folder(job.target) / "plan.json").write_text("")
+    with pytest.raises(SceneError, match=r"plan\.json: is not JSON"):
         adapt_in_tiles(job, 2)
 
 
@@ -309,11 +345,17 @@ def test_the_command(job, capsys):
     assert "x0.5, 2 tiles:" in out and str(job.target) in out
     assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2", "--skip-existing", "--overwrite"]) == 0
     assert "finished before" in capsys.readouterr().out
+    assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2", "--skip-existing", "--json"]) == 0
+    assert [report["file"] for report in json.loads(capsys.readouterr().out)] == [str(job.target)]
 
 
 @pytest.mark.parametrize(
     ("words", "reason"),
-    [("a.ply b.ply --scale 1/2 --tiles 2", "--tiles cuts one checkpoint"), ("a.ply --scale 1/2 --tiles 2 --report", "without tiles")],
+    [
+        ("a.ply b.ply --scale 1/2 --tiles 2", "--tiles cuts one checkpoint"),
+        ("a.ply --scale 1/2 --tiles 2 --report", "without tiles"),
+        ("a.ply --scale 1/2 --tiles 2 --dask local:2 --send-files", "leave --send-files out"),
+    ],
 )
 def test_commands_that_cannot_be(words, reason, capsys):
     assert main(["adapt", *words.split()]) == 2

@@ -223,7 +223,7 @@ class Session:
         base = self.base.digest or _digest(self.base)
         targets = [asdict(target) for target in self.targets.values()]
         base += "" if self.finer is None else _digest(self.finer.model)
-        facts = [base, self.scale, self.config.model_dump(), self.backend.name, asdict(self.base_effects), targets, poses]
+        facts = [base, self.inputs, self.scale, self.config.model_dump(), self.backend.name, asdict(self.base_effects), targets, poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _psnr_per_viewer(self, model: SplatModel) -> dict[str, float]:

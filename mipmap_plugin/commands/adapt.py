@@ -122,6 +122,8 @@ def _check(
 ) -> None:
     """Raise now what adapting and saving would raise, as far as it can be predicted."""
     further = {name: value for name, value in settings.items() if name != "recipe"}
+    if twice := [target for number, target in enumerate(targets) if target in targets[:number]]:
+        raise SettingsError(f"two scales would both be written to {twice[0]}; give scales that differ more, or adapt to them one by one")
     for (scale, viewer), target in zip(requests, targets, strict=True):
         config = make_config(settings["recipe"], scale, **further)
         wrapped.targets(viewer)

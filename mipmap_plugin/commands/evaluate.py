@@ -154,6 +154,8 @@ def _scene(folder: Path, appearance: str) -> Scene:
 
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
+    if len(set(outputs)) < len(outputs):
+        raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
     for output in outputs:
         refuse_output(output, overwrite, [part for path in checkpoint for part in _parts(path)], is_file=True)
         refuse_unwritable(output)

@@ -125,8 +125,11 @@ def _refuse(jobs: Sequence[Job]) -> None:
     if jobs[0].base.backend != "auto":
         BACKENDS.get(jobs[0].base.backend)
     makers: dict[Path, Job] = {}
+    bases = {folder: job.base.checkpoint for job in jobs for folder in (job.base.checkpoint.resolve() / "x").parents}
     for job in jobs:
         job.config()
+        if job.overwrite and (base := bases.get(job.target.resolve())):
+            raise SettingsError(f"{job.target} holds a checkpoint that is to be adapted too ({base}); choose another --output")
         if job.viewer is not None:
             viewers_for(job.viewer)
         if (other := makers.setdefault(job.target, job)) is not job:

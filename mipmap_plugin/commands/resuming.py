@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.progress import note
+
+# The name of a cell's file, or of the folder in which it is written.
+CELL = re.compile(r"[0-9a-f]{24}\.pt|\.[0-9a-f]{24}\.pt\.\d\.tmp")
 
 
 def resume_path(output: Path) -> Path:
@@ -16,7 +21,12 @@ def resume_path(output: Path) -> Path:
 
 @contextmanager
 def resumable(folder: Path | None, unit: str) -> Iterator[None]:
-    """Say what an earlier command left in `folder`; inside, Ctrl-C says how many cells are finished, and how to go on. `unit`: what a cell is."""
+    """Say what an earlier command left in `folder`; inside, Ctrl-C says how many cells are finished, and how to go on. `unit`: what a cell is.
+
+    Raises SettingsError for a folder with other things in it, because it is deleted at the end.
+    """
+    if folder is not None and folder.exists() and not (folder.is_dir() and all(CELL.fullmatch(path.name) for path in folder.iterdir())):
+        raise SettingsError(f"{folder} is needed for what is finished, but is or holds something else; move it, or choose another output")
     if found := _cells(folder):
         note(f"{folder} has {_counted(found, unit)} of a command that was interrupted; those of the same request are not measured again")
     try:

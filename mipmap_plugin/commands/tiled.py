@@ -16,10 +16,13 @@ from mipmap_plugin.jobs.job import Job, Outcome
 
 def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base, threads: int | None, json: bool) -> None:
     """Adapt one checkpoint to each scale and viewer in tiles. Raises SettingsError before any work, JobsFailed."""
+    from mipmap_plugin.jobs.finished import finished
     from mipmap_plugin.tiles.run import adapt_in_tiles
 
     if many.tiles is None or many.is_list(given) or many.shard is not None:
         raise SettingsError("--tiles cuts one checkpoint; give that one, without --list and --shard")
+    if many.send_files:
+        raise SettingsError("--tiles needs a folder that all workers see, so that files are not sent; leave --send-files out")
     settings = dict(request.settings)
     recipe, several = settings.pop("recipe"), len(request.targets) > 1
 
@@ -30,8 +33,11 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
     for scale, viewer in request.targets:
         target = adapted_path(given[0], request.output, scale, viewer, several=several).absolute()
         job = Job(_absolute(base, given[0]), target, scale, viewer, recipe, settings, request.images, request.overwrite)
-        if many.skip_existing and (before := _finished(job)):
-            say(f"{before}: finished before")
+        if many.skip_existing and (before := finished(job)):
+            file, facts = before
+            reports.append({"file": str(file), **facts})
+            if not json:
+                say(f"{file}: finished before")
             continue
         joined = adapt_in_tiles(job, many.tiles, run, threads)
         report = joined.report
@@ -50,10 +56,3 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
 def _absolute(base: Base, checkpoint: Path) -> Base:
     cameras = base.cameras and base.cameras.absolute()
     return Base(checkpoint.absolute(), cameras, base.background, base.backend, base.screen_filter)
-
-
-def _finished(job: Job) -> Path | None:
-    from mipmap_plugin.jobs.finished import finished
-
-    found = finished(job)
-    return found and found[0]

@@ -15,6 +15,7 @@ import uuid
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 from distributed import Client, Event, Future, LocalCluster, as_completed
 
@@ -49,26 +50,33 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
         send_files = send_files or (bool(jobs) and not all(client.run(os.path.exists, str(jobs[0].base.checkpoint)).values()))
         stop = Event(f"stop-{uuid.uuid4().hex}", client=client)
 
-        def submit(job: Job) -> Future[Outcome | Delivery]:
-            sent = client.scatter(pack(job), hash=False) if send_files else job
+        def submit(sent: Any) -> Future[Outcome | Delivery]:
             return client.submit(_task, sent, share, stop.name, key=f"adapt-{uuid.uuid4().hex}", pure=False, resources=needs)
 
         together = SENT_PER_WORKER * max(1, len(workers)) if send_files else max(1, len(jobs))
         try:
             for first in range(0, len(jobs), together):  # files that are sent wait in the workers' memory, so that not all are sent at once
-                done, todo = _finished_before(jobs[first : first + together]) if send_files else ([], jobs)
+                done, todo = _sent(jobs[first : first + together], client) if send_files else ([], [(job, job) for job in jobs])
                 yield from done
-                futures = {submit(job): job for job in todo}
+                futures = {submit(sent): job for job, sent in todo}
                 for future in with_interrupted(list(futures), as_completed, stop.set):
                     yield _outcome(future, futures[future])
         finally:
             stop.set()
 
 
-def _finished_before(jobs: Sequence[Job]) -> tuple[list[Outcome], list[Job]]:
-    """The outcomes of the jobs that need not be done, which a worker cannot know that does not see this disk; and the other jobs."""
-    found = [(job, finished(job) if job.skip_finished else None) for job in jobs]
-    return [Outcome(job, "finished before", *made) for job, made in found if made], [job for job, made in found if not made]
+def _sent(jobs: Sequence[Job], client: Client) -> tuple[list[Outcome], list[tuple[Job, Any]]]:
+    """The outcomes of the jobs that need not or cannot be done, which a worker cannot know that does not see this disk; the others, sent."""
+    outcomes, sent = [], []
+    for job in jobs:
+        try:
+            if made := finished(job) if job.skip_finished else None:
+                outcomes.append(Outcome(job, "finished before", *made))
+            else:
+                sent.append((job, client.scatter(pack(job), hash=False)))
+        except (MipmapPluginError, OSError) as error:
+            outcomes.append(Outcome(job, "failed", reason=str(error)))
+    return outcomes, sent
 
 
 def _task(sent: Job | Parcel, threads: int | None, stop_name: str) -> Outcome | Delivery:

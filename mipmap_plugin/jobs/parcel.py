@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mipmap_plugin.formats.atomic import named, new_file, refuse_output, together
+from mipmap_plugin.formats.atomic import named, new_file, new_folder, refuse_output, together
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models import detect
-from mipmap_plugin.models.outputs import parts_of
+from mipmap_plugin.models.outputs import parts_of, refuse_parts
 
 # Folders of an unpacked parcel.
 BASE, CAMERAS, IMAGES, OUTPUT = Path("base"), Path("cameras"), Path("images"), Path("output")
@@ -35,9 +35,10 @@ class Delivery:
 
 
 def pack(job: Job) -> Parcel:
-    """Pack the checkpoint of a job, its cameras and its photographs. Raises CheckpointError, OSError."""
+    """Pack the checkpoint of a job, its cameras and its photographs. Raises CheckpointError, OutputExists, OutputError, OSError."""
     base = job.base
     checkpoint = detect(base.checkpoint)
+    refuse_output(job.target, job.overwrite, parts_of(checkpoint.path, checkpoint.folder))  # which the worker cannot know
     place = base.checkpoint if base.checkpoint.is_dir() else base.checkpoint.parent
     parts = [part for part in dict.fromkeys(parts_of(checkpoint.path, checkpoint.folder)) if part.is_relative_to(place)]
     members = {BASE / part.relative_to(place): part for part in parts}
@@ -68,16 +69,27 @@ def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
 def unpack(delivery: Delivery, job: Job) -> Outcome:
     """Write what came back to where the job was to write it, atomically. Raises OutputExists, OutputError."""
     outcome, place = replace(delivery.outcome, job=job), named(job.target).parent
-    if outcome.status != "done":
+    if outcome.status != "done" or outcome.file is None:
         return outcome
-    refuse_output(job.target, job.overwrite)
+    base, within = job.base.checkpoint, outcome.file.parts[1:]  # of a model folder
+    source, model_folder = (None, base) if base.is_dir() else (base, None)
+    refuse_parts(job.target, job.overwrite, source, model_folder, within[0] if within else None)
     with together(job.target), tarfile.open(fileobj=io.BytesIO(delivery.files)) as archive:
-        for member in archive.getmembers():
-            content = archive.extractfile(member)
-            assert content is not None
-            with new_file(place / member.name, job.overwrite) as temporary:
-                temporary.write_bytes(content.read())
-    return replace(outcome, file=outcome.file and place / outcome.file)
+        if within:
+            with new_folder(job.target, job.overwrite) as folder:
+                archive.extractall(folder.parent, filter="data")
+        else:
+            for member in archive.getmembers():
+                _write(archive, member, place, job, parts_of(source, model_folder))
+    return replace(outcome, file=place / outcome.file)
+
+
+def _write(archive: tarfile.TarFile, member: tarfile.TarInfo, place: Path, job: Job, base: list[Path]) -> None:
+    content, path = archive.extractfile(member), place / member.name
+    assert content is not None
+    refuse_output(path, job.overwrite, base, is_file=True)
+    with new_file(path, job.overwrite) as temporary:
+        temporary.write_bytes(content.read())
 
 
 def _scene(path: Path, folder: Path) -> dict[Path, Path]:

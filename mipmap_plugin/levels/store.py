@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.atomic import json_text, write_json
+from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.outputs import REPORT
@@ -36,7 +37,7 @@ class LevelStore:
             if folder.exists() and any(folder.iterdir()):
                 raise SettingsError(f"{folder}: unfinished ladders are kept there, but it has other things in it; choose another output")
             write_json(file, facts, overwrite=True)
-        elif _read(file) != facts:
+        elif read_json(file) != facts:
             raise SettingsError(f"{folder}: holds levels of another base, viewer or settings; repeat the run with those, or delete it")
 
     def level(self, name: str, make: Callable[[Path | None], Adapted]) -> Adapted:
@@ -56,7 +57,7 @@ class LevelStore:
     def _loaded(self, file: Path) -> Adapted:
         """A level as it is in its file. Every level is read, also one just made, so that a ladder is the same whether it was interrupted or not."""
         try:
-            report = Report.model_validate(_read(file.with_name(file.name + REPORT)))
+            report = Report.model_validate(read_json(file.with_name(file.name + REPORT)))
             model = load_model(file).to(self._base.model.parameters()["means"].device)
         except (ValueError, MipmapPluginError) as error:
             raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({error}); delete its folder to start anew") from error
@@ -74,8 +75,5 @@ def _facts(base: Wrapped, request: LadderRequest) -> dict[str, Any]:
     poses = [[view.width, view.height, view.fx, view.fy, view.cx, view.cy, *view.viewmat.flatten().tolist()] for view in base.cameras]
     digest = hashlib.sha256(json.dumps([poses, base.background]).encode()).hexdigest()
     parameters = base.model.digest or [float(tensor.double().sum()) for tensor in base.model.parameters().values()]
-    return {"base": parameters, "cameras": digest, "trained": str(base.trained), "request": request.facts(), "versions": versions()}
-
-
-def _read(file: Path) -> Any:
-    return json.loads(file.read_text(encoding="utf-8"))
+    made_with = {"backend": base.backend(viewer=request.viewer)[0].name, "versions": versions()}
+    return {"base": parameters, "cameras": digest, "trained": str(base.trained), "request": request.facts(), **made_with}

@@ -12,8 +12,9 @@ from typing import Any
 
 from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
-from mipmap_plugin.errors import JobsFailed, SettingsError
+from mipmap_plugin.errors import CheckpointError, JobsFailed, SettingsError
 from mipmap_plugin.formats.atomic import named, new_file, refuse_output, sha256, together, write_json
+from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.jobs.engines import in_this_process
@@ -26,7 +27,7 @@ from mipmap_plugin.tiles.job import CUT, START, TileJob
 from mipmap_plugin.tiles.judge import JOINED, judged
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import TiledScene, find_splats, make_cut, opened
-from mipmap_plugin.tiles.start import start_file, tile_file, write_base
+from mipmap_plugin.tiles.start import base_file, start_file, tile_file, write_base
 from mipmap_plugin.tiles.truth import parts, truth_file
 
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
@@ -67,7 +68,11 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
     _claim(folder, job, tiles)
     if not (folder / CUT).exists():
         with announced("cutting"):
-            make_cut(job.base.checkpoint, tiles, folder / CUT)
+            try:
+                make_cut(job.base.checkpoint, tiles, folder / CUT)
+            except CheckpointError:
+                shutil.rmtree(folder)  # nothing was done yet
+                raise
     scene = opened(job.base, job.scale, job.viewer, job.config(), folder / CUT)
     scene.wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
     seconds = {"cutting": time.perf_counter() - began}
@@ -94,9 +99,10 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
     seconds["total"] = time.perf_counter() - began
     facts = [outcome.report for outcome in outcomes]
     if returned != JOINED:
-        files = [start_file(folder, number) for number in range(tiles)]
+        name_of = base_file if returned == AS_IT_IS else start_file
+        files = [name_of(folder, number) for number in range(tiles)]
     if returned == AS_IT_IS:
-        write_base(scene, folder)
+        write_base(scene, files)
     report = make_report(scene, files, seconds, validation, returned)
     saved = _save(scene, job, files, Joined(job.target, report, facts))
     shutil.rmtree(folder)
@@ -121,16 +127,18 @@ def _refuse(job: Job, tiles: int) -> None:
 
 
 def _claim(folder: Path, job: Job, tiles: int) -> None:
-    """Make the folder for this scene, these settings and this number of tiles. Raises SettingsError if it holds those of others."""
+    """Make the folder for this scene, these settings and this number of tiles.
+
+    Raises SettingsError if it holds those of others, CheckpointError, SceneError.
+    """
     base = job.base
     plan = {
         "base": sha256(find_splats(base.checkpoint)[0].path), "tiles": tiles, "scale": job.scale, "viewer": job.viewer,
-        "settings": job.config().model_dump(mode="json"), "cameras": base.cameras and str(base.cameras), "background": base.background,
-        "screen_filter": base.screen_filter, "backend": base.backend,
+        "settings": job.config().model_dump(mode="json"), "inputs": base.asked(), "backend": base.backend,
     }  # fmt: skip
     file = folder / PLAN
     if file.exists():
-        if json.loads(file.read_text(encoding="utf-8")) != json.loads(json.dumps(plan)):
+        if read_json(file) != json.loads(json.dumps(plan)):
             raise SettingsError(f"{folder} holds tiles of another base, settings or number of tiles; repeat those, or delete it to start anew")
         return
     if folder.exists() and any(folder.iterdir()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -33,6 +34,11 @@ def start_file(folder: Path, number: int) -> Path:
     return folder / f"start_{number}.ply"
 
 
+def base_file(folder: Path, number: int) -> Path:
+    """The file of a tile's splats in the base, where nothing was better than that."""
+    return folder / f"base_{number}.ply"
+
+
 def tile_file(folder: Path, number: int) -> Path:
     """The file of an adapted tile."""
     return folder / f"tile_{number}.ply"
@@ -48,10 +54,10 @@ def open_tiles(scene: TiledScene, folder: Path) -> Splats:
     return Splats.of(scene.kind, [PlyRows(tile_file(folder, number)) for number in range(len(scene.cores))])
 
 
-def write_base(scene: TiledScene, folder: Path) -> None:
-    """Write the base's own splats as the start of each tile."""
-    for number, core in enumerate(scene.cores):
-        scene.for_target(scene.base.parameters(core)).save(start_file(folder, number), provenance={}, overwrite=True)
+def write_base(scene: TiledScene, files: Sequence[Path]) -> None:
+    """Write the base's own splats of each tile to its file."""
+    for file, core in zip(files, scene.cores, strict=True):
+        scene.for_target(scene.base.parameters(core)).save(file, provenance={}, overwrite=True)
 
 
 class StartSearch:
@@ -135,7 +141,7 @@ class StartSearch:
             model.save(start_file(self.folder, number), provenance={}, overwrite=True)
 
     def _take_base(self, weights: Tensor) -> None:
-        write_base(self.scene, self.folder)
+        write_base(self.scene, [start_file(self.folder, number) for number in range(len(self.scene.cores))])
         self._done(AS_IT_IS, weights[torch.cat(self.scene.cores)])
 
     def _done(self, name: str, weights: Tensor) -> None:
