@@ -14,7 +14,7 @@ def test_sizes_are_read(text, size):
     assert read_size(text) == size
 
 
-@pytest.mark.parametrize("text", ["20 parsecs", "", "-3MB", "MB", "0", "1.2.3MB"])
+@pytest.mark.parametrize("text", ["20 parsecs", "", "-3MB", "MB", "0", "1.2.3MB", "9" * 400])
 def test_a_size_that_is_none_is_refused(text):
     with pytest.raises(SettingsError, match="bytes: must be a size such as 20MB"):
         read_size(text)

@@ -5,6 +5,8 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 
+import anchor_checkpoints
+import moving
 import pytest
 import tiny
 import torch
@@ -25,7 +27,7 @@ from mipmap_plugin.evaluation.tradeoff.points import on_backend
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.ladder import make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, write_ladder
-from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, WIDE, Band, LadderRequest
+from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
 from mipmap_plugin.levels.switching import most_even, switching_zoom, zooms_between
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, state_path
@@ -151,15 +153,16 @@ def test_levels_below_a_half_are_denser_unless_a_ratio_is_asked_for():
     assert request(ratio=1.5).next_ratio(0.4, 1.5) == 1.5
 
 
-def test_a_level_that_starts_from_a_finer_one_takes_a_third_of_the_steps():
-    assert LadderRequest("spark").steps(1 / 4) == recipe("default", 1 / 4).steps / 3
+def test_a_level_that_starts_from_a_finer_one_takes_fewer_steps():
+    assert LadderRequest("spark").steps(1 / 4) == math.ceil(STEPS_KEPT * recipe("default", 1 / 4).steps)
     assert LadderRequest("spark", recipe="instant").steps(1 / 4) == 0
 
 
 @pytest.mark.parametrize(
     ("options", "reason"),
-    [({"coarsest": 2.0}, "goes down"), ({"ratio": 1.0}, "ratio: must be"), ({"until_splats": 0}, "until_splats"), ({"band": (0.5, 1)}, "band: set")],
-)
+    [({"coarsest": 2.0}, "goes down"), ({"ratio": 1.0}, "ratio: must be"), ({"until_splats": 0}, "until_splats"), ({"band": (0.5, 1)}, "band: set"),
+     ({"least_db": math.nan}, "least_db: must be a number of dB"), ({"recipe": "nonsense"}, "there is no recipe"), ({"steps": -1}, "setting steps")],
+)  # fmt: skip
 def test_impossible_ladders_are_refused(options, reason):
     with pytest.raises(SettingsError, match=reason):
         request(**options)
@@ -262,9 +265,43 @@ def test_an_interrupted_ladder_goes_on_with_what_is_ready(tmp_path, monkeypatch)
         assert file.read_bytes() == (again / file.name).read_bytes()
 
 
+def interrupt():
+    raise Interrupted("Ctrl-C")
+
+
+def test_a_ladder_that_failed_before_its_first_level_is_in_nobodys_way(tmp_path, monkeypatch):
+    base = wrapped()
+    monkeypatch.setattr(base, "adapt", lambda *_, **__: interrupt())
+    with pytest.raises(Interrupted):
+        make_levels(base, request(), resume=tmp_path / "state")
+    assert make_levels(wrapped(), request(coarsest=0.6), resume=tmp_path / "state").levels
+
+
+def test_a_damaged_unfinished_ladder_is_told(tmp_path):
+    (tmp_path / "request.json").write_text("{")
+    (tmp_path / "level_0.ply").touch()
+    with pytest.raises(SceneError, match=r"request\.json: is not JSON"):
+        make_levels(wrapped(), request(), resume=tmp_path)
+
+
+@pytest.mark.parametrize("write", [anchor_checkpoints.write, moving.write_deformable], ids=["anchors", "moving"])
+@pytest.mark.parametrize("by", ["auto", "zoom", "distance"])
+def test_what_no_viewer_draws_has_no_levels(tmp_path, write, by):
+    write(tmp_path / "base")
+    base = wrap_model(tmp_path / "base", cameras=tiny.cameras(2), backend="reference")
+    with pytest.raises(SettingsError, match="levels are files for viewers, so adapt it to one scale at a time"):
+        make_levels(base, request("supersplat", by=by))
+
+
+def test_a_level_of_a_kept_ladder_has_views(tmp_path):
+    level = make_levels(wrapped(), request(coarsest=1.0), resume=tmp_path / "state").levels[0].adapted
+    assert [view.size for view in level.views()] == [view.size for view in wrapped().views()] and "<img" in level._repr_html_()
+
+
 def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
     base = wrapped()
-    monkeypatch.setattr(base, "adapt", lambda *_, **__: (_ for _ in ()).throw(Interrupted("Ctrl-C")))
+    adapt = base.adapt
+    monkeypatch.setattr(base, "adapt", lambda scale, **options: adapt(scale, **options) if scale == 1 else interrupt())
     with pytest.raises(Interrupted):
         make_levels(base, request(), resume=tmp_path / "state")
     with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):

@@ -322,7 +322,12 @@ def test_auto_is_by_zoom_where_a_bound_asks_for_it():
 
 
 @pytest.mark.parametrize(
-    ("options", "reason"), [({"by": "size"}, "by: must be one of"), ({"by": "distance", "least_db": 30.0}, "leave both out")]
+    ("options", "reason"),
+    [
+        ({"by": "size"}, "by: must be one of"),
+        ({"by": "distance", "least_db": 30.0}, "leave both out"),
+        ({"by": "distance", "merge_to": 0.5}, "merge_to:"),
+    ],
 )
 def test_impossible_requests_are_refused(options, reason):
     with pytest.raises(SettingsError, match=reason):

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import anchor_checkpoints
 import mip_checkpoints
@@ -22,11 +23,12 @@ from mipmap_plugin.commands.view import _free, has_display
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.viewing import adapting
+from mipmap_plugin.viewing import page as live_page
 from mipmap_plugin.viewing.adapting import Adapter, Live, Progress, Wish
 from mipmap_plugin.viewing.around import BASE_PIXELS, NEAR, PIXELS, views_for_screen
 from mipmap_plugin.viewing.controls import figures, words
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
-from mipmap_plugin.viewing.page import NO_VISER, _check_address
+from mipmap_plugin.viewing.page import NO_VISER, Page, PageSettings, _check_address
 from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
 from mipmap_plugin.viewing.stage import AMPLIFIED, Look, Stage
@@ -284,6 +286,29 @@ def test_only_one_run_at_a_time(base):
     assert over.wait(120) and adapter.progress.adapted is not None
 
 
+def test_of_two_that_start_at_once_one_is_refused(base, monkeypatch):
+    adapter, refused, others, over = Adapter(base, Supersampled("supersampled", base)), [], [], threading.Event()
+    clear = adapter._stopping.clear
+
+    def another():
+        try:
+            adapter.start(wish(base, recipe="instant"), over.set)
+        except SettingsError:
+            refused.append(True)
+
+    def slow():
+        if not others:
+            others.append(threading.Thread(target=another))
+            others[0].start()
+            others[0].join(0.3)
+        clear()
+
+    monkeypatch.setattr(adapter._stopping, "clear", slow)
+    adapter.start(wish(base, recipe="instant"), over.set)
+    others[0].join(60)
+    assert refused == [True] and over.wait(120)
+
+
 def test_a_run_that_is_preparing_ends_with_the_program(base, monkeypatch):
     monkeypatch.setattr(adapting, "GRACE_S", 0.1)
     preparing = threading.Event()
@@ -307,6 +332,36 @@ def test_a_zoom_is_rounded_to_the_scale_of_a_file(base):
 
 def digest(base):
     return [hashlib.sha256(tensor.detach().numpy().tobytes()).hexdigest() for tensor in base.model.parameters().values()]
+
+
+# The page, with something in the place of viser's server
+
+
+@pytest.fixture
+def page(stage, base, monkeypatch, tmp_path):
+    element = lambda *_, initial_value=None, **__: MagicMock(value=initial_value)  # noqa: E731
+    server = MagicMock(**{f"gui.add_{kind}.side_effect": element for kind in ("dropdown", "slider", "number")})
+    monkeypatch.setattr(live_page, "_server", lambda *_: server)
+    base.cameras = [replace(view, name="r_0") for view in base.cameras]
+    return Page(stage, File("base", base), PageSettings("127.0.0.1", 8080, "scene", [None], ["default"], lambda *_: tmp_path / "new.ply"))
+
+
+def test_every_view_can_be_gone_to_again_and_again_whatever_its_name(page, base, monkeypatch):
+    poses = []
+    monkeypatch.setattr(live_page, "_move", lambda _, pose: poses.append(pose.position))
+    menu = page._controls.view
+    for name in ("r_0", "r_0 (4)", "r_0"):
+        assert menu.value not in page._views  # viser tells of a choice only if it is another one than what stands there
+        menu.value = name
+        page._go(MagicMock())
+    assert poses == [tuple(base.cameras[number].center.tolist()) for number in (0, 3, 0)]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("can't allocate memory")])
+def test_a_picture_that_does_not_fit_into_the_memory_does_not_end_the_page(page, screen, monkeypatch, error):
+    monkeypatch.setattr(page._stage, "draw", MagicMock(side_effect=error))
+    page._draw(MagicMock(), Look("base"), screen, 1.0)
+    assert page._controls.figures.content == live_page.OUT_OF_MEMORY
 
 
 # Words

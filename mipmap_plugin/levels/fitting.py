@@ -28,7 +28,7 @@ def read_size(text: str) -> int:
     found = SIZE.fullmatch(text.strip())
     try:
         size = int(float(found[1]) * UNITS[found[2].lower()]) if found else 0
-    except (ValueError, KeyError):
+    except (ValueError, KeyError, OverflowError):
         size = 0
     if size < 1:
         raise SettingsError(f"bytes: must be a size such as 20MB, got {text}")

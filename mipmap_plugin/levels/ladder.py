@@ -13,6 +13,7 @@ from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.contents import Contents, CurvePoint, Level, Switch
 from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, make_levels_by_distance
 from mipmap_plugin.levels.manifest import write_ladder
@@ -20,6 +21,7 @@ from mipmap_plugin.levels.request import FINEST_RATIO, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.levels.switching import switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
+from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.progress import announced
 from mipmap_plugin.wrap import Wrapped
 
@@ -54,6 +56,8 @@ def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None
 
     Raises SettingsError for a model that no viewer draws and for a group of viewers, BackendUnavailable, Interrupted.
     """
+    if reason := why_no_viewer(base.model):
+        raise SettingsError(f"{base.model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
     if by_distance(base, request):
         return make_levels_by_distance(base, request, resume)
     target = base.target(request.viewer)

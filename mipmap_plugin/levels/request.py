@@ -47,7 +47,7 @@ STREAMING = ("playcanvas", "supersplat", "playcanvas-webgpu", "playcanvas-aa", "
 
 @dataclass(frozen=True)
 class LadderRequest:
-    """The request for a ladder. Raises SettingsError for numbers out of range."""
+    """The request for a ladder. Raises SettingsError for numbers out of range, and for an unknown recipe or setting."""
 
     viewer: str
     coarsest: float = 1 / 16  # the zoom down to which levels are made
@@ -66,10 +66,13 @@ class LadderRequest:
             raise SettingsError(f"ratio: must be from {FINEST_RATIO:.3g} to 4, such as 2, got {self.ratio:g}")
         if self.until_splats is not None and self.until_splats < 1:
             raise SettingsError(f"until_splats: must be at least 1, got {self.until_splats}")
+        if self.least_db is not None and not math.isfinite(self.least_db):
+            raise SettingsError(f"least_db: must be a number of dB, such as 32, got {self.least_db:g}")
         if self.by not in WAYS:
             raise SettingsError(f"by: must be one of {', '.join(WAYS)}, got {self.by}")
         if taken := {"band", "start", "viewer", "scale", "images"} & self.settings.keys():
             raise SettingsError(f"{', '.join(sorted(taken))}: set by the ladder for each level; leave out")
+        recipe(self.recipe, self.coarsest, **self.settings)  # raises before anything is read or kept
 
     @classmethod
     def of(cls, viewer: str, **options: Any) -> LadderRequest:

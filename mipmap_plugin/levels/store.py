@@ -28,17 +28,17 @@ class LevelStore:
     """Finished levels of one ladder in a folder; without a folder nothing is kept."""
 
     def __init__(self, folder: Path | None, base: Wrapped, request: LadderRequest) -> None:
-        """Raises SettingsError for a folder that belongs to another ladder, OutputError if it cannot be written."""
+        """Raises SettingsError for a folder with levels of another ladder, SceneError for a damaged one, OutputError if it cannot be written."""
         self._folder, self._base, self._target = folder, base, base.target(request.viewer)
         if folder is None:
             return
         facts, file = json.loads(json_text(_facts(base, request))), folder / REQUEST
-        if not file.is_file():
-            if folder.exists() and any(folder.iterdir()):
+        if folder.exists() and any(each.name != REQUEST for each in folder.iterdir()):
+            if not file.is_file():
                 raise SettingsError(f"{folder}: unfinished ladders are kept there, but it has other things in it; choose another output")
-            write_json(file, facts, overwrite=True)
-        elif read_json(file) != facts:
-            raise SettingsError(f"{folder}: holds levels of another base, viewer or settings; repeat the run with those, or delete it")
+            if read_json(file) != facts:
+                raise SettingsError(f"{folder}: holds levels of another base, viewer or settings; repeat the run with those, or delete it")
+        write_json(file, facts, overwrite=True)
 
     def level(self, name: str, make: Callable[[Path | None], Adapted]) -> Adapted:
         """The level of that name from the folder, or else the one that `make` returns for the path of the state of its run, kept from now on."""
@@ -63,7 +63,7 @@ class LevelStore:
             raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({error}); delete its folder to start anew") from error
         model.trained = _trained(self._base, self._target)
         backend, _ = self._base.backend(viewer=report.viewer)
-        return Adapted(model, report, backend, self._target, {str(report.viewer): self._target})
+        return Adapted(model, report, backend, self._target, {str(report.viewer): self._target}, cameras=self._base.views())
 
 
 def _trained(base: Wrapped, target: Effects) -> Any:

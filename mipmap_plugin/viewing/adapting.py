@@ -76,7 +76,7 @@ class Adapter:
         self.progress = Progress()
         self._thread: threading.Thread | None = None
         self._warm = set[str | None]()  # the viewers that were adapted for before
-        self._stopping = threading.Event()
+        self._starting, self._stopping = threading.Lock(), threading.Event()
         self._asked: Camera | None = None  # whose picture somebody waits for
         self._answer: tuple[Camera, Tensor] | None = None  # the last picture, and whose it is
         self._stepping = False  # the run takes steps, and answers between them
@@ -84,11 +84,12 @@ class Adapter:
 
     def start(self, wish: Wish, then: Callable[[], None] = lambda: None) -> None:
         """Begin a run, and call `then` in its thread when it has ended. Raises SettingsError while one is running."""
-        if self.progress.running:
-            raise SettingsError("an adaptation is running; stop it first")
-        self._stopping.clear()
-        self._answer, self._stepping = None, False
-        self.progress = Progress(wish, running=True)
+        with self._starting:  # two browsers may ask at once
+            if self.progress.running:
+                raise SettingsError("an adaptation is running; stop it first")
+            self._stopping.clear()
+            self._answer, self._stepping = None, False
+            self.progress = Progress(wish, running=True)
         self._thread = threading.Thread(target=self._run, args=(wish, then), name="adapting", daemon=True)
         self._thread.start()
 

@@ -19,6 +19,9 @@ MARKS = tuple((float(stop), zoom_name(2.0**stop)) for stop in range(-6, 5, 2))
 # Words for what is None in the state.
 AS_TRAINED, NOTHING = "as trained", "nothing"
 
+# What the menu of views shows.
+NOWHERE = "choose ..."
+
 DISTANCE, LENS = "distance", "focal length"
 
 # px of the screen along each side of a pixel of the picture.
@@ -46,7 +49,7 @@ class Controls:
                 "Zoom, 2 to the", *STOPS, initial_value=0.0, marks=MARKS, hint="pixels of the screen per pixel of the training, at the median splat"
             )
             self.by = gui.add_dropdown("Zoom by", (DISTANCE, LENS), initial_value=DISTANCE)
-            self.view = gui.add_dropdown("Go to view", views, initial_value=views[0])
+            self.view = gui.add_dropdown("Go to view", (NOWHERE, *views), initial_value=NOWHERE)
         with gui.add_folder("Adapt"):
             self.seconds = gui.add_number("Seconds", USUAL_S, min=LEAST_S, max=MOST_S, step=1.0, hint="at most")
             self.recipe = gui.add_dropdown("Recipe", recipes, initial_value=recipes[0])

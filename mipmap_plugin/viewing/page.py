@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,15 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.viewing.adapting import Adapter, Live, Wish
-from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, Controls
+from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, NOWHERE, Controls
 from mipmap_plugin.viewing.pace import STILL_S, Pace
 from mipmap_plugin.viewing.screen import Pose, by_distance, by_lens, pose_of, up_of, zoomed
 from mipmap_plugin.viewing.sources import File, of_adapted
 from mipmap_plugin.viewing.stage import Look, Stage, smaller
+
+OUT_OF_MEMORY = "out of memory; enlarge pixels, or make the window smaller"
 
 NO_VISER = "the live view needs viser: pip install 'mipmap-plugin[view]'"
 
@@ -68,7 +72,7 @@ class Page:
         self._seen: dict[int, _Seen] = {}
         self.adapter = Adapter(stage.base, stage.reference, self._progressed)
         self._live = stage.add(Live(self.adapter, base))
-        self._views = {view.name or f"view {number}": view for number, view in enumerate(stage.base.views())}
+        self._views = by_name(stage.base.views())
         self._server = _server(settings.host, settings.port)
         self._prepare()
 
@@ -145,8 +149,10 @@ class Page:
     def _draw(self, client: Any, look: Look, screen: Camera, coarse: float) -> None:
         try:
             picture = self._stage.draw(look, screen, coarse)
-        except (MipmapPluginError, MemoryError) as error:
-            self._controls.figures.content = str(error) or "out of memory; enlarge pixels, or make the window smaller"
+        except (MipmapPluginError, MemoryError, RuntimeError) as error:
+            if not isinstance(error, MipmapPluginError) and not is_out_of_memory(error):
+                raise
+            self._controls.figures.content = str(error) if isinstance(error, MipmapPluginError) else OUT_OF_MEMORY
             return
         self._pace.learn(picture.drawn.width * picture.drawn.height, picture.seconds)
         client.scene.set_background_image(_bytes(picture.image), format="png" if coarse == 1 else "jpeg", jpeg_quality=QUALITY)
@@ -166,9 +172,11 @@ class Page:
             _move(event.client, zoomed(pose, zoom, self._stage.sampling, screen.size, change))
 
     def _go(self, event: Any) -> None:
-        """Move the camera to a view of the scene."""
-        if event.client is not None:
-            _move(event.client, self._pose(self._views[self._controls.view.value]))
+        """Move the camera to a view of the scene. The list is a menu: viser tells of no choice that stands there already."""
+        view = self._views.get(self._controls.view.value)
+        if event.client is not None and view is not None:
+            _move(event.client, self._pose(view))
+            self._controls.view.value = NOWHERE
 
     def _adapt(self, event: Any) -> None:
         """Adapt for what is on the screen of the browser whose button was pressed."""
@@ -178,7 +186,10 @@ class Page:
         screen = smaller(pose.camera(width, height), 1 / look.pixel)
         zoom = self._stage.sampling.of(screen).zoom
         wish = Wish(screen, pose.look_at, zoom, look.viewer, self._controls.seconds.value, self._controls.recipe.value)
-        self.adapter.start(wish, self._ended)
+        try:
+            self.adapter.start(wish, self._ended)
+        except SettingsError:  # another browser was quicker
+            return
         self._controls.offer(self._names(), self._live)
         self._progressed()
 
@@ -213,6 +224,15 @@ class Page:
         else:
             self._controls.told.content = f"saved: {saved}"
             self._controls.save.disabled = True
+
+
+def by_name(views: Sequence[Camera]) -> dict[str, Camera]:
+    """The views by their names; a name that is taken gets a number, as where training and test views are both called r_0."""
+    named: dict[str, Camera] = {}
+    for number, view in enumerate(views):
+        name = view.name or f"view {number}"
+        named[name if name not in named else next(each for again in count(2) if (each := f"{name} ({again})") not in named)] = view
+    return named
 
 
 def _server(host: str, port: int) -> Any:

@@ -79,9 +79,11 @@ def by_distance(base: Wrapped, request: LadderRequest) -> bool:
 def refuse(base: Wrapped, request: LadderRequest) -> None:
     """Raise SettingsError for what levels by distance do not support."""
     if not base.model.traits.same_for_all_views:
-        raise SettingsError(f"{base.model.family}: its splats differ by view or time, so that levels by distance cannot mix them; give by zoom")
+        raise SettingsError(f"{base.model.family}: its splats have a 3D filter, so that levels by distance cannot mix them; give by zoom")
     if request.least_db is not None or request.until_splats is not None:
         raise SettingsError("least_db and until_splats: levels by distance follow from the distances of the cameras; leave both out")
+    if taken := {"merge_to", "most_splats"} & request.settings.keys():
+        raise SettingsError(f"{', '.join(sorted(taken))}: levels by distance have as many splats as their distances need; leave out")
 
 
 def scene_of(base: Wrapped, request: LadderRequest, band: Band) -> Scene:
