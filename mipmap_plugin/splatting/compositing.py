@@ -65,9 +65,10 @@ def composite(
     transmittance = splats.colors.new_ones(tiles_x * tiles_y, tile**2)
     background = splats.colors.new_zeros(3) if background is None else background
     rounded = background.expand(tiles_x * tiles_y, tile**2, 3)
+    filled = int((starts.diff() > 0).sum())
     for tiles, ids in _batches(starts, members, splats.memory_factor * tile**2):
         pixels = _pixel_centers(tiles, tiles_x, tile).to(splats.colors)
-        if torch.is_grad_enabled():
+        if torch.is_grad_enabled() and len(tiles) < filled:  # to compute the only batch again would save no memory
             batch = checkpoint(_composite_batch, splats, settings.min_transmittance, ids, pixels, use_reentrant=False, preserve_rng_state=False)
         else:
             batch = _composite_batch(splats, settings.min_transmittance, ids, pixels)

@@ -221,7 +221,6 @@ def test_an_upsampler_that_is_called_for_is_imported(broken_upsampler):
 
 IMPORTED = """
 import sys
-import torch._dynamo  # checkpointing looks into it, and it imports triton by itself
 before = set(sys.modules)
 from mipmap_plugin import wrap_model
 model = wrap_model(sys.argv[1], backend=sys.argv[2])
