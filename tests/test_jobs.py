@@ -81,6 +81,12 @@ def test_no_job_replaces_the_base_of_another(run, tmp_path):
     assert (tmp_path / "a_x0.5.ply").read_bytes() == before
 
 
+def test_this_folder_is_a_checkpoint_too(run, scenes, monkeypatch):
+    monkeypatch.chdir(scenes / "lego")
+    code, out, _ = run("adapt", ".", "../chair", "--scale", "1/2", *NO_STEP)
+    assert code == 0 and "2 done" in out and (scenes / "lego_x0.5").is_dir()
+
+
 def test_two_scales_of_one_name_are_refused(run, scenes):
     code, _, err = run("adapt", scenes / "lego", "--scale", "1/3", "--scale", "0.3333333", *NO_STEP)
     assert code == 2 and "would both be written to" in err and not (scenes / "lego_x0.333333").exists()

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import tiny
@@ -85,6 +86,25 @@ def test_a_folder_with_other_things_is_not_deleted(folder, capsys, command):
     (kept / "letter.txt").write_text("mine")
     assert main(command(folder, "rows.json")) == 2
     assert "holds something else" in capsys.readouterr().err and (kept / "letter.txt").exists()
+
+
+def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
+    """Which is not in the checkpoint's own bytes."""
+    monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--backend", "reference"]
+    psnrs = []
+    for white in (False, True):
+        options = folder / "base" / "cfg_args"
+        options.write_text(options.read_text().replace("white_background=False", f"white_background={white}"))
+        assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
+        psnrs.append(json.loads((folder / "rows.json").read_text())["rows"][0]["psnr_db"])
+    assert psnrs[0] != psnrs[1]
+
+
+def test_the_scene_is_not_replaced_by_the_rows(folder, capsys):
+    before = (folder / "scene" / "transforms_test.json").read_bytes()
+    assert main([*evaluate(folder, "scene/transforms_test.json"), "--overwrite"]) == 2
+    assert "never replaced" in capsys.readouterr().err and (folder / "scene" / "transforms_test.json").read_bytes() == before
 
 
 def test_rows_and_page_are_two_files(folder, capsys):

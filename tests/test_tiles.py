@@ -208,6 +208,13 @@ def test_a_model_folder_is_written_as_one(job, tmp_path):
     assert len(load_vanilla(tmp_path / "out")) == joined.report.gaussians_after
 
 
+def test_a_model_folder_is_written_beside_the_checkpoint(job, capsys):
+    """Where the scale in its name looks like a suffix."""
+    words = ["adapt", str(job.base.checkpoint), "--scale", "1/2", "--steps", "0", "--views", "given", "--backend", "reference", "--tiles", "2"]
+    assert main(words) == 0
+    assert (job.base.checkpoint.with_name("scene_x0.5") / "point_cloud").is_dir()
+
+
 def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
     """A run that fails in its second tile goes on there, and leaves the same bytes as one that is not disturbed."""
     undisturbed = adapt_in_tiles(replace(job, target=job.target.with_name("other.ply")), 3).file

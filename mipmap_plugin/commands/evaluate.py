@@ -105,8 +105,8 @@ class _Results:
         gallery = evaluation_gallery(wrapped, self._protocol) if self._page else None
         lpips = self._perceptual and self._perceptual.label
         asked = {"protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings, "page": self._page is not None}
-        made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "scene": scene.digest(), "backend": wrapped.backend()[0].name}
-        cells = Cells(self._kept, asked | made_from)
+        made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "trained": str(wrapped.trained), "scene": scene.digest()}
+        cells = Cells(self._kept, asked | made_from | {"backend": wrapped.backend()[0].name})
         judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, gallery, cells)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
         self._notes |= dict.fromkeys(evaluation.notes(wrapped, self._scales, appearance))
@@ -156,8 +156,9 @@ def _scene(folder: Path, appearance: str) -> Scene:
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
+    read = [part for path in checkpoint for part in _parts(path)] + [file for folder in images for file in folder.glob("transforms*.json")]
     for output in outputs:
-        refuse_output(output, overwrite, [part for path in checkpoint for part in _parts(path)], is_file=True)
+        refuse_output(output, overwrite, read, is_file=True)
         refuse_unwritable(output)
     if len(checkpoint) != len(images):
         raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")

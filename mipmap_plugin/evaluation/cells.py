@@ -23,7 +23,6 @@ class Cells:
     def __init__(self, folder: Path | None = None, provenance: Mapping[str, Any] | None = None) -> None:
         """`provenance`: what all cells depend on, as JSON: the base, the photographs, the protocol, the settings."""
         self.folder, self._provenance = folder, {**(provenance or {}), "versions": versions()}
-        self.found = self.kept = 0  # cells that an earlier command had finished; that are in the folder
 
     def find(self, key: Mapping[str, Any]) -> dict[str, Any] | None:
         """The content of a cell, if an earlier command finished it."""
@@ -34,7 +33,6 @@ class Cells:
             content: dict[str, Any] = load_torch(file)
         except CheckpointError:  # cut off by a crash of the machine
             return None
-        self.found, self.kept = self.found + 1, self.kept + 1
         return content
 
     def remove(self) -> None:
@@ -48,7 +46,6 @@ class Cells:
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
             save_torch(file, content, overwrite=True)
-            self.kept += 1
 
     def _file(self, key: Mapping[str, Any]) -> Path | None:
         facts = json.dumps([self._provenance, dict(key)], sort_keys=True, default=str)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.atomic import refuse_output, refuse_to_lose
+from mipmap_plugin.formats.atomic import named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.splat_transform import refuse_as_folder
 from mipmap_plugin.models.base import TrainedScale
 
@@ -86,5 +86,6 @@ def _belongs(name: str, source: str) -> bool:
 
 
 def is_adapted(file: Path) -> bool:
-    """Whether a file is the output of an adaptation, its report or the state of its run."""
+    """Whether a file is the output of an adaptation, its report or the state of its run. Raises OutputError for a root."""
+    file = named(file)
     return file.name.endswith((REPORT, ".resume")) or file.with_name(file.name + REPORT).exists()

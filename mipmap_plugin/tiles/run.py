@@ -16,6 +16,7 @@ from mipmap_plugin.errors import CheckpointError, JobsFailed, SettingsError
 from mipmap_plugin.formats.atomic import named, new_file, refuse_output, sha256, together, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.ply_rows import concatenate
+from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
@@ -121,7 +122,7 @@ def _refuse(job: Job, tiles: int) -> None:
         raise SettingsError("tiles are adapted to one scale, and to no number of splats; leave most_splats (--splats) and band out")
     if job.viewer is not None and len(viewers_for(job.viewer)) > 1:
         raise SettingsError(f"tiles are adapted for one viewer at a time, and {job.viewer} stands for several; give one of them")
-    if job.target.suffix not in ("", ".ply"):
+    if is_written(job.target):
         raise SettingsError(f"{job.target}: tiles are joined to a .ply or a model folder; give one of these, and convert it afterwards")
     refuse_output(job.target, job.overwrite, parts_of(find_splats(job.base.checkpoint)[0].path, None))
 
@@ -174,7 +175,7 @@ def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) ->
             concatenate(files, comments, out)
 
     with together(job.target):
-        if job.target.suffix == ".ply":
+        if job.target.suffix.lower() == ".ply":
             with new_file(job.target, job.overwrite) as temporary, temporary.open("xb") as out:
                 concatenate(files, comments, out)
             saved = job.target

@@ -23,7 +23,8 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
     if 1 in scales:
         raise SettingsError("at scale 1 the base needs no adaptation; give another scale")
     truths = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
-    cells = Cells(folder.path / KEPT, {"base": model.model.digest, "asked": model.asked, "scene": scene and scene.digest(), "views": views})
+    made_from = {"base": model.model.digest, "asked": model.asked, "trained": str(model.trained), "scene": scene and scene.digest()}
+    cells = Cells(folder.path / KEPT, made_from | {"views": views, "threads": model.threads})
     notes = left_out(model, plan) + (not_exposed(model.model) if scene else [])
     tradeoffs = [Tradeoff(scale, truth.label, [], notes) for scale, truth in zip(scales, truths, strict=True)]
     try:
