@@ -77,7 +77,8 @@ def assert_gradients_close(actual, expected, relative=2e-5):
 @pytest.mark.parametrize("screen_filter", ["classic", "antialiased", "mip", "analytic", "window"])
 @pytest.mark.parametrize("view", [camera(), WIDE], ids=["one-tile", "many-tiles"])
 def test_equals_a_sum_over_every_pixel(view, screen_filter):
-    g = leaf(gaussians(80, dtype=torch.float32).to(dtype=torch.float64))  # the same numbers in both precisions
+    count = 20 if screen_filter == "window" else 80  # its sum is slow
+    g = leaf(gaussians(count, dtype=torch.float32).to(dtype=torch.float64))  # the same numbers in both precisions
     effects = Effects(1, screen_filter, background=(0.2, 0.5, 0.9))
     expected_image, expected_alpha = brute_force(g, view, effects.eps2d, effects.background, screen_filter)
     image, alpha, grads = draw(g, view, effects)

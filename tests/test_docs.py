@@ -30,7 +30,7 @@ from mipmap_plugin.commands.many import Many
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models.families import BUILT_IN
-from mipmap_plugin.recipes import RECIPES
+from mipmap_plugin.recipes import DEFAULT_OUT, RECIPES
 from mipmap_plugin.splatting.viewers import VIEWERS
 from mipmap_plugin.wrap import Wrapped
 
@@ -256,6 +256,7 @@ def test_python_runs(piece, tmp_path, monkeypatch):
     """On a scene that adapts in a moment, in place of the reader's."""
     assert unresolved(piece.text) == []
     tiny.folder(tmp_path / "output/bicycle", tiny.cameras(6))
+    monkeypatch.setitem(DEFAULT_OUT, "steps", 20)
     monkeypatch.chdir(tmp_path)
     exec(compile(piece.text, str(piece), "exec"), {"__name__": "block"})
 

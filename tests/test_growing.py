@@ -129,8 +129,7 @@ def test_agreement_at_the_start_is_that_of_the_closed_form(monkeypatch):
     assert found[0] == pytest.approx(-10 * math.log10(sum(errors) / 6), abs=0.01)
 
 
-@pytest.mark.parametrize("agreements", [(30.0, 31.0, 32.0), (30.0, 20.0)])
-@pytest.mark.parametrize("pressed", [6, 10])  # with a growth on trial; after its judgment
+@pytest.mark.parametrize(("agreements", "pressed"), [((30.0, 20.0), 6), ((30.0, 31.0, 32.0), 10)])  # with a growth on trial; after its judgment
 def test_a_resumed_run_equals_an_uninterrupted_one(judged, monkeypatch, tmp_path, agreements, pressed):
     judged(*agreements)
     whole = adapted()

@@ -52,7 +52,7 @@ def untimed(rows):
     return [{name: value for name, value in row.items() if name not in ("adapt_seconds", "ms_per_view")} for row in rows]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill -9"])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)], ids=["ctrl-c", "kill -9"])
 def test_evaluate_goes_on_where_it_stopped(folder, capsys, number):
     kept = folder / "rows.json.resume"
     code, said = stopped(evaluate(folder, "rows.json"), number, kept, 3)

@@ -303,8 +303,7 @@ def with_extras() -> VanillaModel:
     return VanillaModel(tiny.model(40).parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)}))
 
 
-@pytest.mark.parametrize("at", [2, 3, 5])  # at a check that takes back, and between two
-@pytest.mark.parametrize("pruned", [True, False])
+@pytest.mark.parametrize(("at", "pruned"), [(2, True), (3, True), (5, False)])  # at a check that takes back, and between two
 def test_a_resumed_run_takes_back_as_the_whole_one_did(tmp_path, at, pruned):
     settings = {**HARMFUL, "prune_every": 1 if pruned else 50, "min_opacity": 0.4, "steps": 7, "check_every": 2}
     model = wrap_model(with_extras(), cameras=tiny.cameras(), backend="reference")

@@ -105,8 +105,7 @@ def test_a_full_disk_when_the_finished_model_is_saved_leaves_its_state(tmp_path,
 # Ctrl-C
 
 
-@pytest.mark.parametrize("name", WRITERS)
-@pytest.mark.parametrize("where", ["write", "move"])
+@pytest.mark.parametrize(("name", "where"), [*((name, "write") for name in WRITERS), ("ply", "move"), ("cfg_args", "move")])
 def test_ctrl_c_while_saving_leaves_the_old_output_and_nothing_else(tmp_path, monkeypatch, name, where):
     base = SAMPLES[name].make(tmp_path / "base")
     out = tmp_path / "out" / ("new.ply" if base.suffix == ".ply" else "new")

@@ -98,7 +98,8 @@ ROWS = {
     "large features": [("f_anchor_feat", 3, 1e6), ("f_offset", 3, 1e6)],
     "filter 0": [("filter_3D", 3, 0.0)],
     "filter 1e6": [("filter_3D", 3, 1e6)],
-    **{f"{bad} in {prefix}": [(prefix, 3, bad)] for prefix in PREFIXES for bad in (np.nan, np.inf)},
+    **{f"NaN in {prefix}": [(prefix, 3, np.nan)] for prefix in PREFIXES},
+    **{f"infinity in {prefix}": [(prefix, 3, np.inf)] for prefix in ("x", "scale", "rot", "f_rest")},
     "every row the same": [(prefix, row, 0.1) for prefix in PREFIXES if prefix != "level" for row in range(COUNT)],
 }
 
