@@ -27,7 +27,7 @@ WEIGHT_VIEWS = 12
 
 # The powers of `merge_to` that are tried, until merging loses little enough. What starts from a finer level, which merging may cost much, has
 # more: chair at x0.57 loses too much with 15 % of its splats, and not with 19 %.
-POWERS, POWERS_OF_LEVELS = (1, 1 / 2, 1 / 4), (1, 7 / 8, 3 / 4, 1 / 2, 1 / 4)
+POWERS, POWERS_OF_LEVELS = (1, 1 / 2, 1 / 4), (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2, 1 / 4)
 
 
 @dataclass(frozen=True, eq=False)
