@@ -22,6 +22,8 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
     """
     if 1 in scales:
         raise SettingsError("at scale 1 the base needs no adaptation; give another scale")
+    if views is not None and views < 1:
+        raise SettingsError(f"views: at least 1 must be evaluated on, got {views}")
     truths = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
     cells = Cells(folder.path / KEPT, {"base": model.model.digest, "asked": model.asked, "scene": scene and scene.digest(), "views": views})
     notes = left_out(model, plan) + (not_exposed(model.model) if scene else [])
