@@ -126,6 +126,8 @@ class Wrapped:
             raise TypeError(f"render() got unknown options: {', '.join(sorted(unknown))}; there are {', '.join(RenderOptions.__annotations__)}")
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
         check_scale(scale)
+        if supersampling < 1:
+            raise SettingsError(f"supersampling: must be at least 1 sample per pixel along each axis, got {supersampling}")
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
         effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(options.get("outputs", ())), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)

@@ -302,3 +302,10 @@ def test_a_viewer_that_cannot_be_adapted_for_is_refused_before_anything_is_drawn
     monkeypatch.setattr(Wrapped, "render", None)
     with pytest.raises(SettingsError, match="leave the viewer spark out"):
         evaluate(own, scene, [1 / 4], ["instant"], "P3", viewer="spark")
+
+
+def test_a_setting_out_of_range_is_refused_before_anything_is_drawn(scene, monkeypatch):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    monkeypatch.setattr(Wrapped, "render", None)
+    with pytest.raises(SettingsError, match="setting steps"):
+        evaluate(base, scene, [1 / 4], ["default"], "P3", steps=-1)

@@ -392,6 +392,7 @@ def test_without_viser_the_command_says_what_to_install(tmp_path, monkeypatch, c
 
 @pytest.mark.parametrize(("options", "message"), [
     (["--port", "70000"], "port: must be from 0 to 65535"),
+    (["--output", __file__], "give --output a folder"),
     (["--viewer", "portable"], "portable"),
     (["--viewer", "nonsense"], "there is no 'nonsense'"),
     (["--threads", "0"], "threads must be at least 1"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts, scene, wrap
+from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
 from mipmap_plugin.commands.resuming import resumable
 from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, unique_scales
@@ -84,10 +84,10 @@ def tradeoff(
 
 
 def _check(model: Wrapped, plan: Plan, scales: Sequence[float]) -> None:
-    """Raise the errors of a viewer and of recipes before any work."""
+    """Raise the errors of a viewer, of recipes and of settings before any work."""
     model.target(plan.viewer)
-    for name, factor in product(plan.recipes, scales):
-        make_config(name, factor)
+    for name, factor, steps in product(plan.recipes, scales, plan.steps or (None,)):
+        make_config(name, factor, **without_none(seed=plan.seed, steps=steps))
 
 
 def _print(tradeoffs: Sequence[Tradeoff], page: Path | None, json: bool) -> None:

@@ -62,6 +62,8 @@ def view(
 
     if not 0 <= port <= 65535:
         raise SettingsError(f"port: must be from 0 to 65535, got {port}")
+    if output is not None and output.exists() and not output.is_dir():
+        raise SettingsError(f"{output} is no folder, which the page could save to; give --output a folder")
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     if viewer is not None:
         wrapped.target(viewer)  # raises before any work

@@ -190,9 +190,9 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     to the evaluated views themselves, as the paper does. `settings` are those of `Wrapped.adapt`; a `viewer` adds a row of the base in it.
     """
     viewer, rows = settings.get("viewer"), []
-    model.targets(viewer)  # raise errors of the viewer and the recipes before any work
+    model.targets(viewer)  # raise errors of the viewer, the recipes and the settings before any work
     for name, scale in product(recipes, scales):
-        make_config(name, scale)
+        make_config(name, scale, **{key: value for key, value in settings.items() if key in AdaptConfig.model_fields})
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
         rows += _adapted_rows(model, judge, scale, recipes, settings) if scale != 1 or viewer else []

@@ -279,6 +279,14 @@ def test_the_command_prints_a_table_and_refuses_to_replace_it(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["complete"]
 
 
+@pytest.mark.parametrize(
+    ("wrong", "reason"), [(["--views", "0"], "views: at least 1"), (["--steps", "-1"], "setting steps"), (["--seed", "-1"], "setting seed")]
+)
+def test_wrong_options_are_refused_before_anything_is_measured(tmp_path, capsys, monkeypatch, wrong, reason):
+    monkeypatch.setattr(measuring, "_measured", lambda *_: pytest.fail("it is refused before anything is measured"))
+    assert command(tmp_path, *wrong) == 2 and reason in capsys.readouterr().err
+
+
 def test_pictures_without_matplotlib_are_refused_before_anything_is_measured(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     assert command(tmp_path, "--picture") == 2

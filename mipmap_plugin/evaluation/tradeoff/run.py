@@ -22,6 +22,8 @@ def run(model: Wrapped, scene: Scene | None, scales: Sequence[float], plan: Plan
     """
     if 1 in scales:
         raise SettingsError("at scale 1 the base needs no adaptation; give another scale")
+    if views is not None and views < 1:
+        raise SettingsError(f"views: at least 1 must be evaluated on, got {views}")
     truths = [base_itself(model, scale, views) if scene is None else photographs(model, scene, scale, views) for scale in scales]
     made_from = {"base": model.model.digest, "asked": model.asked, "trained": str(model.trained), "scene": scene and scene.digest()}
     cells = Cells(folder.path / KEPT, made_from | {"views": views, "threads": model.threads})
