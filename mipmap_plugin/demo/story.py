@@ -8,7 +8,7 @@ from pathlib import Path
 from mipmap_plugin.evaluation.evaluate import Row
 
 # What is wrong with a base at other zooms (Mip-Splatting, section 1).
-FAULT = {True: "thick and bright", False: "needles and holes"}  # zoomed out, zoomed in
+ZOOMED_OUT, ZOOMED_IN = "thick and bright", "needles and holes"
 
 
 def story(rows: Sequence[Row], viewer: str | None, seconds: float, output: Path, page: Path | None) -> str:
@@ -19,7 +19,8 @@ def story(rows: Sequence[Row], viewer: str | None, seconds: float, output: Path,
     lines = [f"The embedded scene {drawn}, three views that nothing was trained on, dB against the ray-traced world:"]
     for scale in scales:
         base, adapted = by_name[scale, "base"], by_name[scale, "adapted"]
-        change = f"base {base.psnr_db:.1f} dB ({FAULT[scale < 1]}) -> adapted {adapted.psnr_db:.1f} dB"
+        fault = f" ({ZOOMED_OUT if scale < 1 else ZOOMED_IN})" if scale != 1 else ""
+        change = f"base {base.psnr_db:.1f} dB{fault} -> adapted {adapted.psnr_db:.1f} dB"
         lines.append(f"  {_zoom(scale):5}{change}, {base.gaussians:,} -> {adapted.gaussians:,} splats, in {adapted.adapt_seconds:.0f} s")
     lines.append(f"All of it took {seconds:.0f} s. Files and pictures (base | adapted | truth): {output.resolve()}")
     return "\n".join([*lines, *([f"page: {page}"] if page else [])])

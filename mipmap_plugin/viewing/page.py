@@ -79,7 +79,8 @@ class Page:
     @property
     def address(self) -> str:
         """Where the page is."""
-        return f"http://{self._settings.host}:{self._server.get_port()}"
+        host = f"[{self._settings.host}]" if ":" in self._settings.host else self._settings.host  # of IPv6
+        return f"http://{host}:{self._server.get_port()}"
 
     def run(self) -> None:
         """Draw until Ctrl-C."""
