@@ -25,9 +25,12 @@ from mipmap_plugin.models.base import Rebuilt, SplatModel
 # Views from which blend weights are computed.
 WEIGHT_VIEWS = 12
 
-# The powers of `merge_to` that are tried, until merging loses little enough. What starts from a finer level, which merging may cost much, has
-# more: chair at x0.57 loses too much with 15 % of its splats, and not with 19 %.
-POWERS, POWERS_OF_LEVELS = (1, 1 / 2, 1 / 4), (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2, 1 / 4)
+# The powers of `merge_to` that are tried, until merging loses little enough.
+POWERS = (1, 1 / 2, 1 / 4)
+
+# Before them, what starts from a finer level is merged even where too few of its splats share a pixel: else chair would keep half of them at x0.57.
+# What is left has to show at least so many dB: from 29 dB lego's steps regain all that merging cost, from 20 dB those of flowers, a capture, a third.
+COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ class StartProblem:
     phase: Callable[[str], AbstractContextManager[None]]  # counts the seconds spent inside under a phase of that name
     name: str = "the base"  # what the base is called in the report
     may_lose: float = 0.0  # dB by which merged splats may be worse than the base as it is
-    coarsely: bool = False  # whether splats are merged down to a fraction even where too few of them share a pixel
+    coarsely: bool = False  # whether splats may be merged even where too few of them share a pixel
 
     def from_level(self, finer: FinerLevel, model: Callable[[], SplatModel]) -> StartProblem:
         """The same request, starting from a finer level instead of from the base; `model` makes copies of it.
@@ -93,25 +96,32 @@ class StartSearch:
         if config.merge_to == 1 and config.returns == "last":
             return formed, "the closed form"
         base_db, formed_db = problem.steer(base), problem.steer(formed)
-        powers = POWERS_OF_LEVELS if problem.coarsely else POWERS
-        for fraction in (config.merge_to**power for power in powers) if config.merge_to < 1 else ():
-            merged = self._candidate(weights, fraction)
-            if (merged_db := problem.steer(merged)) >= formed_db - config.merging_costs:
+        for power, coarsely in self._merges():
+            merged = self._candidate(weights, config.merge_to**power, coarsely)
+            merged_db = problem.steer(merged)
+            if merged_db >= max(formed_db - config.merging_costs, LEAST_DB if coarsely else -math.inf):
                 return (merged, "the closed form of merged splats") if merged_db >= base_db - problem.may_lose else (base, problem.name)
         return (formed, "the closed form") if formed_db >= base_db else (base, problem.name)
 
-    def _candidate(self, weights: Tensor | None, fraction: float) -> SplatModel:
+    def _merges(self) -> list[tuple[float, bool]]:
+        """The power of `merge_to` of each candidate, and whether it is merged coarsely."""
+        if self._problem.config.merge_to == 1:
+            return []
+        coarse = COARSE_POWERS if self._problem.coarsely else ()
+        return [*((power, True) for power in coarse), *((power, False) for power in POWERS)]
+
+    def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
         """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""
         problem, student = self._problem, self._problem.base()
         if fraction < 1 and weights is not None:
             with problem.phase("merging"):
-                weights = self._merge(student, weights, fraction)
+                weights = self._merge(student, weights, fraction, coarsely)
         if problem.config.closed_form:
             with problem.phase("closed form"):
                 student.reshape(lambda gaussians: self._closed_form(gaussians, weights), problem.views)
         return student
 
-    def _merge(self, student: SplatModel, weights: Tensor, fraction: float) -> Tensor:
+    def _merge(self, student: SplatModel, weights: Tensor, fraction: float, coarsely: bool) -> Tensor:
         """Merge the student's splats down to a fraction of them, or to `most_splats`; return the blend weights of the merged splats."""
         problem, merged_weights = self._problem, []
 
@@ -119,7 +129,7 @@ class StartSearch:
             return pixel_size(means, problem.views) / problem.scale
 
         def merged(gaussians: Gaussians) -> Gaussians:
-            most = problem.config.most_splats or (math.ceil(fraction * len(gaussians)) if problem.coarsely else None)
+            most = problem.config.most_splats or (math.ceil(fraction * len(gaussians)) if coarsely else None)
             if most is None:
                 splats, new_weights = merge(gaussians, pixel_of(gaussians.means), weights, fraction, self._rounds)
             else:
