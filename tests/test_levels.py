@@ -12,6 +12,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, load_model, wrap_model
+from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.image_store import STEPS
@@ -94,6 +95,16 @@ def test_a_run_starts_from_a_finer_level_and_keeps_a_fraction_of_the_base():
     assert len(finer) <= 30 and adapted.report.gaussians_before == 40
     assert any("merged" in name or "finer level" in name for name in adapted.report.validation)
     assert 10 <= adapted.report.gaussians_after <= 30
+
+
+def test_splats_that_share_no_pixel_are_merged_where_enough_is_left_to_see(monkeypatch):
+    def count(least_db):
+        monkeypatch.setattr(candidates, "LEAST_DB", least_db)
+        settings = dict(steps=0, merge_to=0.05, merging_costs=99, validation_views=2, returns="last")
+        return len(base.adapt(0.9, viewer="antialiased", start=FinerLevel(base.model, 1.0), **settings).model)
+
+    base = wrapped(40)
+    assert count(-math.inf) == 2 < count(math.inf)
 
 
 def test_a_start_has_to_be_finer():
