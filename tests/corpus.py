@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -135,7 +136,8 @@ def _dot_splat(path: Path) -> Path:
 
 def _spz(path: Path) -> Path:
     path.mkdir()
-    (path / "a.spz").write_bytes(gzip.compress(b"NGSP" + bytes(200)))
+    count, bytes_a_splat = 10, 9 + 1 + 3 + 3 + 3  # version 2: center, opacity, color, scales, rotation
+    (path / "a.spz").write_bytes(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 2, count, 0, 12, 0, 0) + bytes(count * bytes_a_splat)))
     return path / "a.spz"
 
 

@@ -147,5 +147,11 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
         return str(error)[:160]
     if done.returncode == 0 and target.is_file():
         return ""
-    lines = [line.strip() for line in (done.stderr + done.stdout).splitlines() if line.strip()]
-    return (lines[-1] if lines else f"exit code {done.returncode}")[:160]
+    return _reason(done.stderr + done.stdout) or f"exit code {done.returncode}"
+
+
+def _reason(said: str) -> str:
+    """What splat-transform says went wrong: its line with the error, before a trace and a summary, or else its last one."""
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    errors = [line.partition("Error: ")[2] for line in lines if "Error: " in line]
+    return (errors[0] if errors else lines[-1] if lines else "")[:160]
