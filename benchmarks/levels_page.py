@@ -75,7 +75,10 @@ def strip(path: Path, rows: Mapping[str, Sequence[Tensor]], zooms: Sequence[floa
 def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
     """A plot of dB over zoom for each base and viewer, with our switches."""
     figure = figure_class()(figsize=(12, 3.6 * ((len(results) + 1) // 2)), layout="constrained")
-    for axes, result in zip(figure.subplots((len(results) + 1) // 2, 2, squeeze=False, sharey=True).flat, results, strict=False):
+    plots = list(figure.subplots((len(results) + 1) // 2, 2, squeeze=False, sharey=True).flat)
+    for axes in plots[len(results) :]:
+        axes.set_axis_off()
+    for axes, result in zip(plots, results, strict=False):
         for film in result["films"]:
             zooms, quality = ([frame[key] for frame in film["frames"]] for key in ("zoom", "psnr_db"))
             width = 2.4 if film["name"] == "levels" else 1.3
