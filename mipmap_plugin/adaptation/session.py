@@ -23,7 +23,8 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
-from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch, warm_up_backend
+from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch
+from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
@@ -109,7 +110,8 @@ class Session:
         began = time.perf_counter()
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())
-            warm_up_backend(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0)
+            merging = self.config.merge_to < 1 and self._start_problem().has_blend_weights
+            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0, merging=merging)
         as_it_is = self._for_target(self._base_in_viewer, shared=True)
         initial, start = StartSearch(self._start_problem()).best()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}

@@ -158,14 +158,3 @@ class StartSearch:
         """[N]: the blend weights of the base's splats, in target pixels of a view."""
         gaussians = base.gaussians(self._weight_views[0]).detach()
         return blend_weights(gaussians, self._weight_views, self._problem.backend, self._problem.base_effects) * self._problem.scale**2
-
-
-def warm_up_backend(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], *, gradients: bool) -> None:
-    """Let the backend compile for all `effects` by rendering one splat, so that compilation counts in no later phase."""
-    camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
-    for setting in effects:
-        one = gaussians[torch.arange(min(1, len(gaussians)))].detach()
-        one.means.requires_grad_(gradients)
-        image = backend.render(one, camera, setting).image
-        if gradients and image.requires_grad:
-            image.sum().backward()

@@ -24,8 +24,9 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Validation, split_validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.candidates import WEIGHT_VIEWS, warm_up_backend
+from mipmap_plugin.adaptation.start.candidates import WEIGHT_VIEWS
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.views import GOLDEN, choose_views
@@ -166,7 +167,8 @@ class LevelRun:
     def run(self, resume: Path | None) -> Adapted:
         """Make the level, or go on with the run that `resume` holds."""
         began = time.perf_counter()
-        warm_up_backend(self.scene.backend, self.finest, (self.scene.target, self.scene.base.effects()), gradients=self.config.steps > 0)
+        drawn_with = self.scene.target, self.scene.base.effects()
+        warm_up(self.scene.backend, self.finest, drawn_with, gradients=self.config.steps > 0, merging=True)
         with announced(f"level {self.number}: merging"):
             student, name = self._start()
         initial, states, curve, ended_by, state = student.copy(), {}, [], "0 steps", None
