@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,7 +53,7 @@ class Forecast:
 
     schedule: ViewSchedule
     config: AdaptConfig
-    checked: Callable[[int], bool]  # whether the run is checked after a step
+    checks: Sequence[int]  # the steps after which the run is checked, in order
     first_step: int = 0  # steps that an earlier process has done
 
     def left(self, step: int, seconds: float, costs: Costs) -> float:
@@ -62,7 +63,7 @@ class Forecast:
             return math.inf
         a_view = (seconds - costs.seconds()) / (draws[1] - draws[0])
         new_views = max(0, min(self.schedule.views, draws[2]) - len(costs.truths))
-        checks = sum(map(self.checked, range(step + 1, self.config.steps + 1)))
+        checks = len(self.checks) - bisect_right(self.checks, step)
         return (draws[2] - draws[1]) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks)
 
 

@@ -40,7 +40,8 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     step and after each step; its time is not counted, and the run ends if it returns True.
     """
     order, cameras = ViewSchedule(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
-    forecast, began = Forecast(order, config, lambda step: is_checked(step, config), run.step), run.watch.seconds - run.costs.seconds()
+    checks = [step for step in range(1, config.steps + 1) if is_checked(step, config)]
+    forecast, began = Forecast(order, config, checks, run.step), run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
     with bar, interruptible() as interrupted:
         reason = STOPPED if observe(run) is True else reason_to_stop(run.curve, run.watch.seconds, config)
