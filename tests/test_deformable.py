@@ -1,6 +1,7 @@
 """Deformable 3D Gaussians: what it reads, shows, adapts and writes."""
 
 import zipfile
+from dataclasses import replace
 
 import moving
 import numpy as np
@@ -201,10 +202,12 @@ def test_splats_without_the_network_of_their_iteration_are_passed_over(tmp_path)
         load_model(folder, iteration=30_000)
 
 
-def test_the_ply_of_a_moving_scene_alone_is_refused(tmp_path):
-    ply = moving.write_deformable(tmp_path / "m") / "point_cloud/iteration_40000/point_cloud.ply"
-    with pytest.raises(CheckpointError, match="one part of a moving scene"):
-        load_model(ply)
+def test_the_ply_of_a_moving_scene_is_read_with_the_network_of_its_iteration(tmp_path):
+    model = load_model(moving.write_deformable(tmp_path / "m"))
+    again = load_model(model.save(tmp_path / "saved", provenance={}))
+    camera = replace(tiny.cameras(1)[0], time=0.5)
+    assert again.moves
+    assert torch.equal(again.gaussians(camera).means, model.gaussians(camera).means)
 
 
 def without(state, name):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import Effect
-from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
@@ -132,8 +132,6 @@ class MovingModel:
 def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:
     """The canonical splats of a moving scene, and the file of their network. Raises CheckpointError."""
     checkpoint = detect_as(path, (family,), iteration=iteration)
-    if Path(path).is_file():
-        raise CheckpointError(f"{path} is one part of a moving scene, whose network lies beside it; give the model folder that holds both")
     canonical = read_vanilla(checkpoint)
     title = find_family(family).title
     canonical.notes += [f"the network that moves the splats ({title}) is frozen: they adapt as they are before they move", TIMELESS]
