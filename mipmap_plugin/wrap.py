@@ -16,7 +16,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_background
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.models.inria_folder import read_options
+from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.scenes import Scene, model_cameras
 from mipmap_plugin.splatting.filters import USUAL_EPS2D
@@ -56,14 +56,21 @@ def wrap_model(
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
     given = own_cameras(model) if cameras is None else cameras.cameras if isinstance(cameras, Scene) else cameras
     wrapped = Wrapped(model, placed(model, cameras).cameras if isinstance(cameras, Scene) else given, backend, trained, threads)
-    wrapped.loading_s, wrapped.asked = loading_s, asked_for(given, color, screen_filter)
+    wrapped.loading_s, wrapped.asked = loading_s, asked_for(model.folder, given, color, screen_filter)
     return wrapped
 
 
-def asked_for(cameras: Sequence[Camera], background: tuple[float, float, float] | None, screen_filter: str | None) -> dict[str, str]:
-    """What is given beside a checkpoint, as its adaptations record it (`Report.inputs`). `cameras`: before they are placed in the model's frame."""
+def asked_for(
+    folder: Path | None, cameras: Sequence[Camera], background: tuple[float, float, float] | None, screen_filter: str | None
+) -> dict[str, str]:
+    """What is given beside a checkpoint, as its adaptations record it (`Report.inputs`). `cameras`: before they are placed in the model's frame.
+
+    `folder`: of the model; the options of training in its cfg_args say how the base looks, but the hash of the base is that of its splats.
+    """
     color = "" if background is None else " ".join(f"{channel:g}" for channel in background)
-    return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or ""}
+    options = read_options(folder)[0]
+    trained = str(trained_scale(options, None)) if options else ""
+    return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or "", "trained": trained}
 
 
 def _loaded(path: str | Path, backend: str) -> SplatModel:

@@ -238,6 +238,14 @@ def test_other_cameras_background_or_photographs_are_not_finished(tmp_path):
     assert finished(job) is not None
 
 
+def test_other_options_of_the_training_are_not_finished(tmp_path):
+    folder = tiny.folder(tmp_path / "scene", count=30)
+    job = replace(job_of(tmp_path), base=Base(folder))
+    assert run_job(job).status == "done" and finished(job) is not None
+    (folder / "cfg_args").write_text("Namespace(sh_degree=1, white_background=True)")
+    assert finished(job) is None
+
+
 def test_a_job_that_travels_makes_the_same_bytes(tmp_path):
     scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(3), count=30)
     here = job_of(tmp_path, images=scene, scale=2.0, skip_finished=False)

@@ -29,12 +29,12 @@ class Base:
         from mipmap_plugin.scenes import load_scene, model_cameras
         from mipmap_plugin.wrap import asked_for
 
+        folder = detect(self.checkpoint).folder
         if self.cameras is not None:
             cameras = load_scene(self.cameras, read_options(self.checkpoint)[0]).cameras
         else:
-            folder = detect(self.checkpoint).folder
             cameras = tuple(model_cameras(folder, read_options(folder)[0]))
-        return asked_for(cameras, COLORS[self.background], self.screen_filter)
+        return asked_for(folder, cameras, COLORS[self.background], self.screen_filter)
 
     def load(self, threads: int | None = None) -> Wrapped:
         """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
