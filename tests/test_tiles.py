@@ -211,7 +211,7 @@ def test_a_model_folder_is_written_as_one(job, tmp_path):
 def test_a_model_folder_is_written_beside_the_checkpoint(job, capsys):
     """Where the scale in its name looks like a suffix."""
     words = ["adapt", str(job.base.checkpoint), "--scale", "1/2", "--steps", "0", "--views", "given", "--backend", "reference", "--tiles", "2"]
-    assert main(words) == 0
+    assert main([*words, "--cameras", str(job.base.checkpoint.with_name("{name}") / "cameras.json")]) == 0
     assert (job.base.checkpoint.with_name("scene_x0.5") / "point_cloud").is_dir()
 
 

@@ -91,10 +91,10 @@ def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -
     recipe = settings.pop("recipe")
     jobs = []
     for path in checkpoints:
-        own = replace(base, checkpoint=path.absolute(), cameras=_of_scene(base.cameras, path))
+        own = replace(base, checkpoint=path.absolute(), cameras=of_scene(base.cameras, path))
         for scale, viewer in request.targets:
             target = adapted_path(path, request.output, scale, viewer, several=several).absolute()
-            images = _of_scene(request.images, path)
+            images = of_scene(request.images, path)
             jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite, skip))
     _refuse(jobs)
     return shard(jobs, *_part(many.shard))
@@ -112,7 +112,7 @@ def _checkpoints(given: Sequence[Path]) -> list[Path]:
     return checkpoints
 
 
-def _of_scene(path: Path | None, checkpoint: Path) -> Path | None:
+def of_scene(path: Path | None, checkpoint: Path) -> Path | None:
     """A path in which {name} stands for the checkpoint's name."""
     return path and Path(str(path).replace("{name}", checkpoint.resolve().stem)).absolute()
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mipmap_plugin.commands.common import print_facts
-from mipmap_plugin.commands.many import Many, Request, engine
+from mipmap_plugin.commands.many import Many, Request, engine, of_scene
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.errors import SettingsError
@@ -32,7 +33,7 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
     reports = []
     for scale, viewer in request.targets:
         target = adapted_path(given[0], request.output, scale, viewer, several=several).absolute()
-        job = Job(_absolute(base, given[0]), target, scale, viewer, recipe, settings, request.images, request.overwrite)
+        job = Job(_absolute(base, given[0]), target, scale, viewer, recipe, settings, of_scene(request.images, given[0]), request.overwrite)
         if many.skip_existing and (before := finished(job)):
             file, facts = before
             reports.append({"file": str(file), **facts})
@@ -54,5 +55,4 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
 
 
 def _absolute(base: Base, checkpoint: Path) -> Base:
-    cameras = base.cameras and base.cameras.absolute()
-    return Base(checkpoint.absolute(), cameras, base.background, base.backend, base.screen_filter)
+    return replace(base, checkpoint=checkpoint.absolute(), cameras=of_scene(base.cameras, checkpoint))
