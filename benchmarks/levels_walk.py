@@ -39,7 +39,7 @@ from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.manifest import MANIFEST
-from mipmap_plugin.levels.request import Band, LadderRequest
+from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.streamed import CANVAS, distances, progression
 from mipmap_plugin.models.outputs import REPORT
 from mipmap_plugin.scenes.trajectories import jittered
@@ -220,8 +220,7 @@ def main(
     for path in only or BASES:
         base, name = wrap_model(data / "checkpoints" / path, threads=1), Path(path).name
         request = LadderRequest(VIEWER, coarsest=COARSEST)
-        target = base.target(VIEWER)
-        scene = scene_of(base, request, Band.first(request.first_ratio(target), as_it_is=target == base.effects()))
+        scene = scene_of(base, request, request.first_band(base.target(VIEWER), base.effects()))
         walked = walks(scene)
         with tempfile.TemporaryDirectory() as folder:
             shown = mixtures(scene, base, ladders, name, Path(folder))
