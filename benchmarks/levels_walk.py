@@ -186,7 +186,8 @@ def page(results: Sequence[dict[str, Any]]) -> str:
 def section(result: dict[str, Any]) -> str:
     head = ["", "worst, dB", "mean, dB", "first, dB", "x1/2", "x1/4", "last", "flicker, mean", "worst", "splats", "switches", "least likeness, dB"]
     facts = f"{result['chunks']} chunks of at most {result['extent']} world units; levels of {result['counts']} splats, {result['steps']} steps each."
-    return f"## {result['base']} in {result['viewer']}\n\n{facts} {result['note']}\n\n{markdown(head, [row(film) for film in result['films']])}\n"
+    said = f"{facts} {result['note']}".strip()
+    return f"## {result['base']} in {result['viewer']}\n\n{said}\n\n{markdown(head, [row(film) for film in result['films']])}\n"
 
 
 def row(film: dict[str, Any]) -> list[str]:

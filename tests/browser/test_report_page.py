@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -224,7 +225,7 @@ def test_a_ladder_by_distance_is_a_curve_over_distances(open_page: Open, walked_
     assert f"{last['psnr_db']:.2f} dB with the levels ({round(last['splats']):,} splats)" in page.text_content("#levels .readout")
     shown = page.eval_on_selector_all("#levels tbody tr", "rows => rows.map(row => row.cells[1].textContent)")
     ends = [f"{level['distance_from']:.3g}" for level in manifest["levels"][1:]]
-    assert shown == [f"to {ends[0]}", *(f"from {low} to {high}" for low, high in zip(ends, ends[1:], strict=False)), f"from {ends[-1]}"]
+    assert shown == [f"to {ends[0]}", *(f"from {low} to {high}" for low, high in pairwise(ends)), f"from {ends[-1]}"]
 
 
 def test_the_slider_shows_the_level_of_each_zoom(open_page: Open, ladder: Path) -> None:
