@@ -99,7 +99,8 @@ class StartSearch:
         for power, coarsely in self._merges():
             merged = self._candidate(weights, config.merge_to**power, coarsely)
             merged_db = problem.steer(merged)
-            if merged_db >= max(formed_db - config.merging_costs, LEAST_DB if coarsely else -math.inf):
+            least = max(LEAST_DB, base_db - problem.may_lose) if coarsely else -math.inf  # after coarse ones, plain ones are still to come
+            if merged_db >= max(formed_db - config.merging_costs, least):
                 return (merged, "the closed form of merged splats") if merged_db >= base_db - problem.may_lose else (base, problem.name)
         return (formed, "the closed form") if formed_db >= base_db else (base, problem.name)
 
