@@ -104,10 +104,10 @@ def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
             axes.axvline(change["zoom"], color="tab:blue", linewidth=0.6, linestyle=":")
         axes.set_xscale("log", base=2)
         axes.invert_xaxis()
-        against = "supersampled base (dashed: photographs)" if _ceiling(result) else "supersampled base"
-        axes.set(title=f"{result['base']} in {result['viewer']}", xlabel="zoom (dotted: switches)", ylabel=f"dB against the {against}")
+        axes.set(title=f"{result['base']} in {result['viewer']}", xlabel="zoom (dotted: switches)", ylabel="dB against the supersampled base")
         axes.grid(alpha=0.25)
-        axes.legend(fontsize=8, frameon=False)
+    lines = {line.get_label(): line for axes in plots for line in axes.get_lines() if not line.get_label().startswith("_")}
+    figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=len(lines), fontsize=8, frameon=False)
     with new_file(path, overwrite=True) as temporary:
         figure.savefig(temporary, format="png", dpi=90)
 
