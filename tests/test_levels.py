@@ -109,12 +109,12 @@ def test_splats_that_share_no_pixel_are_merged_where_enough_is_left_to_see(monke
     assert count(-math.inf) == 2 < count(math.inf)
 
 
-@pytest.mark.parametrize(("coarse_db", "found"), [(30.0, ("merged", 0.1, True)), (26.0, ("merged", 0.1, False)), (20.0, ("merged", 0.1, False))])
-def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypatch, coarse_db, found):
-    """The finer level has 38 dB and may lose 9; with 26 dB, a coarse candidate is worse, though not by 9 dB than the closed form."""
+@pytest.mark.parametrize(("coarse_db", "base_db", "coarsely"), [(30.0, 32.0, True), (30.0, 34.0, False), (26.0, 20.0, False), (20.0, 20.0, False)])
+def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypatch, coarse_db, base_db, coarsely):
+    """The finer level has 38 dB and may lose 9, as the closed form may; the base itself may lose 3."""
 
     def steer(model):
-        return {"base": 38.0, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)
+        return {"finer": 38.0, "base": base_db, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)
 
     def candidate(_, weights, fraction, coarsely=False):
         return ("formed",) if fraction == 1 else ("merged", fraction, coarsely)
@@ -125,13 +125,13 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
 
     config = SimpleNamespace(most_splats=None, closed_form=True, merge_to=0.1, merging_costs=9.0, returns="best")
     problem = SimpleNamespace(
-        config=config, base=lambda: Base(["base"]), steer=steer, coarsely=True, may_lose=9.0, name="the finer level", phase=lambda _: nullcontext(),
-        views=[], scale=0.5, base_effects=None, target=None, has_blend_weights=False,
+        base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, steer=steer, may_lose=9.0, name="the finer level", views=[],
+        scale=0.5, phase=lambda _: nullcontext(), base_effects=None, target=None, has_blend_weights=False,
     )  # fmt: skip
     monkeypatch.setattr(candidates, "filter_suffices", lambda *_: False)
     monkeypatch.setattr(candidates.StartSearch, "_base_weights", lambda *_: None)
     monkeypatch.setattr(candidates.StartSearch, "_candidate", candidate)
-    assert candidates.StartSearch(problem).best()[0] == found
+    assert candidates.StartSearch(problem).best()[0] == ("merged", 0.1, coarsely)
 
 
 def test_a_start_has_to_be_finer():
