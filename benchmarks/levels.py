@@ -4,8 +4,9 @@
     python benchmarks/levels.py DATA --ladders DIR --only bases/lego_200 --viewer spark
 
 Ladders that are not in DIR yet are made there (minutes each). The rival is splat-transform's --decimate, to the splats of each of our levels, in the
-same file format; its levels are shown at the same zooms. It is left out where splat-transform is not found. Writes levels/<base>_<viewer>.json
-and .png, a strip of frames, and levels.md and levels.png from all in that folder. --no-measure makes the strips only.
+same file format; its levels are shown at the same zooms. It is left out where splat-transform is not found. Where there are test photographs, frames
+are compared with those too. Writes levels/<base>_<viewer>.json and .png, a strip of frames, and levels.md and levels.png from all in that folder.
+--no-measure makes the strips only.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import math
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -24,6 +25,7 @@ from statistics import fmean
 import torch
 import tyro
 from levels_page import draw, page, strip
+from levels_photographs import against, photograph
 from torch import Tensor
 from tqdm import tqdm
 
@@ -32,7 +34,7 @@ from mipmap_plugin.adaptation.adapted import render_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.evaluation.protocols import test_views
+from mipmap_plugin.evaluation.protocols import TestView, test_views
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.splat_transform import TOOL, find_tool
 from mipmap_plugin.levels.manifest import MANIFEST
@@ -67,6 +69,7 @@ class Frame:
     zoom: float
     psnr_db: float  # mean over the views, against the supersampled base
     flicker: float | None  # 8-bit levels: RMS of the change from the frame before, minus the same change of the truth; None for the first
+    photo_db: float | None = None  # mean over the views, against their photographs; None where there are none
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,10 @@ class Change:
 class Dolly:
     """The frames' cameras and their truths."""
 
-    def __init__(self, base: Wrapped, views: Sequence[Camera]) -> None:
+    def __init__(self, base: Wrapped, views: Sequence[Camera], photographs: Sequence[TestView] = ()) -> None:
+        """`photographs`: of all the views, in their order, or none."""
         self.base, self.views = base, views
+        self._photographs = dict(zip(views, photographs, strict=bool(photographs)))
         self.zooms = [COARSEST ** (number / (FRAMES - 1)) for number in range(FRAMES)]
 
     def truth(self, view: Camera, zoom: float, like: float | None = None) -> Tensor:
@@ -106,6 +111,16 @@ class Dolly:
 
     def truths(self) -> dict[Camera, list[Tensor]]:
         return {view: [self.truth(view, zoom) for zoom in self.zooms] for view in self.views}
+
+    def photo_db(self, images: Mapping[Camera, Sequence[Tensor]]) -> list[float | None]:
+        """PSNR (dB) of each frame against the photographs, mean over the views, of the frames of each view."""
+        if not self._photographs:
+            return [None] * len(self.zooms)
+        rows = []
+        for view, shot in self._photographs.items():
+            wanted = [photograph(shot, at(view, zoom)) for zoom in self.zooms]
+            rows.append([against(image, truth, shot.camera, zoom) for image, truth, zoom in zip(images[view], wanted, self.zooms, strict=True)])
+        return [fmean(column) for column in zip(*rows, strict=True)]
 
 
 def at(view: Camera, zoom: float, like: float | None = None) -> Camera:
@@ -130,15 +145,16 @@ class Show:
 
 def film(dolly: Dolly, show: Show, viewer: str, truths: dict[Camera, list[Tensor]]) -> Film:
     """Measure every frame."""
-    quality, flicker = [], []
+    quality, flicker, shown = [], [], {}
     for view in dolly.views:
-        images = [drawn(dolly.base, show.file(zoom), viewer, at(view, zoom)) for zoom in tqdm(dolly.zooms, desc=show.name, disable=None)]
+        zooms = tqdm(dolly.zooms, desc=show.name, disable=None)
+        shown[view] = images = [drawn(dolly.base, show.file(zoom), viewer, at(view, zoom)) for zoom in zooms]
         quality.append([psnr(image, truth) for image, truth in zip(images, truths[view], strict=True)])
         wrong = [image - truth for image, truth in zip(images, truths[view], strict=True)]
         flicker.append([255 * float((middle(before, after) - after).square().mean().sqrt()) for before, after in pairwise(wrong)])
     means = [fmean(each) for each in zip(*quality, strict=True)]
     changes = [None, *(fmean(each) for each in zip(*flicker, strict=True))]
-    frames = [Frame(*each) for each in zip(dolly.zooms, means, changes, strict=True)]
+    frames = [Frame(*each) for each in zip(dolly.zooms, means, changes, dolly.photo_db(shown), strict=True)]
     return Film(show.name, [len(file.parameters()["means"]) for file in show.files], show.megabytes, frames)
 
 
@@ -174,11 +190,12 @@ def changes(dolly: Dolly, ours: Show, viewer: str) -> list[Change]:
     return found
 
 
-def views_of(base: Wrapped, images: Path) -> list[Camera]:
-    """The cameras of the dolly: test views where the images lie there, else random ones between the base's own."""
+def dolly_of(base: Wrapped, images: Path) -> Dolly:
+    """The dolly, seen from test views with photographs where the images lie there, else from random views between the base's own."""
     if images.is_dir():
-        return [view.camera for view in test_views(base.place(load_scene(images)), base.cameras[0], base.background)[VIEWS]]
-    return jittered(base.views(), RANDOM_VIEWS, torch.Generator().manual_seed(SEED))
+        shots = test_views(base.place(load_scene(images)), base.cameras[0], base.background)[VIEWS]
+        return Dolly(base, [shot.camera for shot in shots], shots)
+    return Dolly(base, jittered(base.views(), RANDOM_VIEWS, torch.Generator().manual_seed(SEED)))
 
 
 def ladder_of(base: Wrapped, viewer: str, folder: Path) -> Path:
@@ -236,7 +253,7 @@ def main(
     (output / "levels").mkdir(parents=True, exist_ok=True)
     for path in only or BASES:
         base, name = wrap_model(data / "checkpoints" / path, threads=1), Path(path).name
-        dolly = Dolly(base, views_of(base, data / "images" / name.split("_")[0]))
+        dolly = dolly_of(base, data / "images" / name.split("_")[0])
         truths = dolly.truths() if measure else {}
         for each in viewer or VIEWERS:
             ladder = ladder_of(base, each, ladders / f"{name}_{each}")
@@ -250,7 +267,7 @@ def main(
             facts = {
                 "base": name, "viewer": each, "films": [asdict(one) for one in films],
                 "changes": [asdict(change) for change in changes(dolly, shown[0], each)],
-                "seconds": [level["seconds"] for level in manifest["levels"]],
+                "seconds": [level["seconds"] for level in manifest["levels"]], "supersampled_photo_db": dolly.photo_db(truths),
             }  # fmt: skip
             write_json(output / "levels" / f"{name}_{each}.json", facts, overwrite=True)
     results = [json.loads(file.read_text()) for file in sorted((output / "levels").glob("*.json"), reverse=True)]

@@ -18,6 +18,7 @@ INTRO = """# A dolly over a ladder of levels
 
 Made by `python benchmarks/levels.py DATA --ladders DIR`: a camera that zooms out continuously from x1 to x1/16, drawn by our renderer as the viewer
 draws; two views that nothing was adapted to, of the test set or else random, 49 frames each; dB against the supersampled base of each frame.
+Where there are test photographs, frames are also compared with those, shrunk by Pillow's bicubic; *supersampled base* is then what can be reached.
 *levels*: ours. *base*: alone. *one file*: the default recipe at x1/4. *splat-transform*: its `--decimate` to the splats of each of our levels,
 in the same format, at the same zooms. *Flicker*: RMS of the change between neighboring frames that the truth does not have, in 8-bit levels; *worst*
 is of one pair of frames.
@@ -37,15 +38,20 @@ def page(results: Sequence[dict[str, Any]]) -> str:
 
 
 def section(result: dict[str, Any]) -> str:
-    films, seconds = result["films"], result["seconds"]
+    films, seconds, ceiling = result["films"], result["seconds"], _ceiling(result)
     head = ["", "worst frame, dB", "mean, dB", "least lead of ours, dB", "flicker, mean", "flicker, worst", "MB", "splats, thousands"]
+    rows = [row(film, films[0]) for film in films]
+    if ceiling:
+        head += ["photographs: worst, dB", "mean, dB"]
+        rows = [cells + extremes(photo_dbs(film)) for cells, film in zip(rows, films, strict=True)]
+        rows.append(["supersampled base", *["–"] * (len(head) - 3), *extremes(ceiling)])
     switches = [
         [f"x{each['zoom']:.3f}", f"{each['step_db']:+.2f}", *(f"{each[key]:.1f}" for key in ("likeness_db", "one_percent_db"))]
         for each in result["changes"]
     ]
     table = markdown(["switch at", "dB, finer - coarser", "PSNR of both levels, dB", "PSNR of a 1 % zoom, dB"], switches)
     spent = f"{sum(seconds):.0f} s for all levels ({', '.join(f'{each:.0f}' for each in seconds)}), one thread of a busy machine"
-    return f"## {result['base']} in {result['viewer']}\n\n{markdown(head, [row(film, films[0]) for film in films])}\n\n{spent}\n\n{table}\n"
+    return f"## {result['base']} in {result['viewer']}\n\n{markdown(head, rows)}\n\n{spent}\n\n{table}\n"
 
 
 def row(film: dict[str, Any], ours: dict[str, Any]) -> list[str]:
@@ -54,8 +60,22 @@ def row(film: dict[str, Any], ours: dict[str, Any]) -> list[str]:
     leads = [our["psnr_db"] - its["psnr_db"] for our, its in zip(ours["frames"], film["frames"], strict=True) if our["zoom"] < 0.5]
     lead = "–" if film is ours else f"{min(leads):.1f}"
     splats = ", ".join(f"{count / 1000:.1f}" for count in film["splats"])
-    numbers = [f"{min(quality):.1f}", f"{fmean(quality):.1f}", lead, f"{fmean(flicker):.2f}", f"{max(flicker):.2f}", f"{film['megabytes']:.1f}"]
-    return [film["name"], *numbers, splats]
+    return [film["name"], *extremes(quality), lead, f"{fmean(flicker):.2f}", f"{max(flicker):.2f}", f"{film['megabytes']:.1f}", splats]
+
+
+def extremes(dbs: Sequence[float]) -> list[str]:
+    """The worst and the mean."""
+    return [f"{min(dbs):.1f}", f"{fmean(dbs):.1f}"]
+
+
+def photo_dbs(film: dict[str, Any]) -> list[float]:
+    """dB of each frame against the photographs."""
+    return [frame["photo_db"] for frame in film["frames"]]
+
+
+def _ceiling(result: dict[str, Any]) -> list[float]:
+    """dB of the supersampled base against the photographs of each frame; none where none are known."""
+    return [each for each in result.get("supersampled_photo_db", []) if each is not None]
 
 
 def strip(path: Path, rows: Mapping[str, Sequence[Tensor]], zooms: Sequence[float]) -> None:
@@ -79,16 +99,26 @@ def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
     for axes in plots[len(results) :]:
         axes.set_axis_off()
     for axes, result in zip(plots, results, strict=False):
-        for film in result["films"]:
-            zooms, quality = ([frame[key] for frame in film["frames"]] for key in ("zoom", "psnr_db"))
-            width = 2.4 if film["name"] == "levels" else 1.3
-            axes.plot(zooms, quality, label=film["name"], color=COLORS.get(film["name"], "tab:green"), linewidth=width)
+        _lines(axes, result)
         for change in result["changes"]:
             axes.axvline(change["zoom"], color="tab:blue", linewidth=0.6, linestyle=":")
         axes.set_xscale("log", base=2)
         axes.invert_xaxis()
         axes.set(title=f"{result['base']} in {result['viewer']}", xlabel="zoom (dotted: switches)", ylabel="dB against the supersampled base")
         axes.grid(alpha=0.25)
-        axes.legend(fontsize=8, frameon=False)
+    lines = {line.get_label(): line for axes in plots for line in axes.get_lines() if not line.get_label().startswith("_")}
+    figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=len(lines), fontsize=8, frameon=False)
     with new_file(path, overwrite=True) as temporary:
         figure.savefig(temporary, format="png", dpi=90)
+
+
+def _lines(axes: Any, result: dict[str, Any]) -> None:
+    """dB over zoom of all films, and, dashed, of ours and of what can be reached against photographs."""
+    for film in result["films"]:
+        zooms, quality = ([frame[key] for frame in film["frames"]] for key in ("zoom", "psnr_db"))
+        width = 2.4 if film["name"] == "levels" else 1.3
+        axes.plot(zooms, quality, label=film["name"], color=COLORS.get(film["name"], "tab:green"), linewidth=width)
+    if ceiling := _ceiling(result):
+        zooms = [frame["zoom"] for frame in result["films"][0]["frames"]]
+        axes.plot(zooms, photo_dbs(result["films"][0]), "--", label="levels against photographs", color=COLORS["levels"], linewidth=1.3)
+        axes.plot(zooms, ceiling, "--", label="supersampled base against photographs", color="black", linewidth=1)

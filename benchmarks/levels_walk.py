@@ -39,7 +39,7 @@ from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.manifest import MANIFEST
-from mipmap_plugin.levels.request import Band, LadderRequest
+from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.streamed import CANVAS, distances, progression
 from mipmap_plugin.models.outputs import REPORT
 from mipmap_plugin.scenes.trajectories import jittered
@@ -186,7 +186,8 @@ def page(results: Sequence[dict[str, Any]]) -> str:
 def section(result: dict[str, Any]) -> str:
     head = ["", "worst, dB", "mean, dB", "first, dB", "x1/2", "x1/4", "last", "flicker, mean", "worst", "splats", "switches", "least likeness, dB"]
     facts = f"{result['chunks']} chunks of at most {result['extent']} world units; levels of {result['counts']} splats, {result['steps']} steps each."
-    return f"## {result['base']} in {result['viewer']}\n\n{facts} {result['note']}\n\n{markdown(head, [row(film) for film in result['films']])}\n"
+    said = f"{facts} {result['note']}".strip()
+    return f"## {result['base']} in {result['viewer']}\n\n{said}\n\n{markdown(head, [row(film) for film in result['films']])}\n"
 
 
 def row(film: dict[str, Any]) -> list[str]:
@@ -220,8 +221,7 @@ def main(
     for path in only or BASES:
         base, name = wrap_model(data / "checkpoints" / path, threads=1), Path(path).name
         request = LadderRequest(VIEWER, coarsest=COARSEST)
-        target = base.target(VIEWER)
-        scene = scene_of(base, request, Band.first(request.first_ratio(target), as_it_is=target == base.effects()))
+        scene = scene_of(base, request, request.first_band(base.target(VIEWER), base.effects()))
         walked = walks(scene)
         with tempfile.TemporaryDirectory() as folder:
             shown = mixtures(scene, base, ladders, name, Path(folder))

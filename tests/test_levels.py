@@ -2,8 +2,10 @@
 
 import json
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import anchor_checkpoints
 import moving
@@ -105,6 +107,31 @@ def test_splats_that_share_no_pixel_are_merged_where_enough_is_left_to_see(monke
 
     base = wrapped(40)
     assert count(-math.inf) == 2 < count(math.inf)
+
+
+@pytest.mark.parametrize(("coarse_db", "base_db", "coarsely"), [(30.0, 32.0, True), (30.0, 34.0, False), (26.0, 20.0, False), (20.0, 20.0, False)])
+def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypatch, coarse_db, base_db, coarsely):
+    """The finer level has 38 dB and may lose 9, as the closed form may; the base itself may lose 3."""
+
+    def steer(model):
+        return {"finer": 38.0, "base": base_db, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)
+
+    def candidate(_, weights, fraction, coarsely=False):
+        return ("formed",) if fraction == 1 else ("merged", fraction, coarsely)
+
+    class Base(tuple):
+        def parameters(self):
+            return {"means": torch.zeros(100, 3)}
+
+    config = SimpleNamespace(most_splats=None, closed_form=True, merge_to=0.1, merging_costs=9.0, returns="best")
+    problem = SimpleNamespace(
+        base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, steer=steer, may_lose=9.0, name="the finer level", views=[],
+        scale=0.5, phase=lambda _: nullcontext(), base_effects=None, target=None, has_blend_weights=False,
+    )  # fmt: skip
+    monkeypatch.setattr(candidates, "filter_suffices", lambda *_: False)
+    monkeypatch.setattr(candidates.StartSearch, "_base_weights", lambda *_: None)
+    monkeypatch.setattr(candidates.StartSearch, "_candidate", candidate)
+    assert candidates.StartSearch(problem).best()[0] == ("merged", 0.1, coarsely)
 
 
 def test_a_start_has_to_be_finer():

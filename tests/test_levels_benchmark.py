@@ -13,9 +13,12 @@ sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules im
 from levels import Dolly, Show, at, changes, film, middle
 from levels_counts import Row
 from levels_counts import page as page_of_counts
-from levels_page import HEIGHT, WORDS, page, strip
+from levels_page import HEIGHT, WORDS, draw, page, strip
+from levels_photographs import against, photograph
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.evaluation.protocols import TestView as Shot
 
 
 @pytest.fixture
@@ -49,6 +52,48 @@ def test_the_base_at_its_own_scale_is_the_truth_and_does_not_flicker(dolly):
     assert [frame.zoom for frame in measured.frames] == pytest.approx([1, 1 / 4, 1 / 16])
 
 
+@pytest.fixture
+def shot():
+    """A test view of 16 x 12 px, and a photograph of four times its size."""
+    camera = tiny.cameras(1, width=16, height=12)[0]
+    return Shot(camera, (torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(1)) * 255).round() / 255, Path("a.png"))
+
+
+def test_a_photograph_of_a_frame_of_its_size_is_that_of_the_protocol(shot):
+    for zoom in (1.0, 0.5):
+        assert torch.equal(photograph(shot, at(shot.camera, zoom)), shot.truth(zoom, PROTOCOLS["P3"]))
+
+
+def test_a_photograph_is_shrunk_by_exactly_the_zoom(shot):
+    """A ramp stays a ramp, whose color says where each pixel of a frame lies in the photograph; beyond that its edge goes on."""
+    ramp = torch.linspace(0, 252 / 255, 64).expand(48, 64)[..., None].expand(-1, -1, 3)
+    shot = Shot(shot.camera, ramp, Path("a.png"))
+    frame = at(shot.camera, 0.71)
+    places = ((torch.arange(frame.width) + 0.5 - frame.width / 2) / 0.71 + 8) * 4 - 0.5
+    found = photograph(shot, frame)[frame.height // 2, 1:-1, 0] * 63 * 255 / 252
+    torch.testing.assert_close(found, places[1:-1], atol=0.3, rtol=0)
+
+
+def test_only_pixels_within_the_photograph_are_compared(shot):
+    frame = at(shot.camera, 0.71)
+    truth = photograph(shot, frame)
+    wrong = torch.zeros_like(truth)
+    wrong[1:-1, 1:-1] = truth[1:-1, 1:-1]
+    assert against(wrong, truth, shot.camera, 0.71) > 100 > against(wrong, truth, shot.camera, frame.width / 16)
+
+
+def test_a_dolly_with_photographs_is_compared_with_them(dolly, monkeypatch):
+    monkeypatch.setattr("levels.COARSEST", 1 / 4)
+    dolly = Dolly(dolly.base, dolly.views)
+    photographs = [Shot(view, dolly.truth(view, 1.0), Path("a.png")) for view in dolly.views]
+    with_them = Dolly(dolly.base, dolly.views, photographs)
+    show = Show("base", [dolly.base.model], [], 1.0)
+    measured, ceiling = film(with_them, show, "classic", with_them.truths()), with_them.photo_db(with_them.truths())
+    assert min(ceiling) > 40 and measured.frames[0].photo_db > 45
+    assert measured.frames[-1].photo_db < ceiling[-1] - 3
+    assert film(dolly, show, "classic", dolly.truths()).frames[0].photo_db is None
+
+
 def test_files_change_at_their_switches(dolly):
     coarser = tiny.model(5, degree=0)
     show = Show("two", [dolly.base.model, coarser], [0.5], 1.0)
@@ -66,6 +111,19 @@ def test_the_page_compares_films():
     assert "## lego in spark" in text and "5 s for all levels (3, 2)" in text
     cells = [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line.startswith("| base")]
     assert cells[0][1:5] == ["base", "25.0", "27.0", "9.0"]
+
+
+def test_the_page_says_how_far_photographs_are_reached(tmp_path):
+    """Results of before they counted have no such columns."""
+    frames = [{"zoom": zoom, "psnr_db": 36.0, "flicker": 1.0, "photo_db": photo} for zoom, photo in ((1, 30.0), (0.25, 28.0))]
+    film = {"name": "levels", "splats": [1000], "megabytes": 1.0, "frames": frames}
+    result = {"base": "lego", "viewer": "spark", "films": [film], "changes": [], "seconds": [3.0], "supersampled_photo_db": [31.0, 33.0]}
+    old = {key: value for key, value in result.items() if key != "supersampled_photo_db"}
+    for text, dbs in ((page([result]), [["28.0", "29.0"], ["31.0", "32.0"]]), (page([old]), [])):
+        rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith(("| levels", "| supersampled"))]
+        assert [cells[-2:] for cells in rows if len(cells) == 10] == dbs
+    draw(tmp_path / "plot.png", [result, old])
+    assert (tmp_path / "plot.png").stat().st_size > 0
 
 
 def test_the_lead_of_a_count_is_over_the_better_rival():

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -334,9 +335,38 @@ def test_impossible_requests_are_refused(options, reason):
         wrapped(near=20, far=20).levels("classic", **options)
 
 
-def test_the_command_makes_levels_by_distance(tmp_path, capsys):
+@pytest.fixture
+def command(tmp_path):
+    """Words of a command that makes a small ladder by distance in tmp_path/out."""
     VanillaModel.from_gaussians(with_background(60, 40), tiny.model(1).trained).save(tmp_path / "base", provenance={})
     write_cameras(tmp_path / "base" / "cameras.json", tiny.cameras(3, width=48, height=36))
-    command = ["levels", str(tmp_path / "base"), "--viewer", "playcanvas", "--output", str(tmp_path / "out"), "--coarsest", "1/4"]
-    assert cli.main([*command, "--recipe", "instant", "--backend", "cpu", "--threads", "1"]) == 0
+    words = ["levels", str(tmp_path / "base"), "--viewer", "playcanvas", "--output", str(tmp_path / "out"), "--by", "distance"]
+    return [*words, "--recipe", "instant", "--backend", "cpu", "--threads", "1"]
+
+
+def test_the_command_makes_levels_by_distance(tmp_path, capsys, command):
+    assert cli.main([*command, "--coarsest", "1/4"]) == 0
     assert "lodBaseDistance" in capsys.readouterr().out and (tmp_path / "out" / "level_1.ply").is_file()
+
+
+@pytest.mark.parametrize("by", ["distance", "zoom"])
+def test_a_ladder_that_ends_within_its_first_band_has_one_level(tmp_path, capsys, command, by):
+    assert cli.main([*command, "--by", by, "--coarsest", "1", "--report", "--json"]) == 0
+    manifest = json.loads(capsys.readouterr().out)
+    assert [level["file"] for level in manifest["levels"]] == ["level_0.ply"] and manifest["switches"] == []
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_the_page_of_walks_has_the_figures_of_their_manifest(tmp_path, capsys, command):
+    assert cli.main([*command, "--coarsest", "1/4", "--report"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"page: {tmp_path / 'out' / 'report.html'}"
+    text, manifest = (tmp_path / "out" / "report.html").read_text(), json.loads((tmp_path / "out" / MANIFEST).read_text())
+    record = json.loads(re.search(r'<script type="application/json" id="record">(.*?)</script>', text, re.DOTALL)[1])
+    assert record["ladder"] == manifest and f"on walks backwards at worst {manifest['worst_db']:.1f} dB" in record["lead"]
+    scales = [zoom["scale"] for zoom in record["zooms"]]
+    assert scales == sorted(scales) and scales[-1] == 1 and scales[0] < 1 / 2 and len(scales) > 3
+    curve = {round(point["psnr_db"], 6): point for point in manifest["curve"]}
+    for zoom in record["zooms"]:
+        base, levels, truth = zoom["pictures"]
+        assert [base["role"], levels["role"], truth["role"]] == ["base", "adapted", "truth"]
+        assert curve[round(levels["mean"]["psnr_db"], 6)]["base_db"] == pytest.approx(base["mean"]["psnr_db"])

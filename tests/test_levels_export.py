@@ -182,6 +182,14 @@ def test_a_failed_conversion_leaves_nothing(ladder, tool):
     assert not (ladder / "streamed").exists()
 
 
+@pytest.mark.parametrize("by", ["zoom", "distance"])
+def test_streamed_sog_of_one_level_is_refused_before_any_work(tmp_path, tool, capsys, monkeypatch, by):
+    monkeypatch.setattr("mipmap_plugin.levels.ladder.make_levels", None)
+    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "0.9"]
+    assert cli.main([*words, "--by", by, "--streamed-sog"]) == 2
+    assert "a single level" in capsys.readouterr().err and not (tmp_path / "ladder").exists()
+
+
 def test_without_splat_transform_the_command_says_so_before_any_work(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PATH", "")
     base = tiny.folder(tmp_path / "base")

@@ -37,9 +37,7 @@ class Exports:
 
     def write(self, ladder: Path, contents: ZoomContents | DistanceContents) -> list[Path]:
         """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""
-        from mipmap_plugin.levels.contents import Contents
-
-        page = [write_levels_page(ladder, contents, self.title)] if self.title is not None and isinstance(contents, Contents) else []
+        page = [write_levels_page(ladder, contents, self.title)] if self.title is not None else []
         return self._for_viewers(ladder) + page
 
     def _for_viewers(self, ladder: Path) -> list[Path]:
@@ -50,15 +48,16 @@ class Exports:
 
 
 def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
-    """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once."""
-    from mipmap_plugin.levels.distance.ladder import by_distance
+    """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once, but for
+    Streamed SOG of a ladder that comes out as a single level because that has few enough splats."""
     from mipmap_plugin.levels.ladder import make_levels
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
+    from mipmap_plugin.levels.streamed import SINGLE_LEVEL
     from mipmap_plugin.wrap import state_path
 
     refuse_ladder(output, wrapped, overwrite=overwrite)
-    if exports.title is not None and by_distance(wrapped, request):
-        raise SettingsError("the page shows levels by zoom, and these are by distance; leave out --report, or add --by zoom")
+    if exports.streamed_sog and request.first_band(wrapped.target(request.viewer), wrapped.effects()).reaches(request.coarsest):
+        raise SettingsError(SINGLE_LEVEL)
     ladder = make_levels(wrapped, request, resume=state_path(output))
     folder = ladder.save(output, overwrite=overwrite)
     return read_manifest(folder), exports.write(folder, ladder.contents)

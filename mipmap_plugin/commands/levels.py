@@ -59,7 +59,7 @@ def levels(
         backend: Name of a backend; auto chooses the fastest one that can serve the request.
         threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
         seed: Seed of everything random.
-        report: Also write report.html into the folder: dB over zoom with the switches, and pictures at each.
+        report: Also write report.html into the folder: dB over zoom with the switches and pictures at each, or by distance dB and pictures of walks.
         overwrite: Replace a ladder that exists.
         json: Print levels.json.
     """

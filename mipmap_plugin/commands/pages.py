@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mipmap_plugin.adaptation.adapted import Adapted
     from mipmap_plugin.evaluation.tradeoff.front import Tradeoff
     from mipmap_plugin.levels.contents import Contents
+    from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
     from mipmap_plugin.pages.gallery import Gallery
     from mipmap_plugin.wrap import Wrapped
 
@@ -99,11 +100,14 @@ def write_tradeoff_page(page: Path | None, checkpoint: Path, base: Wrapped, trad
     return write_page(page, tradeoff_page(title, base, facts(tradeoffs, complete=True), (this_command(),)), overwrite)
 
 
-def write_levels_page(folder: Path, ladder: Contents, title: str) -> Path:
+def write_levels_page(folder: Path, ladder: Contents | DistanceContents, title: str) -> Path:
     """Write the page of a ladder into its folder."""
+    from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
     from mipmap_plugin.levels.manifest import read_manifest
     from mipmap_plugin.pages.html import write_page
     from mipmap_plugin.pages.levels import levels_page
+    from mipmap_plugin.pages.walks import walks_page
 
-    page = levels_page(f"{title}: levels", ladder, read_manifest(folder), (this_command(),))
+    name, manifest, commands = f"{title}: levels", read_manifest(folder), (this_command(),)
+    page = walks_page(name, ladder, manifest, commands) if isinstance(ladder, DistanceContents) else levels_page(name, ladder, manifest, commands)
     return write_page(folder / LEVELS_PAGE, page, overwrite=True)

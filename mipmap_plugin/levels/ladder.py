@@ -17,7 +17,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.contents import Contents, CurvePoint, Level, Switch
 from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, make_levels_by_distance
 from mipmap_plugin.levels.manifest import write_ladder
-from mipmap_plugin.levels.request import FINEST_RATIO, Band, LadderRequest
+from mipmap_plugin.levels.request import FINEST_RATIO, SAME, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.levels.switching import switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
@@ -27,9 +27,6 @@ from mipmap_plugin.wrap import Wrapped
 
 # Two neighboring zooms of the curve of dB are at most this factor apart.
 CURVE_STEP = 2**0.25
-
-# Rounding: scales and ratios within this factor are the same.
-SAME = 1 + 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +57,12 @@ def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None
         raise SettingsError(f"{base.model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
     if by_distance(base, request):
         return make_levels_by_distance(base, request, resume)
-    target = base.target(request.viewer)
+    band = request.first_band(base.target(request.viewer), base.effects())
     store = LevelStore(None if resume is None else Path(resume), base, request)
     with announced("rendering the base"):
         yardstick = Yardstick(base, request.seed)
     work = _Work(base, request, store, yardstick)
-    levels, ratio = [work.first(request.first_ratio(target), as_it_is=target == base.effects())], request.first_ratio(target)
+    levels, ratio = [work.first(band)], band.ratio
     while not work.ends(levels[-1]):
         level, ratio = work.next(levels, ratio)
         levels.append(level)
@@ -85,9 +82,9 @@ class _Work:
     store: LevelStore
     yardstick: Yardstick
 
-    def first(self, ratio: float, *, as_it_is: bool) -> Level:
+    def first(self, band: Band) -> Level:
         """x1: the base, converted to the viewer unless that draws it as its training did."""
-        band = Band.first(ratio, as_it_is=as_it_is)
+        as_it_is = self.base.target(self.request.viewer) == self.base.effects()
         return self._made("level_0", band, {} if as_it_is else band.settings())
 
     def next(self, levels: Sequence[Level], ratio: float) -> tuple[Level, float]:
@@ -106,7 +103,7 @@ class _Work:
     def ends(self, last: Level) -> bool:
         """Whether the ladder needs no further level."""
         few = self.request.until_splats is not None and last.splats <= self.request.until_splats
-        return few or last.band.low <= self.request.coarsest * SAME
+        return few or last.band.reaches(self.request.coarsest)
 
     def _made(self, name: str, band: Band, settings: dict[str, object]) -> Level:
         request = self.request

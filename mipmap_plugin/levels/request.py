@@ -20,6 +20,9 @@ WIDE, NARROW, DENSE_BELOW = 2**0.8, 2**0.5, 0.5
 # px²: up to this dilation the wide ratio suits viewers without compensation too.
 SMALL_DILATION = 0.1
 
+# Rounding: scales within this factor are the same.
+SAME = 1 + 1e-6
+
 # The finest ratio that is tried for a bound on the quality.
 FINEST_RATIO = 2**0.25
 
@@ -87,6 +90,10 @@ class LadderRequest:
             return self.ratio
         return WIDE if target.screen_filter in COMPENSATED or target.eps2d <= SMALL_DILATION else NARROW
 
+    def first_band(self, target: Effects, trained: Effects) -> Band:
+        """The band of x1, for a viewer that draws as `target` a base that was trained to be drawn as `trained`."""
+        return Band.first(self.first_ratio(target), as_it_is=target == trained)
+
     def next_ratio(self, shown_down_to: float, ratio: float) -> float:
         """The ratio below a level that is shown down to this zoom, after levels of the given ratio."""
         return min(ratio, NARROW) if self.ratio is None and shown_down_to < DENSE_BELOW else ratio
@@ -118,6 +125,10 @@ class Band:
     def first(cls, ratio: float, *, as_it_is: bool) -> Band:
         """The band of x1: up to x1 only, since nothing finer is known. `as_it_is`: of a base that the viewer draws as its training did."""
         return cls(1.0, BASE_REACH if as_it_is else ratio**-0.5, 1.0, ratio)
+
+    def reaches(self, coarsest: float) -> bool:
+        """Whether no coarser level is needed."""
+        return self.low <= coarsest * SAME
 
     def next(self, ratio: float, coarsest: float) -> Band:
         """The band below this one; its scale is at least `coarsest`."""

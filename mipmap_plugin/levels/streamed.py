@@ -23,6 +23,8 @@ from mipmap_plugin.levels.manifest import read_manifest
 
 STREAMED, META, SETTINGS = "streamed", "lod-meta.json", "playcanvas.json"
 
+SINGLE_LEVEL = "this ladder has a single level, which needs no streaming; give a smaller --coarsest"
+
 # px: the shorter side of the canvas that distances are computed for.
 CANVAS = 1080
 
@@ -94,7 +96,7 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
     manifest = read_manifest(folder)
     rising = distances(manifest, canvas)
     if not rising:
-        raise SettingsError("this ladder has a single level, which needs no streaming; give a smaller --coarsest")
+        raise SettingsError(SINGLE_LEVEL)
     with new_folder(folder / STREAMED, overwrite) as temporary:
         made = temporary / META
         extent = manifest.get("chunk_extent", int(EXTENT * rising[0]))

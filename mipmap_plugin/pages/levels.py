@@ -30,7 +30,8 @@ def levels_page(title: str, ladder: Contents, manifest: dict[str, Any], commands
     scales = [level.band.scale for level in ladder.levels if not any(math.isclose(level.band.scale, zoom, rel_tol=SAME) for zoom in switches)]
     zooms = [_zoom(ladder, yardstick, scale) for scale in sorted(scales + switches)]
     effects = effects_of_base(ladder.base)
-    return Page(title, _lead(manifest), commands, zooms, ladder=manifest, effects=effects, provenance=manifest["versions"])
+    where = f"from {rounded(ladder.curve[0].zoom)} to {rounded(ladder.curve[-1].zoom)}"
+    return Page(title, lead(manifest, where), commands, zooms, ladder=manifest, effects=effects, provenance=manifest["versions"])
 
 
 @torch.no_grad()
@@ -45,7 +46,7 @@ def _zoom(ladder: Contents, yardstick: Yardstick, scale: float) -> Zoom:
         adapted = ladder.levels[number].adapted
         pictures.append(_picture(name, role, adapted.render(camera).image, truth, yardstick.psnr(adapted, scale), f"level_{number}.ply"))
     pictures.insert(2, Picture("base, supersampled", "truth", truth, note=TRUTH))
-    return Zoom(_rounded(scale), scale, pictures, view.name, TRUTH, f"{VIEWS} views that no level was adapted to")
+    return Zoom(rounded(scale), scale, pictures, view.name, TRUTH, f"{VIEWS} views that no level was adapted to")
 
 
 def _shown(ladder: Contents, scale: float) -> list[tuple[str, Role, int]]:
@@ -62,16 +63,17 @@ def _picture(name: str, role: Role, image: Tensor, truth: Tensor, mean: float, n
     return Picture(name, role, image, {"psnr_db": psnr(image, truth)}, {"psnr_db": mean}, note)
 
 
-def _rounded(zoom: float) -> str:
+def rounded(zoom: float) -> str:
+    """A zoom to three digits."""
     return zoom_name(float(f"{zoom:.3g}"))
 
 
-def _lead(manifest: dict[str, Any]) -> str:
+def lead(manifest: dict[str, Any], where: str) -> str:
+    """What came out. `where`: what the curve is over."""
     levels, curve = manifest["levels"], manifest["curve"]
     splats, megabytes = sum(level["splats"] for level in levels), sum(level["bytes"] for level in levels) / 1e6
-    ends = f"from {_rounded(curve[0]['zoom'])} to {_rounded(curve[-1]['zoom'])}"
     base = min(point["base_db"] for point in curve)
     return (
-        f"{len(levels)} levels for {manifest['viewer']}, {splats:,} splats, {megabytes:.1f} MB: {ends} at worst {manifest['worst_db']:.1f} dB, "
+        f"{len(levels)} levels for {manifest['viewer']}, {splats:,} splats, {megabytes:.1f} MB: {where} at worst {manifest['worst_db']:.1f} dB, "
         f"{manifest['mean_db']:.1f} dB on average; the base alone falls to {base:.1f} dB."
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,15 @@ def ladder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("ladder")
     words = ["levels", tiny.folder(here / "base"), "--viewer", "spark", "--coarsest", "1/4", "--ratio", "2", "--steps", "5", "--views", "given"]
     assert main([str(word) for word in (*words, "--output", here / "levels", "--report")]) == 0
+    return here / "levels" / "levels.json"
+
+
+@pytest.fixture(scope="module")
+def walked_ladder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The manifest of a ladder by distance; its page lies beside it."""
+    here = tmp_path_factory.mktemp("walked")
+    words = ["levels", tiny.folder(here / "base"), "--viewer", "playcanvas", "--by", "distance", "--coarsest", "1/4", "--ratio", "2"]
+    assert main([str(word) for word in (*words, "--recipe", "instant", "--output", here / "levels", "--report")]) == 0
     return here / "levels" / "levels.json"
 
 
@@ -203,6 +213,19 @@ def test_a_ladder_is_a_curve_over_zoom_with_its_switches_and_levels(open_page: O
     assert f"{last['psnr_db']:.2f} dB with level_{last['level']}.ply" in page.text_content("#levels .readout")
     shown = page.eval_on_selector_all("#levels tbody tr", "rows => rows.map(row => [row.cells[0], row.cells[4]].map(cell => cell.textContent))")
     assert shown == [[level["file"], str(level["splats"])] for level in manifest["levels"]]
+
+
+def test_a_ladder_by_distance_is_a_curve_over_distances(open_page: Open, walked_ladder: Path) -> None:
+    page, manifest = open_page(walked_ladder.with_name("report.html")), json.loads(walked_ladder.read_text())
+    assert page.locator("#levels .mark").count() == len(manifest["curve"])
+    places = page.eval_on_selector_all("#levels .mark", "marks => marks.map(each => Number(each.getAttribute('cx')))")
+    assert places == sorted(places) and places[-1] > places[0]
+    last = manifest["curve"][-1]
+    page.locator("#levels .mark").last.focus()
+    assert f"{last['psnr_db']:.2f} dB with the levels ({round(last['splats']):,} splats)" in page.text_content("#levels .readout")
+    shown = page.eval_on_selector_all("#levels tbody tr", "rows => rows.map(row => row.cells[1].textContent)")
+    ends = [f"{level['distance_from']:.3g}" for level in manifest["levels"][1:]]
+    assert shown == [f"to {ends[0]}", *(f"from {low} to {high}" for low, high in pairwise(ends)), f"from {ends[-1]}"]
 
 
 def test_the_slider_shows_the_level_of_each_zoom(open_page: Open, ladder: Path) -> None:

@@ -32,6 +32,9 @@ POWERS = (1, 1 / 2, 1 / 4)
 # What is left has to show at least so many dB: from 29 dB lego's steps regain all that merging cost, from 20 dB those of flowers, a capture, a third.
 COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 
+# dB by which it may be worse than the base as it is. Steps regain 3 to 8 of lego, chair and a capture; from lower, the whole base would be the level.
+COARSE_COSTS = 3.0
+
 
 @dataclass(frozen=True, eq=False)
 class FinerLevel:
@@ -57,7 +60,7 @@ class StartProblem:
     phase: Callable[[str], AbstractContextManager[None]]  # counts the seconds spent inside under a phase of that name
     name: str = "the base"  # what the base is called in the report
     may_lose: float = 0.0  # dB by which merged splats may be worse than the base as it is
-    coarsely: bool = False  # whether splats may be merged even where too few of them share a pixel
+    coarse_base: Callable[[], SplatModel] | None = None  # with it, splats may be merged even where too few share a pixel: copies of the base itself
 
     def from_level(self, finer: FinerLevel, model: Callable[[], SplatModel]) -> StartProblem:
         """The same request, starting from a finer level instead of from the base; `model` makes copies of it.
@@ -69,7 +72,7 @@ class StartProblem:
         views = [view.zoomed(finer.scale) for view in self.views]
         return replace(
             self, base=model, views=views, scale=self.scale / finer.scale, base_effects=self.target, config=config, name="the finer level",
-            may_lose=config.merging_costs, coarsely=True,
+            may_lose=config.merging_costs, coarse_base=self.base,
         )  # fmt: skip
 
 
@@ -96,10 +99,11 @@ class StartSearch:
         if config.merge_to == 1 and config.returns == "last":
             return formed, "the closed form"
         base_db, formed_db = problem.steer(base), problem.steer(formed)
+        least_db = self._least_coarse_db(base_db)
         for power, coarsely in self._merges():
             merged = self._candidate(weights, config.merge_to**power, coarsely)
             merged_db = problem.steer(merged)
-            if merged_db >= max(formed_db - config.merging_costs, LEAST_DB if coarsely else -math.inf):
+            if merged_db >= max(formed_db - config.merging_costs, least_db if coarsely else -math.inf):
                 return (merged, "the closed form of merged splats") if merged_db >= base_db - problem.may_lose else (base, problem.name)
         return (formed, "the closed form") if formed_db >= base_db else (base, problem.name)
 
@@ -107,8 +111,14 @@ class StartSearch:
         """The power of `merge_to` of each candidate, and whether it is merged coarsely."""
         if self._problem.config.merge_to == 1:
             return []
-        coarse = COARSE_POWERS if self._problem.coarsely else ()
+        coarse = COARSE_POWERS if self._problem.coarse_base else ()
         return [*((power, True) for power in coarse), *((power, False) for power in POWERS)]
+
+    def _least_coarse_db(self, finer_db: float) -> float:
+        """What a coarsely merged candidate has to show; what shows less leaves the choice to plain merging. `finer_db`: of the finer level."""
+        if (base := self._problem.coarse_base) is None:
+            return math.inf
+        return max(LEAST_DB, finer_db - self._problem.may_lose, self._problem.steer(base()) - COARSE_COSTS)
 
     def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
         """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""

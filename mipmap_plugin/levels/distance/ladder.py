@@ -51,8 +51,7 @@ def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str |
     """Make the levels. `resume`: as for `levels.ladder.make_levels`. Raises what that raises, and SettingsError for a model whose splats cannot be
     merged, or for settings that levels by distance do not have."""
     refuse(base, request)
-    target = base.target(request.viewer)
-    band = Band.first(request.first_ratio(target), as_it_is=target == base.effects())
+    band = request.first_band(base.target(request.viewer), base.effects())
     scene = scene_of(base, request, band)
     store = LevelStore(None if resume is None else Path(resume), base, request)
     first = store.level("level_0", lambda state: _first(base, request, band, state))

@@ -43,7 +43,7 @@ class DistanceRule:
         near = nearest(pixels)
         first = near / band.low
         steps = math.log(near / request.coarsest / first) / math.log(band.ratio)
-        return cls(first, band.ratio, 1 + max(1, math.ceil(steps - 1e-6)))
+        return cls(first, band.ratio, 1 if band.reaches(request.coarsest) else 1 + max(1, math.ceil(steps - 1e-6)))
 
     def level(self, pixels: Tensor) -> Tensor:
         """The level that is shown where pixels have these sizes; int64 of the same shape."""

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from statistics import fmean
 
 import torch
+from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.level import MEASURED_SAMPLES, Scene
 from mipmap_plugin.levels.distance.mixture import Mixture
+from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, foreground
 from mipmap_plugin.levels.yardstick import DRAW, VIEWS
 from mipmap_plugin.limits import derived_seed
@@ -36,32 +38,59 @@ class WalkPoint:
     splats: float  # that the mixture has, on average
 
 
-@torch.no_grad()
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What is seen from one place of a walk."""
+
+    pixel: float  # world units: the size of a pixel at what is nearest
+    way: float  # world units walked
+    truth: Tensor  # [H, W, 3], as are the images
+    mixture: Tensor
+    base: Tensor
+    splats: int  # of the mixture
+
+
+class Walks:
+    """Random walks backwards over levels."""
+
+    def __init__(self, scene: Scene, levels: Sequence[SplatModel]) -> None:
+        generator = torch.Generator().manual_seed(derived_seed(int(scene.request.settings.get("seed", 0)), DRAW))
+        self.views = jittered(scene.views, VIEWS, generator)
+        self._truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, {}, MEASURED_SAMPLES)
+        splats = [model.gaussians(scene.base.any_camera()).detach() for model in levels]
+        self._scene, self._mixture = scene, Mixture.of(scene.rule, scene.chunks, splats)
+
+    @torch.no_grad()
+    def seen(self, view: Camera, size: float) -> Seen:
+        """Where a pixel at what is nearest has this size, or where the walk from a view begins."""
+        depth = foreground(view, self._scene.splats.means, self._scene.target.near_plane)
+        way = max(0.0, size * focal_of(view) - depth)
+        camera = backed(view, way)
+        shown = self._mixture.splats(camera)
+        truth, mixture, base = self._truth.make(camera, view), self._draw(shown, camera), self._draw(self._scene.splats, camera)
+        return Seen((depth + way) / focal_of(view), way, truth, mixture, base, len(shown))
+
+    def _draw(self, splats: Gaussians, camera: Camera) -> Tensor:
+        return self._scene.backend.render(splats, camera, self._scene.target).image.clamp(0, 1)
+
+
+def places(rule: DistanceRule) -> list[float]:
+    """Where walks are looked at: sizes of a pixel at what is nearest, rising; where they begin, and in the middle of each level and at its end."""
+    ends = [rule.ends(number)[1] for number in range(rule.count)]
+    return [0.0, *(size for end in ends for size in (end / rule.ratio**0.5, end * 0.999))]
+
+
 def measured(scene: Scene, levels: Sequence[SplatModel]) -> list[WalkPoint]:
-    """The quality where the walks begin, and where what is nearest is in the middle of each level and at its end."""
-    generator = torch.Generator().manual_seed(derived_seed(int(scene.request.settings.get("seed", 0)), DRAW))
-    views = jittered(scene.views, VIEWS, generator)
-    truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, {}, MEASURED_SAMPLES)
-    mixture = Mixture.of(scene.rule, scene.chunks, [model.gaussians(scene.base.any_camera()).detach() for model in levels])
-    rule = scene.rule
-    sizes = [0.0, *(size for number in range(rule.count) for size in (rule.ends(number)[1] / rule.ratio**0.5, rule.ends(number)[1] * 0.999))]
-    points = []
-    for size in sizes:
-        rows = [_compared(scene, mixture, truth, view, size) for view in views]
+    """The quality at all `places`, in their order."""
+    walks, points = Walks(scene, levels), []
+    for size in places(scene.rule):
+        rows = [_compared(walks.seen(view, size)) for view in walks.views]
         nearest, dbs, base_dbs, counts = (fmean(column) for column in zip(*rows, strict=True))
-        points.append(WalkPoint(nearest, int(rule.level(torch.tensor([nearest]))), dbs, base_dbs, counts))
-    return sorted(points, key=lambda point: point.pixel)
+        points.append(WalkPoint(nearest, int(scene.rule.level(torch.tensor([nearest]))), dbs, base_dbs, counts))
+    return points
 
 
-def _compared(scene: Scene, mixture: Mixture, truth: WalkTruth, view: Camera, size: float) -> tuple[float, float, float, float]:
-    """Where a pixel at what is nearest has this size, or where the walk begins: that size, dB of the mixture and of the base, splats."""
-    depth = foreground(view, scene.splats.means, scene.target.near_plane)
-    way = max(0.0, size * focal_of(view) - depth)
-    camera = backed(view, way)
-    right, shown = truth.make(camera, view), mixture.splats(camera)
-
-    def psnr(splats: Gaussians) -> float:
-        image = scene.backend.render(splats, camera, scene.target).image.clamp(0, 1)
-        return decibel(float((image - right).square().mean()))
-
-    return (depth + way) / focal_of(view), psnr(shown), psnr(scene.splats), float(len(shown))
+def _compared(seen: Seen) -> tuple[float, float, float, float]:
+    """The size of a pixel, dB of the mixture and of the base, splats."""
+    dbs = [decibel(float((image - seen.truth).square().mean())) for image in (seen.mixture, seen.base)]
+    return seen.pixel, dbs[0], dbs[1], float(seen.splats)
