@@ -190,6 +190,24 @@ def test_streamed_sog_of_one_level_is_refused_before_any_work(tmp_path, tool, ca
     assert "a single level" in capsys.readouterr().err and not (tmp_path / "ladder").exists()
 
 
+def test_an_interrupted_export_loses_no_level(tmp_path, tool, capsys, monkeypatch):
+    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
+    words += ["--by", "zoom", "--steps", "1", "--views", "given", "--backend", "reference", "--streamed-sog"]
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as first:
+        first.setattr("mipmap_plugin.levels.streamed.write_streamed", interrupted)
+        assert cli.main(words) == 130
+    assert "the same command with --overwrite" in capsys.readouterr().err
+    levels = (tmp_path / "ladder" / "level_1.ply").read_bytes()
+    monkeypatch.setattr("mipmap_plugin.wrapped.Wrapped.adapt", None)
+    assert cli.main([*words, "--overwrite"]) == 0
+    assert (tmp_path / "ladder" / "level_1.ply").read_bytes() == levels and (tmp_path / "ladder" / "streamed").is_dir()
+    assert not (tmp_path / "ladder.resume").exists()
+
+
 def test_without_splat_transform_the_command_says_so_before_any_work(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PATH", "")
     base = tiny.folder(tmp_path / "base")

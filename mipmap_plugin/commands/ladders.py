@@ -59,8 +59,13 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     if exports.streamed_sog and request.first_band(wrapped.target(request.viewer), wrapped.effects()).reaches(request.coarsest):
         raise SettingsError(SINGLE_LEVEL)
     ladder = make_levels(wrapped, request, resume=state_path(output))
-    folder = ladder.save(output, overwrite=overwrite)
-    return read_manifest(folder), exports.write(folder, ladder.contents)
+    folder = ladder.save(output, overwrite=overwrite, finished=False)  # an export may fail after minutes, and the levels took longer
+    try:
+        files = exports.write(folder, ladder.contents)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; {folder} has the levels, and the same command with --overwrite goes on from these") from None
+    ladder.forget()
+    return read_manifest(folder), files
 
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:

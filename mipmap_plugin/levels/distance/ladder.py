@@ -40,11 +40,19 @@ class DistanceLadder:
         """From the finest to the coarsest."""
         return self.contents.levels
 
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError."""
+    def save(self, folder: str | Path, *, overwrite: bool = False, finished: bool = True) -> Path:
+        """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError.
+
+        `finished`: forget what was kept to go on from; otherwise `forget` does.
+        """
         saved = write(self.contents, Path(folder), overwrite)
-        self._store.remove()
+        if finished:
+            self.forget()
         return saved
+
+    def forget(self) -> None:
+        """Delete what was kept to go on from."""
+        self._store.remove()
 
 
 def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> DistanceLadder:
