@@ -1,5 +1,6 @@
 """What commands say: quiet or not, and in a log."""
 
+import contextlib
 import re
 import sys
 
@@ -8,7 +9,7 @@ import tiny
 
 from mipmap_plugin import progress
 from mipmap_plugin.cli import main
-from mipmap_plugin.commands.voice import options, speaking
+from mipmap_plugin.commands.voice import options, say, speaking
 from mipmap_plugin.errors import SettingsError
 
 QUICK = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference"]
@@ -19,9 +20,20 @@ def base(tmp_path):
     return str(tiny.folder(tmp_path / "base", tiny.cameras(3)))
 
 
-def test_a_quiet_command_prints_nothing(base, capsys):
-    assert main(["adapt", base, "--quiet", *QUICK]) == 0
+LEVELS = ["levels", "--viewer", "spark", "--coarsest", "1", "--recipe", "instant", "--backend", "reference", "--by", "zoom"]
+
+
+@pytest.mark.parametrize("words", [["adapt", *QUICK], LEVELS], ids=["adapt", "levels"])
+def test_a_quiet_command_prints_nothing(base, tmp_path, capsys, words):
+    assert main([*words, base, "--quiet", "--output", str(tmp_path / "made")]) == 0
     assert capsys.readouterr() == ("", "")
+
+
+def test_what_is_said_reaches_a_pipe_at_once(tmp_path):
+    pipe = (tmp_path / "pipe").open("w")
+    with pipe, contextlib.redirect_stdout(pipe):
+        say("http://localhost:8080")
+        assert (tmp_path / "pipe").read_text() == "http://localhost:8080\n"
 
 
 def test_a_quiet_command_prints_json(base, capsys):

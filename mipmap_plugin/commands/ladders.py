@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
+from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.splat_transform import refuse_exchange
 
@@ -73,31 +74,32 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
     if json:
         print_facts(manifest, json)
         return
-    if manifest.get("by") == "distance":
-        _print_distances(folder, manifest)
-    else:
-        _print_zooms(folder, manifest)
+    lines = _distances(folder, manifest) if manifest.get("by") == "distance" else _zooms(folder, manifest)
     base = min(point["base_db"] for point in manifest["curve"])
-    print(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
-    print(f"  {manifest['measured']}")
-    print("".join(f"{look_at(path)}\n" if path.name == LEVELS_PAGE else f"  {path}\n" for path in exports), end="")
+    lines.append(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
+    lines.append(f"  {manifest['measured']}")
+    say("\n".join([*lines, *(look_at(path) if path.name == LEVELS_PAGE else f"  {path}" for path in exports)]))
 
 
-def _print_zooms(folder: Path, manifest: dict[str, Any]) -> None:
-    print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels")
+def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:
+    lines = [f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels"]
     for level in manifest["levels"]:
         ends = {"down to": level["shown_from"], "up to": level["shown_to"]}
         shown = ", ".join(f"{word} x{zoom:.3g}" for word, zoom in ends.items() if zoom is not None) or "at every zoom"
         quality = list(level["psnr_db"].values())
-        print(f"  {level['file']}  x{level['scale']:.3g}, shown {shown}: {min(quality):.1f} to {max(quality):.1f} dB, ", end="")
-        print(f"{level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s")
+        lines.append(f"  {level['file']}  x{level['scale']:.3g}, shown {shown}: {min(quality):.1f} to {max(quality):.1f} dB, {_size(level)}")
+    return lines
 
 
-def _print_distances(folder: Path, manifest: dict[str, Any]) -> None:
-    print(f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels by distance")
+def _distances(folder: Path, manifest: dict[str, Any]) -> list[str]:
+    lines = [f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels by distance"]
     for level in manifest["levels"]:
         ends = {"from": level["distance_from"] or None, "to": level["distance_to"]}
         shown = " ".join(f"{word} {distance:.3g}" for word, distance in ends.items() if distance is not None) or "everywhere"
-        print(f"  {level['file']}  shown {shown}: {level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s")
-    print(f"  distances in world units on a canvas of {manifest['canvas']} px: lodBaseDistance {manifest['lodBaseDistance']:.4g}, ", end="")
-    print(f"lodMultiplier {manifest['lodMultiplier']:.3g}")
+        lines.append(f"  {level['file']}  shown {shown}: {_size(level)}")
+    rule = f"lodBaseDistance {manifest['lodBaseDistance']:.4g}, lodMultiplier {manifest['lodMultiplier']:.3g}"
+    return [*lines, f"  distances in world units on a canvas of {manifest['canvas']} px: {rule}"]
+
+
+def _size(level: dict[str, Any]) -> str:
+    return f"{level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s"

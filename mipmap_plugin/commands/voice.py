@@ -38,7 +38,7 @@ def say(text: str) -> None:
     voice = VOICE.get()
     voice.write(text)
     if not voice.quiet:
-        print(text)
+        print(text, flush=True)  # at once, for whoever reads it from a pipe, as the address of a live view
 
 
 def detail(text: str) -> None:
