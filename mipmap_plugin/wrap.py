@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_background
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.models.inria_folder import read_options, trained_scale
+from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.scenes import Scene, model_cameras
 from mipmap_plugin.splatting.filters import USUAL_EPS2D
@@ -65,12 +67,12 @@ def asked_for(
 ) -> dict[str, str]:
     """What is given beside a checkpoint, as its adaptations record it (`Report.inputs`). `cameras`: before they are placed in the model's frame.
 
-    `folder`: of the model; the options of training in its cfg_args say how the base looks, but the hash of the base is that of its splats.
+    `folder`: of the model; the options of its training (cfg_args) say how the base looks, and its hash is that of the splats alone.
     """
     color = "" if background is None else " ".join(f"{channel:g}" for channel in background)
-    options = read_options(folder)[0]
-    trained = str(trained_scale(options, None)) if options else ""
-    return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or "", "trained": trained}
+    options = {name: value for name, value in read_options(folder)[0].items() if not isinstance(value, str)}  # but paths
+    digest = sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest() if options else ""
+    return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or "", "options": digest}
 
 
 def _loaded(path: str | Path, backend: str) -> SplatModel:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import anchor_checkpoints
+import corpus
 import pytest
 import tiny
 from running import saving_often, wait_until
@@ -265,15 +266,25 @@ def test_a_job_that_travels_makes_the_same_bytes(tmp_path):
     assert failed.status == "failed" and "nobody" in failed.reason
 
 
+@pytest.mark.parametrize("given", ["", "point_cloud/iteration_30000/point_cloud.ply"])
 @pytest.mark.parametrize("suffix", ["", ".ply"])
-def test_a_model_folder_travels(tmp_path, suffix):
+def test_a_model_folder_travels(tmp_path, suffix, given):
     folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
-    job = Job(Base(folder, backend="reference"), tmp_path / f"here{suffix}", 0.5, settings={"steps": 0, "seed": 0, "views": "given"})
+    (folder / "cfg_args").write_text("Namespace(sh_degree=1, white_background=True)")
+    job = Job(Base(folder / given, backend="reference"), tmp_path / f"here{suffix}", 0.5, settings={"steps": 0, "seed": 0, "views": "given"})
     assert run_job(job).status == "done"
     away = replace(job, target=tmp_path / f"away{suffix}")
     assert unpack(do_parcel(pack(away), run_job), away).status == "done"
     here, there = (path.read_bytes() if suffix else next(path.rglob("*.ply")).read_bytes() for path in (job.target, away.target))
     assert here == there and finished(away) is not None
+
+
+def test_options_beside_an_exchange_format_are_not_of_its_training(tmp_path):
+    """Loading it does not read them."""
+    file = corpus.SAMPLES[".spz"].make(tmp_path / "base")
+    (tmp_path / "base" / "cfg_args").write_text("Namespace(sh_degree=1, white_background=True)")
+    write_cameras(tmp_path / "base" / "cameras.json", tiny.cameras(3))
+    assert Base(file, cameras=tmp_path / "base" / "cameras.json").asked()["options"] == ""
 
 
 def test_what_comes_back_never_replaces_the_base(tmp_path):

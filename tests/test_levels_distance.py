@@ -257,9 +257,11 @@ def test_the_truth_keeps_the_thickness_of_the_first_picture():
     assert classic[1] / classic[0] > 0.9
 
 
-def test_a_base_that_integrates_over_pixels_is_refused():
+def test_a_base_that_integrates_over_pixels_is_refused_before_any_work(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.levels.distance.ladder.scene_of", None)
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(1), screen_filter="analytic")
     with pytest.raises(SettingsError, match="need a base with a dilation"):
-        WalkTruth((tiny.gaussians(), CpuBackend(), Effects(1, "analytic", 0.0)), tiny.cameras(1), {}, 2)
+        base.levels("classic", by="distance")
 
 
 # Ladders

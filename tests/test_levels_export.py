@@ -190,16 +190,17 @@ def test_streamed_sog_of_one_level_is_refused_before_any_work(tmp_path, tool, ca
     assert "a single level" in capsys.readouterr().err and not (tmp_path / "ladder").exists()
 
 
-def test_an_interrupted_export_loses_no_level(tmp_path, tool, capsys, monkeypatch):
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt, 130), (lambda: OutputError("the disk is full"), 2)], ids=["Ctrl-C", "error"])
+def test_an_export_that_ends_early_loses_no_level(tmp_path, tool, capsys, monkeypatch, error, code):
     words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
     words += ["--by", "zoom", "--steps", "1", "--views", "given", "--backend", "reference", "--streamed-sog"]
 
-    def interrupted(*arguments):
-        raise KeyboardInterrupt
+    def ends(*arguments):
+        raise error()
 
     with monkeypatch.context() as first:
-        first.setattr("mipmap_plugin.levels.streamed.write_streamed", interrupted)
-        assert cli.main(words) == 130
+        first.setattr("mipmap_plugin.levels.streamed.write_streamed", ends)
+        assert cli.main(words) == code
     assert "the same command with --overwrite" in capsys.readouterr().err
     levels = (tmp_path / "ladder" / "level_1.ply").read_bytes()
     monkeypatch.setattr("mipmap_plugin.wrapped.Wrapped.adapt", None)

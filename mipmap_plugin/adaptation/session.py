@@ -110,7 +110,7 @@ class Session:
         began = time.perf_counter()
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())
-            merging = self.config.merge_to < 1 and self._start_problem().has_blend_weights
+            merging = self.config.merge_to < 1 and self._has_blend_weights
             warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0, merging=merging)
         as_it_is = self._for_target(self._base_in_viewer, shared=True)
         initial, start = StartSearch(self._start_problem()).best()
@@ -125,10 +125,9 @@ class Session:
         return self._select(states, curve, ended_by)
 
     def _start_problem(self) -> StartProblem:
-        has_blend_weights = self.has_gradients and self.base.traits.same_for_all_views
         from_base = StartProblem(
             lambda: self._for_target(self.base, shared=True), self.base_views, self.scale, self.base_effects, self.start_target, self.config,
-            self.backend, has_blend_weights, self.steer, self.phase,
+            self.backend, self._has_blend_weights, self.steer, self.phase,
         )  # fmt: skip
         finer = self.finer
         return from_base if finer is None else from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
@@ -214,6 +213,10 @@ class Session:
         """PSNR (dB) of a model on the views that steer the run."""
         with self.phase("validation"):
             return self.validation.steer(model)
+
+    @property
+    def _has_blend_weights(self) -> bool:
+        return self.has_gradients and self.base.traits.same_for_all_views
 
     @property
     def _white(self) -> bool:

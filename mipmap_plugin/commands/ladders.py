@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.splat_transform import refuse_exchange
 
 if TYPE_CHECKING:
@@ -51,22 +51,35 @@ class Exports:
 def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
     """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once, but for
     Streamed SOG of a ladder that comes out as a single level because that has few enough splats."""
+    from mipmap_plugin import threads
     from mipmap_plugin.levels.ladder import make_levels
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
     from mipmap_plugin.wrap import state_path
 
     refuse_ladder(output, wrapped, overwrite=overwrite)
-    if exports.streamed_sog and request.first_band(wrapped.target(request.viewer), wrapped.effects()).reaches(request.coarsest):
+    if exports.streamed_sog and _is_single(wrapped, request):
         raise SettingsError(SINGLE_LEVEL)
     ladder = make_levels(wrapped, request, resume=state_path(output))
-    folder = ladder.save(output, overwrite=overwrite, finished=False)  # an export may fail after minutes, and the levels took longer
+    if exports.streamed_sog and len(ladder.levels) == 1:
+        raise SettingsError(SINGLE_LEVEL)
+    folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
     try:
-        files = exports.write(folder, ladder.contents)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted; {folder} has the levels, and the same command with --overwrite goes on from these") from None
+        with threads.limited(wrapped.threads, shared=getattr(wrapped.backend()[0], "own_threads", False)):
+            files = exports.write(folder, ladder.contents)
+    except (KeyboardInterrupt, MipmapPluginError) as error:
+        again = f"{folder} has the levels, and the same command with --overwrite goes on from these"
+        raise type(error)(f"{str(error) or 'interrupted'}; {again}") from error
     ladder.forget()
     return read_manifest(folder), files
+
+
+def _is_single(wrapped: Wrapped, request: LadderRequest) -> bool:
+    """Whether a ladder will have one level, as far as that is known before any work."""
+    if wrapped.model.traits.no_viewer:
+        return False  # and no ladder
+    few = request.until_splats is not None and len(wrapped.model.parameters()["means"]) <= request.until_splats
+    return few or request.first_band(wrapped.target(request.viewer), wrapped.effects()).reaches(request.coarsest)
 
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:

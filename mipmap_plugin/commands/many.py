@@ -114,7 +114,9 @@ def _checkpoints(given: Sequence[Path]) -> list[Path]:
 
 def of_scene(path: Path | None, checkpoint: Path) -> Path | None:
     """A path in which {name} stands for the checkpoint's name."""
-    return path and Path(str(path).replace("{name}", checkpoint.resolve().stem)).absolute()
+    place = checkpoint.resolve()
+    name = place.stem if place.is_file() else place.name
+    return path and Path(str(path).replace("{name}", name)).absolute()
 
 
 def _refuse(jobs: Sequence[Job]) -> None:

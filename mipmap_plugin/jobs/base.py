@@ -29,7 +29,8 @@ class Base:
         from mipmap_plugin.scenes import load_scene, model_cameras
         from mipmap_plugin.wrap import asked_for
 
-        folder = detect(self.checkpoint).folder
+        found = detect(self.checkpoint)
+        folder = None if found.family == "exchange" else found.folder  # which is not of an exchange format's training
         if self.cameras is not None:
             cameras = load_scene(self.cameras, read_options(self.checkpoint)[0]).cameras
         else:

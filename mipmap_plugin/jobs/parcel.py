@@ -39,14 +39,14 @@ def pack(job: Job) -> Parcel:
     base = job.base
     checkpoint = detect(base.checkpoint)
     refuse_output(job.target, job.overwrite, parts_of(checkpoint.path, checkpoint.folder))  # which the worker cannot know
-    place = base.checkpoint if base.checkpoint.is_dir() else base.checkpoint.parent
-    parts = [part for part in dict.fromkeys(parts_of(checkpoint.path, checkpoint.folder)) if part.is_relative_to(place)]
-    members = {BASE / part.relative_to(place): part for part in parts}
+    folder = checkpoint.folder  # with the options and networks of the checkpoint, also where its PLY is given
+    if folder is None or not base.checkpoint.is_relative_to(folder):
+        folder = base.checkpoint if base.checkpoint.is_dir() else base.checkpoint.parent
+    parts = [part for part in dict.fromkeys(parts_of(checkpoint.path, checkpoint.folder)) if part.is_relative_to(folder)]
+    members = {BASE / part.relative_to(folder): part for part in parts}
     members |= {} if base.cameras is None else _scene(base.cameras, CAMERAS)
     members |= {} if job.images is None else _scene(job.images, IMAGES)
-    sent = replace(
-        base, checkpoint=BASE if base.checkpoint.is_dir() else BASE / base.checkpoint.name, cameras=base.cameras and _packed(base.cameras, CAMERAS)
-    )
+    sent = replace(base, checkpoint=BASE / base.checkpoint.relative_to(folder), cameras=base.cameras and _packed(base.cameras, CAMERAS))
     target = OUTPUT / named(job.target).name
     return Parcel(replace(job, base=sent, target=target, images=job.images and _packed(job.images, IMAGES)), _archive(members))
 

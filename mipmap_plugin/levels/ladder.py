@@ -41,13 +41,13 @@ class Ladder:
         """From the finest to the coarsest."""
         return self.contents.levels
 
-    def save(self, folder: str | Path, *, overwrite: bool = False, finished: bool = True) -> Path:
+    def save(self, folder: str | Path, *, overwrite: bool = False, keep_resume: bool = False) -> Path:
         """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError.
 
-        `finished`: forget what was kept to go on from; otherwise `forget` does.
+        `keep_resume`: leave what was kept to go on from until `forget`.
         """
         saved = write_ladder(self.contents, Path(folder), overwrite)
-        if finished:
+        if not keep_resume:
             self.forget()
         return saved
 

@@ -32,7 +32,7 @@ POWERS = (1, 1 / 2, 1 / 4)
 # What is left has to show at least so many dB: from 29 dB lego's steps regain all that merging cost, from 20 dB those of flowers, a capture, a third.
 COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 
-# dB by which it may be worse than the base as it is. Steps regain 3 to 8 of lego, chair and a capture; from lower, the whole base would be the level.
+# dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB, of lego, of chair and of a capture. What fails is merged less.
 COARSE_COSTS = 3.0
 
 
@@ -99,11 +99,11 @@ class StartSearch:
         if config.merge_to == 1 and config.returns == "last":
             return formed, "the closed form"
         base_db, formed_db = problem.steer(base), problem.steer(formed)
-        least_db = self._least_coarse_db(base_db)
+        least_coarse_db = math.inf if problem.coarse_base is None else self._least_coarse_db(base_db, problem.coarse_base())
         for power, coarsely in self._merges():
             merged = self._candidate(weights, config.merge_to**power, coarsely)
             merged_db = problem.steer(merged)
-            if merged_db >= max(formed_db - config.merging_costs, least_db if coarsely else -math.inf):
+            if merged_db >= max(formed_db - config.merging_costs, least_coarse_db if coarsely else -math.inf):
                 return (merged, "the closed form of merged splats") if merged_db >= base_db - problem.may_lose else (base, problem.name)
         return (formed, "the closed form") if formed_db >= base_db else (base, problem.name)
 
@@ -114,11 +114,9 @@ class StartSearch:
         coarse = COARSE_POWERS if self._problem.coarse_base else ()
         return [*((power, True) for power in coarse), *((power, False) for power in POWERS)]
 
-    def _least_coarse_db(self, finer_db: float) -> float:
-        """What a coarsely merged candidate has to show; what shows less leaves the choice to plain merging. `finer_db`: of the finer level."""
-        if (base := self._problem.coarse_base) is None:
-            return math.inf
-        return max(LEAST_DB, finer_db - self._problem.may_lose, self._problem.steer(base()) - COARSE_COSTS)
+    def _least_coarse_db(self, finer_db: float, base: SplatModel) -> float:
+        """The PSNR that a coarsely merged candidate has to show. `finer_db`: that of the finer level."""
+        return max(LEAST_DB, finer_db - self._problem.may_lose, self._problem.steer(base) - COARSE_COSTS)
 
     def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
         """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""

@@ -40,13 +40,13 @@ class DistanceLadder:
         """From the finest to the coarsest."""
         return self.contents.levels
 
-    def save(self, folder: str | Path, *, overwrite: bool = False, finished: bool = True) -> Path:
+    def save(self, folder: str | Path, *, overwrite: bool = False, keep_resume: bool = False) -> Path:
         """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError.
 
-        `finished`: forget what was kept to go on from; otherwise `forget` does.
+        `keep_resume`: leave what was kept to go on from until `forget`.
         """
         saved = write(self.contents, Path(folder), overwrite)
-        if finished:
+        if not keep_resume:
             self.forget()
         return saved
 
@@ -87,6 +87,8 @@ def refuse(base: Wrapped, request: LadderRequest) -> None:
     """Raise SettingsError for what levels by distance do not support."""
     if not base.model.traits.same_for_all_views:
         raise SettingsError(f"{base.model.family}: its splats have a 3D filter, so that levels by distance cannot mix them; give by zoom")
+    if (trained_with := base.effects().screen_filter) in INTEGRATED:
+        raise SettingsError(f"levels by distance need a base with a dilation; this one was trained with {trained_with}; give by zoom")
     if request.least_db is not None or request.until_splats is not None:
         raise SettingsError("least_db and until_splats: levels by distance follow from the distances of the cameras; leave both out")
     if taken := {"merge_to", "most_splats"} & request.settings.keys():

@@ -20,8 +20,7 @@ from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import COMPENSATED, INTEGRATED, Effects
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.effects import COMPENSATED, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.filters import SQUARE_VARIANCE
 from mipmap_plugin.splatting.projection import project
@@ -54,10 +53,8 @@ class WalkTruth:
 
     def __init__(self, base: tuple[Gaussians, Backend, Effects], views: Sequence[Camera], begins: Mapping[Camera, Camera], samples: int) -> None:
         """`base`: its splats, drawn by a backend with the effects of its training. `views`: of the training. `begins`: where the walk of each
-        view began. `samples`: a pixel's along each side. Raises SettingsError for a base whose screen filter integrates over pixels."""
+        view began. `samples`: a pixel's along each side."""
         self._splats, self._backend, self._effects = base
-        if self._effects.screen_filter in INTEGRATED:
-            raise SettingsError(f"levels by distance need a base with a dilation; this one was trained with {self._effects.screen_filter}")
         self._pixels, self._begins, self._samples = pixel_size(self._splats.means, views), begins, samples
         self._store = ImageStore(LIMIT, self._splats.means)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -55,7 +56,8 @@ class Walks:
 
     def __init__(self, scene: Scene, levels: Sequence[SplatModel]) -> None:
         generator = torch.Generator().manual_seed(derived_seed(int(scene.request.settings.get("seed", 0)), DRAW))
-        self.views = jittered(scene.views, VIEWS, generator)
+        seeing = [view for view in (*jittered(scene.views, VIEWS, generator), *scene.views) if math.isfinite(self._depth(view, scene))]
+        self.views = seeing[:VIEWS]
         self._truth = WalkTruth((scene.splats, scene.backend, scene.base.effects()), scene.views, {}, MEASURED_SAMPLES)
         splats = [model.gaussians(scene.base.any_camera()).detach() for model in levels]
         self._scene, self._mixture = scene, Mixture.of(scene.rule, scene.chunks, splats)
@@ -63,12 +65,16 @@ class Walks:
     @torch.no_grad()
     def seen(self, view: Camera, size: float) -> Seen:
         """Where a pixel at what is nearest has this size, or where the walk from a view begins."""
-        depth = foreground(view, self._scene.splats.means, self._scene.target.near_plane)
+        depth = self._depth(view, self._scene)
         way = max(0.0, size * focal_of(view) - depth)
         camera = backed(view, way)
         shown = self._mixture.splats(camera)
         truth, mixture, base = self._truth.make(camera, view), self._draw(shown, camera), self._draw(self._scene.splats, camera)
         return Seen((depth + way) / focal_of(view), way, truth, mixture, base, len(shown))
+
+    @staticmethod
+    def _depth(view: Camera, scene: Scene) -> float:
+        return foreground(view, scene.splats.means, scene.target.near_plane)
 
     def _draw(self, splats: Gaussians, camera: Camera) -> Tensor:
         return self._scene.backend.render(splats, camera, self._scene.target).image.clamp(0, 1)
