@@ -1,7 +1,7 @@
 """One file of a chosen count: `adapt --splats` against splat-transform's --decimate and --decimate-adaptive, at a half and a quarter of the splats.
 
     python benchmarks/levels_counts.py DATA
-    python benchmarks/levels_counts.py DATA --only flowers_r8
+    python benchmarks/levels_counts.py DATA --only flowers_r8 --recipe thorough --scale 1
 
 Every file is drawn as the viewer draws, at cameras that nothing was adapted to, against the base itself: as it is at x1, supersampled below. What
 decimation alone costs is shown too: the rival's splats, supersampled just as the base is. Needs what tests/browser/README.md installs with npm, or
@@ -67,9 +67,10 @@ class Row:
     base: float
     rivals: dict[str, float]
     supersampled: dict[str, float]  # the rivals
+    recipe: str = "default"  # of ours
 
 
-def measure(dolly: Dolly, file: Path) -> None:
+def measure(dolly: Dolly, file: Path, scales: Sequence[float], recipe: str) -> None:
     """Every count at every scale."""
     found = [Row(**each) for each in json.loads(file.read_text())] if file.exists() else []
     source = dolly.base.model.source
@@ -78,13 +79,13 @@ def measure(dolly: Dolly, file: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for fraction in FRACTIONS:
             rivals = {name: load_model(decimated(source, option, round(count * fraction), Path(folder))) for name, option in RIVALS.items()}
-            for scale in SCALES:
-                if (fraction, scale) not in {(each.fraction, each.scale) for each in found}:
-                    found.append(row(dolly, rivals, fraction, scale))
+            for scale in scales:
+                if (fraction, scale, recipe) not in {(each.fraction, each.scale, each.recipe) for each in found}:
+                    found.append(row(dolly, rivals, fraction, scale, recipe))
                     write_json(file, [asdict(each) for each in found], overwrite=True)
 
 
-def row(dolly: Dolly, rivals: dict[str, SplatModel], fraction: float, scale: float) -> Row:
+def row(dolly: Dolly, rivals: dict[str, SplatModel], fraction: float, scale: float, recipe: str) -> Row:
     truths = {view: dolly.truth(view, scale) for view in dolly.views}
 
     def quality(draw: Callable[[Camera], torch.Tensor]) -> float:
@@ -98,10 +99,10 @@ def row(dolly: Dolly, rivals: dict[str, SplatModel], fraction: float, scale: flo
         its = Dolly(Wrapped(model, dolly.base.cameras, "auto", dolly.base.trained), dolly.views)
         return quality(lambda view: its.truth(view, scale))
 
-    ours = dolly.base.adapt(scale, viewer=VIEWER, most_splats=round(len(dolly.base.model.parameters()["means"]) * fraction))
+    ours = dolly.base.adapt(scale, viewer=VIEWER, recipe=recipe, most_splats=round(len(dolly.base.model.parameters()["means"]) * fraction))
     return Row(
         fraction, len(ours.model.parameters()["means"]), scale, in_viewer(ours.model), ours.report.seconds["total"], in_viewer(dolly.base.model),
-        {name: in_viewer(model) for name, model in rivals.items()}, {name: supersampled(model) for name, model in rivals.items()},
+        {name: in_viewer(model) for name, model in rivals.items()}, {name: supersampled(model) for name, model in rivals.items()}, recipe,
     )  # fmt: skip
 
 
@@ -117,9 +118,9 @@ def page(results: Mapping[str, Sequence[Row]]) -> str:
 
 
 def table(found: Sequence[Row]) -> str:
-    head = ["splats", "scale", "ours", "base", *RIVALS, "lead", "seconds"]
+    head = ["recipe", "splats", "scale", "ours", "base", *RIVALS, "lead", "seconds"]
     body = [
-        [f"{each.splats:,}", f"x{each.scale:g}", f"{each.ours:.1f}", f"{each.base:.1f}",
+        [each.recipe, f"{each.splats:,}", f"x{each.scale:g}", f"{each.ours:.1f}", f"{each.base:.1f}",
          *(f"{each.rivals[name]:.1f} ({each.supersampled[name]:.1f})" for name in RIVALS),
          f"{each.ours - max(each.rivals.values()):+.1f}", f"{each.seconds:.0f}"]
         for each in found
@@ -131,6 +132,8 @@ def main(
     data: tyro.conf.Positional[Path],
     output: Path = Path("benchmarks/results"),
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    scale: tyro.conf.UseAppendAction[tuple[float, ...]] = (),
+    recipe: str = "default",
 ) -> None:
     """Measure, and write the tables.
 
@@ -138,6 +141,8 @@ def main(
         data: The folder with checkpoints/.
         output: Where the results go.
         only: Which bases; all by default.
+        scale: 1, 0.5 and 0.25 by default.
+        recipe: Of ours.
     """
     torch.set_num_threads(1)
     os.environ["PATH"] = f"{BROWSER}{os.pathsep}{os.environ['PATH']}"
@@ -146,7 +151,7 @@ def main(
         held_out = whole.cameras[EVERY // 2 :: EVERY]
         kept = [camera for camera in whole.cameras if camera not in held_out]
         base = wrap_model(whole.model, cameras=kept, background=whole.background, threads=1)
-        measure(Dolly(base, held_out), output / "levels_counts" / f"{name}.json")
+        measure(Dolly(base, held_out), output / "levels_counts" / f"{name}.json", scale or SCALES, recipe)
     results = {file.stem: [Row(**each) for each in json.loads(file.read_text())] for file in sorted((output / "levels_counts").glob("*.json"))}
     (output / "levels_counts.md").write_text(page(results), encoding="utf-8")
 
