@@ -118,11 +118,11 @@ def page(results: Mapping[str, Sequence[Row]]) -> str:
 
 
 def table(found: Sequence[Row]) -> str:
-    head = ["recipe", "splats", "scale", "ours", "base", *RIVALS, "lead", "seconds"]
+    head = ["splats", "scale", "ours", "base", *RIVALS, "lead", "seconds", "recipe"]
     body = [
-        [each.recipe, f"{each.splats:,}", f"x{each.scale:g}", f"{each.ours:.1f}", f"{each.base:.1f}",
+        [f"{each.splats:,}", f"x{each.scale:g}", f"{each.ours:.1f}", f"{each.base:.1f}",
          *(f"{each.rivals[name]:.1f} ({each.supersampled[name]:.1f})" for name in RIVALS),
-         f"{each.ours - max(each.rivals.values()):+.1f}", f"{each.seconds:.0f}"]
+         f"{each.ours - max(each.rivals.values()):+.1f}", f"{each.seconds:.0f}", each.recipe]
         for each in found
     ]  # fmt: skip
     return markdown(head, body)

@@ -131,7 +131,7 @@ def test_the_lead_of_a_count_is_over_the_better_rival():
     row = Row(0.5, 19_000, 0.5, 32.0, 60.0, 29.0, rivals, {"splat-transform": 30.0, "adaptive": 31.0})
     text = page_of_counts({"flowers_r8": [row]})
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| 19,000")]
-    assert cells == [["19,000", "x0.5", "32.0", "29.0", "26.0 (30.0)", "27.5 (31.0)", "+4.5", "60"]] and "## flowers_r8" in text
+    assert cells == [["19,000", "x0.5", "32.0", "29.0", "26.0 (30.0)", "27.5 (31.0)", "+4.5", "60", "default"]] and "## flowers_r8" in text
 
 
 def test_a_strip_has_a_row_for_each_way_and_a_column_for_each_zoom(tmp_path):
