@@ -20,10 +20,11 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance import chunks as chunks_module
 from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats, shaped
-from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance
+from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, scene_of
 from mipmap_plugin.levels.distance.mixture import Mixture, together
 from mipmap_plugin.levels.distance.rule import DistanceRule, focal, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
+from mipmap_plugin.levels.distance.yardstick import Walks
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.request import Band, LadderRequest
 from mipmap_plugin.levels.streamed import distances, progression
@@ -262,6 +263,16 @@ def test_a_base_that_integrates_over_pixels_is_refused_before_any_work(monkeypat
     base = wrap_model(tiny.model(), cameras=tiny.cameras(1), screen_filter="analytic")
     with pytest.raises(SettingsError, match="need a base with a dilation"):
         base.levels("classic", by="distance")
+
+
+def test_walks_begin_where_something_is_seen(small_chunks, monkeypatch):
+    base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=2.0, by="distance")
+    scene = scene_of(base, request, request.first_band(base.target("classic"), base.effects()))
+    away = from_x(1e6)
+    assert math.isinf(foreground(away, scene.splats.means, scene.target.near_plane))
+    monkeypatch.setattr("mipmap_plugin.levels.distance.yardstick.jittered", lambda views, count, generator: [away, views[0]])
+    walks = Walks(scene, [base.model] * scene.rule.count)
+    assert walks.views and not any(view is away for view in walks.views)
 
 
 # Ladders
