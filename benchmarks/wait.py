@@ -28,6 +28,7 @@ PHASES = ("compilation", "blend weights", "merging", "closed form", "pseudo trut
 INTRO = """# How long a person waits
 
 Made by `python benchmarks/wait.py DATA`: seconds of whole processes, the quickest of {runs}; the phases of the report of the same run. Two cores.
+*before*: the version given by `--before`.
 """
 
 
