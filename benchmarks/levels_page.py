@@ -94,7 +94,7 @@ def strip(path: Path, rows: Mapping[str, Sequence[Tensor]], zooms: Sequence[floa
 
 def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
     """A plot of dB over zoom for each base and viewer, with our switches."""
-    figure = figure_class()(figsize=(12, 3.6 * ((len(results) + 1) // 2)), layout="constrained")
+    figure = figure_class()(figsize=(12, 2.3 * ((len(results) + 1) // 2)), layout="constrained")
     plots = list(figure.subplots((len(results) + 1) // 2, 2, squeeze=False, sharey=True).flat)
     for axes in plots[len(results) :]:
         axes.set_axis_off()
@@ -104,8 +104,9 @@ def draw(path: Path, results: Sequence[dict[str, Any]]) -> None:
             axes.axvline(change["zoom"], color="tab:blue", linewidth=0.6, linestyle=":")
         axes.set_xscale("log", base=2)
         axes.invert_xaxis()
-        axes.set(title=f"{result['base']} in {result['viewer']}", xlabel="zoom (dotted: switches)", ylabel="dB against the supersampled base")
+        axes.set(title=f"{result['base']} in {result['viewer']}", ylabel="dB")
         axes.grid(alpha=0.25)
+    figure.supxlabel("zoom (dotted: switches); dB against the supersampled base", fontsize=9)
     lines = {line.get_label(): line for axes in plots for line in axes.get_lines() if not line.get_label().startswith("_")}
     figure.legend(lines.values(), lines.keys(), loc="outside upper center", ncols=len(lines), fontsize=8, frameon=False)
     with new_file(path, overwrite=True) as temporary:
