@@ -275,6 +275,12 @@ def test_walks_begin_where_something_is_seen(small_chunks, monkeypatch):
     assert walks.views and not any(view is away for view in walks.views)
 
 
+def test_cameras_that_see_nothing_are_refused():
+    base = wrap_model(wrapped().model, cameras=[from_x(1e6)])
+    with pytest.raises(SettingsError, match="no camera sees a splat"):
+        base.levels("classic", by="distance")
+
+
 # Ladders
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.level import LevelRun, Scene
 from mipmap_plugin.levels.distance.manifest import Contents, write
 from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
-from mipmap_plugin.levels.distance.walks import focal_of
+from mipmap_plugin.levels.distance.walks import focal_of, foreground
 from mipmap_plugin.levels.distance.yardstick import measured
 from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
@@ -89,6 +90,9 @@ def refuse(base: Wrapped, request: LadderRequest) -> None:
         raise SettingsError(f"{base.model.family}: its splats have a 3D filter, so that levels by distance cannot mix them; give by zoom")
     if (trained_with := base.effects().screen_filter) in INTEGRATED:
         raise SettingsError(f"levels by distance need a base with a dilation; this one was trained with {trained_with}; give by zoom")
+    means, near = base.model.parameters()["means"].detach(), base.effects().near_plane
+    if not any(math.isfinite(foreground(view, means, near)) for view in base.views()):
+        raise SettingsError("no camera sees a splat, so that no distance follows from them; give the scene's --cameras, or levels by zoom")
     if request.least_db is not None or request.until_splats is not None:
         raise SettingsError("least_db and until_splats: levels by distance follow from the distances of the cameras; leave both out")
     if taken := {"merge_to", "most_splats"} & request.settings.keys():
