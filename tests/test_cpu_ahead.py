@@ -67,6 +67,6 @@ def test_what_is_sent_to_the_process_compiles_a_backward_pass(monkeypatch, has_c
     monkeypatch.setattr(ahead, "_are_compiled", lambda: False)
     sent = pickle.loads(ahead.start(has_covariances, Effects(0)).stdin.written)
     drawn = []
-    monkeypatch.setattr(ahead.drawing, "draw_back", lambda drawing, *d_outputs: drawn.append(drawing))
+    monkeypatch.setattr(ahead.drawing, "draw_back", lambda splats, *rest: drawn.append(splats))
     ahead.compile_back(*sent)
-    assert len(drawn[0].splats.covariances) == has_covariances
+    assert len(drawn[0].covariances) == has_covariances

@@ -20,9 +20,10 @@ from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.cpu import NO_NUMBA, CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, RenderSettings
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.viewers import BUILT_IN
 
 needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
 BACKEND = CpuBackend()
@@ -137,6 +138,39 @@ def test_the_number_of_threads_changes_no_bit(screen_filter, threads_for_any_wor
     for image, alpha, grads in results[1:]:
         assert torch.equal(image, results[0][0]) and torch.equal(alpha, results[0][1])
         assert all(torch.equal(grad, results[0][2][name]) for name, grad in grads.items())
+
+
+SHOTS = [
+    (WIDE, Effects(1)), (camera(40, 30, 50.0, 50.0), Effects(1, "analytic", background=(0.2, 0.4, 0.6))), (WIDE, Effects(0, "window")),
+    (camera(40, 30, 50.0, 50.0), Effects(1, settings=RenderSettings(bucketed=True, picture_step=1 / 255))),
+]  # fmt: skip
+
+
+@needs_numba
+def test_views_of_any_effects_drawn_in_one_call_are_those_drawn_alone(threads_for_any_work):
+    g = gaussians(2000, dtype=torch.float32)
+    alone, together = leaf(g), []
+    images = [BACKEND.render(alone, *shot).image for shot in SHOTS]
+    sum(image.square().sum() for image in images).backward()
+    for threads in (1, 2, 5):
+        torch.set_num_threads(threads)
+        leaves = leaf(g)
+        drawn = BACKEND.render_views(leaves, SHOTS)
+        assert all(torch.equal(rendered.image, image) for rendered, image in zip(drawn, images, strict=True))
+        sum(rendered.image.square().sum() for rendered in drawn).backward()
+        together.append(leaves)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        first, *others = (getattr(leaves, name).grad for leaves in together)
+        assert all(torch.equal(other, first) for other in others)
+        torch.testing.assert_close(first, getattr(alone, name).grad, atol=1e-5 * float(first.abs().max()), rtol=1e-4)
+
+
+@needs_numba
+def test_packed_views_are_packed_for_each_camera():
+    packed = next(viewer for viewer in BUILT_IN if viewer.settings.packing).effects(Effects(1))
+    g, shots = gaussians(300, dtype=torch.float32), [(each, packed) for each, _ in SHOTS[:2]]
+    drawn = BACKEND.render_views(g, shots)
+    assert all(torch.equal(rendered.image, BACKEND.render(g, *shot).image) for rendered, shot in zip(drawn, shots, strict=True))
 
 
 @needs_numba

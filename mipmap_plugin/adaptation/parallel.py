@@ -1,6 +1,8 @@
-"""The choice between rendering views in parallel and one after the other."""
+"""The choice between rendering views in parallel, in one call, and one after the other."""
 
 from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
 
 from torch import Tensor
 
@@ -11,8 +13,25 @@ from mipmap_plugin.camera import Camera
 # needs memory at a time.
 SMALL = 1 << 19
 
+# Views that a step draws in one call, and their pixels: all of them are in memory until the step's gradients are known. A view's lists take a
+# third of what a gradient of its splats takes, of which only one is needed then; more views at once gain nothing.
+VIEWS_AT_ONCE, PIXELS_AT_ONCE = 4, 1 << 20
+
+# Splats from which on torch's own threads pay off in what is done once a step: their parameters no longer fit into a cache.
+LARGE_FOR_TORCH = 1 << 17
+
 
 def max_threads(means: Tensor, camera: Camera) -> int:
     """The number of views to render in parallel, for splats with `means` [N, 3] and images of the size of `camera`'s."""
     small = means.device.type == "cpu" and len(means) + camera.width * camera.height <= SMALL
     return threads.for_views() if small else 1
+
+
+def views_at_once(camera: Camera) -> int:
+    """The number of views of the size of `camera`'s that a step draws in one call."""
+    return max(1, min(VIEWS_AT_ONCE, PIXELS_AT_ONCE // (camera.width * camera.height)))
+
+
+def large_for_torch(means: Tensor) -> AbstractContextManager[None]:
+    """Inside, torch has all threads if the splats with these `means` [N, 3] are many."""
+    return threads.lent_to_torch() if means.device.type == "cpu" and len(means) >= LARGE_FOR_TORCH else nullcontext()

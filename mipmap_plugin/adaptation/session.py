@@ -22,6 +22,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
+from mipmap_plugin.adaptation.renderers import renderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
 from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch
 from mipmap_plugin.adaptation.start.compilation import warm_up
@@ -31,12 +32,10 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.views import choose_views, over_band, with_times
-from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
 from mipmap_plugin.freed_memory import return_freed_memory
-from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.progress import announced
 
@@ -86,7 +85,7 @@ class Session:
             self.views_note += f", {len(self.views)} of them upsampled"
         self.state: StateFile | None = None
         truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
-        first, *further = [_renderer(self.backend, target) for target in self.extremes.values()]
+        first, *further = [renderer(self.backend, target) for target in self.extremes.values()]
         self.validation = Validation(steering, choosing, scale, truth, first, config.resize, further)
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
@@ -166,8 +165,10 @@ class Session:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
         max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
         max_splats = min(max_splats, self.config.most_splats or sys.maxsize)
-        first, *further = [_renderer(self.backend, _unrounded(target)) for target in self.extremes.values()]
-        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further)
+        targets = [unrounded(target) for target in self.extremes.values()]
+        first, *further = [renderer(self.backend, target) for target in targets]
+        together = views_renderer(self.backend, targets)
+        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -235,7 +236,7 @@ class Session:
         """PSNR (dB) in each viewer, where the file is made for several."""
         if len(self.targets) == 1:
             return {}
-        first, *further = [_renderer(self.backend, target) for target in self.targets.values()]
+        first, *further = [renderer(self.backend, target) for target in self.targets.values()]
         psnrs = replace(self.validation, render=first, further_renders=further).viewer_psnrs(model, self.validation.choosing)
         return dict(zip(self.targets, psnrs, strict=True))
 
@@ -267,16 +268,6 @@ class Session:
             versions=versions(),
             inputs=self.inputs,
         )
-
-
-def _renderer(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
-    """A function that renders the image of a camera. It holds no session, which would keep the state's file locked after the run."""
-    return lambda gaussians, camera: backend.render(gaussians, camera, effects).image
-
-
-def _unrounded(effects: Effects) -> Effects:
-    """The effects without the rounding of a viewer's file and picture, which is noise to an optimizer step and a third of its time."""
-    return replace(effects, settings=replace(effects.settings, packing=None, picture_step=None))
 
 
 def _free_memory() -> None:

@@ -140,7 +140,8 @@ class Backend(Protocol):
     # Optional: `note: str`, shown wherever the backend is listed or chosen. `own_threads: bool`: its kernels have threads of their own
     # (`threads.for_kernels`), return the same bytes on any number, and may run in several threads at once; then torch has one while adapting.
     # `blend_weights(gaussians, camera, effects) -> Tensor | None`: the sum of each splat's blend weights over the image, [N], or None where it has
-    # to be found from gradients.
+    # to be found from gradients. `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call, each shot a
+    # (camera, effects); adaptation steps are drawn so.
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""

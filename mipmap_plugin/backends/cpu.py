@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -21,7 +22,7 @@ from mipmap_plugin.splatting.packing import packed
 NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
 
 # The position of the coefficients among the arguments of `_Draw.forward`.
-SH = 7
+SH = 5
 
 
 class CpuBackend:
@@ -48,9 +49,19 @@ class CpuBackend:
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if numba is missing or the request is not supported."""
-        tensors, ranks = self._prepared(gaussians, camera, effects)
-        image, alpha = _Draw.apply(camera, effects, ranks, *tensors)  # type: ignore[no-untyped-call]  # torch's
-        return Rendered(image, alpha)
+        return self._drawn(gaussians, [(camera, effects)])[0]
+
+    def render_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
+        """Several views of the same splats, each with effects of its own, in one call. Raises as `render`."""
+        if any(effects.settings.packing is not None for _, effects in shots):  # which depends on the camera
+            return [self.render(gaussians, camera, effects) for camera, effects in shots]
+        return self._drawn(gaussians, shots)
+
+    def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
+        prepared = [self._prepared(gaussians, camera, effects) for camera, effects in shots]
+        wanted = [(*shot, ranks) for shot, (_, ranks) in zip(shots, prepared, strict=True)]
+        outputs = _Draw.apply(wanted, *prepared[0][0])  # type: ignore[no-untyped-call]  # torch's
+        return [Rendered(image, alpha) for image, alpha in zip(outputs[::2], outputs[1::2], strict=True)]
 
     @torch.no_grad()
     def blend_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor | None:
@@ -103,23 +114,28 @@ def _ahead() -> ModuleType:
 
 
 class _Draw(torch.autograd.Function):
+    """The image and the alpha of each shot, one after the other."""
+
     @staticmethod
-    def forward(ctx: Any, camera: Camera, effects: Effects, ranks: Any, *tensors: Any) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, shots: Sequence[tuple[Camera, Effects, Any]], *tensors: Any) -> tuple[Tensor, ...]:
         drawing, gradients = _drawing(), any(ctx.needs_input_grad)
-        ctx.kind = tensors[-1] is not None, effects
+        ctx.kinds = {(tensors[-1] is not None, effects) for _, effects, _ in shots}
         if gradients:
-            _ahead().start(*ctx.kind)
-        image, alpha, ctx.drawing = drawing.draw(drawing.as_arrays(*tensors), camera, effects, ranks, gradients=gradients)
+            for kind in ctx.kinds:
+                _ahead().start(*kind)
+        ctx.splats = drawing.as_arrays(*tensors)
+        ctx.drawings = drawing.draw(ctx.splats, [drawing.Shot(*shot) for shot in shots], gradients=gradients)
         ctx.save_for_backward(*tensors)
-        return torch.from_numpy(image), torch.from_numpy(alpha)
+        return tuple(torch.from_numpy(output) for drawn in ctx.drawings for output in (drawn.image, drawn.alpha))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor | None, ...]:
         tensors = ctx.saved_tensors  # read even where unused: torch raises an error here if one was modified in place
-        d_outputs = d_image.contiguous().numpy(), d_alpha.contiguous().numpy()
-        _ahead().wait(*ctx.kind)
-        grads = _drawing().draw_back(ctx.drawing, *d_outputs, harmonics=ctx.needs_input_grad[SH])
+        arrays = [gradient.contiguous().numpy() for gradient in d_outputs]
+        for kind in ctx.kinds:
+            _ahead().wait(*kind)
+        pairs = list(zip(arrays[::2], arrays[1::2], strict=True))
+        grads = _drawing().draw_back(ctx.splats, ctx.drawings, pairs, harmonics=ctx.needs_input_grad[SH])
         # Gradients that are not wanted, and those of the shape that is not in use, are empty: None for torch.
-        pairs = zip(tensors, grads, strict=True)
-        return None, None, None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in pairs)
+        return None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in zip(tensors, grads, strict=True))

@@ -15,12 +15,11 @@ from mipmap_plugin.adaptation.optimization.growing import control_density, froze
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.parallel import max_threads
+from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, views_at_once
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.threads import side_by_side
 
 # The square of half a step of an 8-bit image: smaller mean square differences are invisible on a display, and hardly count.
@@ -85,30 +84,24 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     progress = run.progress(config)
     set_rates(run.optimizer, config, progress, run.steering.rate_factor(progress, config), frozen=frozen_parameters(run))
     splats = Activation(run.student, share=len(views) > 1)
-    splats.activate(cameras[views[0]])
-
-    def render_and_compare(draw_and_view: tuple[int, Camera]) -> tuple[Gaussians, Camera, Tensor]:
-        draw, view = draw_and_view
-        camera = cameras[view]
-        gaussians = splats(camera)
-        target = run.costs.truth(view, task.truth)  # r(x̂): the frozen base, resized
-        image = task.renderer(draw)(gaussians, camera)  # x: the student at the new scale
-        difference = difference_from(target, image, config.resize)
-        square_error = difference.square().mean()
-        loss = _loss(difference, square_error, config.loss)
-        (loss if task.detail is None else loss + task.detail(view, image)).backward()
-        return gaussians, camera, square_error.detach()
-
-    draws = list(enumerate(views, run.step * config.views_per_step))
-    threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if splats.shares else 1
-    for gaussians, camera, square_error in side_by_side(render_and_compare, draws, threads):
-        run.square_error = run.square_error + square_error.double() / len(views)
+    with large_for_torch(run.student.parameters()["means"]):
+        splats.activate(cameras[views[0]])
+    at_once = views_at_once(cameras[views[0]]) if splats.shares and task.render_views and run.gradients is None else 1
+    for number in range(0, len(views), at_once):
+        some = views[number : number + at_once]
+        targets = _truths(run, task, some, cameras)  # r(x̂): the frozen base, resized
+        gaussians = splats(cameras[some[0]])
+        images = task.images(gaussians, [cameras[view] for view in some], run.step * config.views_per_step + number)  # x: the student
+        losses, square_errors = zip(*(_compare(task, config, *each) for each in zip(some, images, targets, strict=True)), strict=True)
+        sum(losses[1:], losses[0]).backward()
+        run.square_error = run.square_error + sum(square_errors) / len(views)
         if run.gradients is not None:
-            run.gradients.add(*splats.means_gradient(gaussians), camera)
+            run.gradients.add(*splats.means_gradient(gaussians), cameras[some[0]])
         splats.accumulate(gaussians)
-    del gaussians  # shares the colors' memory, which is needed for their gradients
-    splats.backward()
-    run.optimizer.step()
+        del gaussians, images, losses  # what the gradients need has the memory of these
+    with large_for_torch(run.student.parameters()["means"]):
+        splats.backward()
+        run.optimizer.step()
     run.optimizer.zero_grad()
     run.step += 1
     if run.step % config.prune_every == 0 and run.step < config.steps:
@@ -116,6 +109,21 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
 
 
 # --8<-- [end:step]
+
+
+def _truths(run: Run, task: Task, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> list[Tensor]:
+    """The truths of some views; those that no step used yet are made side by side."""
+    new = [view for view in views if view not in run.costs.truths]
+    threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if len(new) > 1 else 1
+    return list(side_by_side(lambda view: run.costs.truth(view, task.truth), views, threads))
+
+
+def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """The loss of one image, and its mean square error."""
+    difference = difference_from(target, image, config.resize)
+    square_error = difference.square().mean()
+    loss = _loss(difference, square_error, config.loss)
+    return loss if task.detail is None else loss + task.detail(view, image), square_error.detach().double()
 
 
 def _loss(difference: Tensor, square_error: Tensor, name: str) -> Tensor:

@@ -26,6 +26,10 @@ from mipmap_plugin.models.base import SplatModel
 AGREEMENT_VIEWS = 8
 
 
+# Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
+ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
+
+
 @dataclass(frozen=True)
 class Task:
     """What is optimized: the views, their truth, and the renderers."""
@@ -39,10 +43,17 @@ class Task:
     detail: Callable[[Camera, Tensor], Tensor] | None = None  # a view and its image -> a further part of the loss
     max_splats: int = sys.maxsize  # growing stops at this number
     further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
+    render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
 
     def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
         return (self.render, *self.further_renders)[draw % (1 + len(self.further_renders))]
+
+    def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
+        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
+        if self.render_views is not None:
+            return self.render_views(gaussians, cameras, draw)
+        return [self.renderer(draw + number)(gaussians, camera) for number, camera in enumerate(cameras)]
 
     def pixel(self, means: Tensor) -> float:
         """The size of a target pixel at the median of `means` [N, 3], in world units."""

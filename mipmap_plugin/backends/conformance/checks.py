@@ -68,6 +68,23 @@ def check_case(backend: Backend, name: str, build: Builder, *, dtype: torch.dtyp
     return compare(name, actual, expected_answer(build, dtype), dtype)
 
 
+def check_views(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Outcome:
+    """Check that `render_views`, which few backends have, draws a case and another view of it as `render` does, and sums their gradients."""
+    case = build()
+    splats = case.gaussians.to(device, dtype)
+    shots = [(case.camera, case.effects), (case.camera.zoomed(0.5), case.effects)]
+    answers = []
+    for renders in (backend.render_views, lambda splats, shots: [backend.render(splats, *shot) for shot in shots]):  # type: ignore[attr-defined]
+        leaves = {f.name: getattr(splats, f.name) for f in fields(Gaussians)}
+        leaves = {name: leaf.detach().clone().requires_grad_() for name, leaf in leaves.items() if leaf is not None}
+        images = torch.cat([rendered.image.flatten(0, 1) for rendered in renders(Gaussians(**leaves), shots)])
+        alphas = torch.cat([rendered.alpha.flatten() for rendered in renders(Gaussians(**leaves), shots)])
+        grads = torch.autograd.grad(images.square().sum(), list(leaves.values()), allow_unused=True, materialize_grads=True)
+        answers.append(Answer(_plain(images)[None], _plain(alphas)[None, :, None], dict(zip(leaves, map(_plain, grads), strict=True))))
+    together, alone = answers
+    return compare("views", together, alone, dtype)
+
+
 def draw(backend: Backend, case: HardCase, *, differentiate: bool = True) -> Answer:
     """Render `case`, and differentiate the sum of the image under fixed random weights of both signs."""
     leaves = {f.name: getattr(case.gaussians, f.name) for f in fields(Gaussians)}

@@ -7,7 +7,7 @@ import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend
 from mipmap_plugin.backends.conformance.cases import CASES
-from mipmap_plugin.backends.conformance.checks import check_case
+from mipmap_plugin.backends.conformance.checks import check_case, check_views
 
 
 class BackendSuite:
@@ -30,4 +30,10 @@ class BackendSuite:
         outcome = check_case(self.backend, case, CASES[case], dtype=self.dtype, device=self.device)
         if outcome.skipped:
             pytest.skip(outcome.message)
+        assert outcome.passed, outcome.message
+
+    def test_views_in_one_call_are_those_drawn_alone(self) -> None:
+        if not hasattr(self.backend, "render_views"):
+            pytest.skip("it draws one view at a time")
+        outcome = check_views(self.backend, CASES["sh-degree-3"], dtype=self.dtype, device=self.device)
         assert outcome.passed, outcome.message

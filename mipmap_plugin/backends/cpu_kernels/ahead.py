@@ -57,7 +57,7 @@ def compile_back(has_covariances: bool, effects: Effects) -> None:
     camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
     view, integers = drawing.view_of(camera, effects, splats, gradients=True), np.zeros(0, np.int32)
     lists = Lists(np.zeros(1, np.int64), integers, np.zeros(0, np.int64), integers)
-    pixel = np.zeros((1, 1), np.float32)
-    drawn = drawing.Drawing(view, splats, np.zeros((1, layout.SPLAT_FIELDS), np.float32), np.zeros(2, np.int64), lists,
-                            Frame(np.zeros(3, np.float32), pixel, pixel), Limits(0.0, 0.0, 0.0))  # fmt: skip
-    drawing.draw_back(drawn, np.zeros((1, 1, 3), np.float32), pixel)
+    pixel, picture = np.zeros((1, 1), np.float32), np.zeros((1, 1, 3), np.float32)
+    table, slots, frame = np.zeros((1, layout.SPLAT_FIELDS), np.float32), np.zeros(2, np.int64), Frame(np.zeros(3, np.float32), pixel, pixel)
+    drawn = drawing.Drawing(view, drawing.flags_of(view, splats), Limits(0.0, 0.0, 0.0), table, slots, lists, frame, picture, pixel)
+    drawing.draw_back(splats, [drawn], [(picture, pixel)])

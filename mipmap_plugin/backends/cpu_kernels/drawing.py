@@ -1,8 +1,10 @@
-"""One image and its gradients: the kernels in order."""
+"""Views of the same splats, and their gradients: the kernels in order, each for all views at once."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +12,7 @@ from torch import Tensor
 
 from mipmap_plugin.backends.cpu_kernels import compositing, compositing_back, layout, projection, projection_back, rounding, sorting, window_tiles
 from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL, OVER_WINDOW, Flags, Frame, Limits, Lists, SplatArrays, View
-from mipmap_plugin.backends.cpu_kernels.threads import team
+from mipmap_plugin.backends.cpu_kernels.threads import Team, team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.pool import empty
@@ -19,61 +21,109 @@ from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, w_end
 SAMPLING = {"analytic": OVER_PIXEL, "window": OVER_WINDOW}
 
 
+# Splats whose gradients are summed over the views at a time: their gradients, 236 bytes each, stay in the cache meanwhile.
+ROWS = 1 << 13
+
+
+class Shot(NamedTuple):
+    """A view to be drawn."""
+
+    camera: Camera
+    effects: Effects
+    ranks: np.ndarray | None = None  # [N] int32, front to back; sorts splats instead of their depths
+
+
 class Drawing(NamedTuple):
-    """What the backward pass needs of a forward pass."""
+    """A view: what is drawn, and what the backward pass needs of it."""
 
     view: View
-    splats: SplatArrays
+    flags: Flags
+    limits: Limits
     table: np.ndarray  # [N, SPLAT_FIELDS]
     slots: np.ndarray  # [N + 1] each splat's first slot
     lists: Lists
     frame: Frame
-    limits: Limits
+    image: np.ndarray  # [H, W, 3]
+    alpha: np.ndarray  # [H, W]
 
 
-def draw(
-    splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None, *, gradients: bool = True
-) -> tuple[np.ndarray, np.ndarray, Drawing]:
-    """The image [H, W, 3], alpha [H, W] and what `draw_back` needs. ranks: [N] int32, front to back; sorts splats instead of their depths.
-
-    gradients: whether `draw_back` will be called.
-    """
-    view = view_of(camera, effects, splats, gradients)
-    limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, effects.settings.picture_step or 0.0)
-    count, (height, width) = len(splats.means), camera.size
-    table, depths, counts, slots = empty(count, layout.SPLAT_FIELDS), empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
-    outputs = empty(height, width, 3), empty(height, width)
-    frame = Frame(np.array(effects.background, np.float32), empty(height, width), empty(height, width))
-    threads = team(count + width * height)
-    flags = flags_of(view, splats)
-    threads.share(projection.project, count, flags, view, splats, table, depths, counts)
-    np.cumsum(counts, out=slots[1:])
-    lists = sorting.tile_lists(table, depths if ranks is None else ranks, slots, width, height, threads)
-    if view.sampling == OVER_WINDOW:
-        threads.share(window_tiles.composite, len(lists.starts) - 1, table, lists, frame, outputs)
-    else:
-        threads.share(compositing.composite, len(lists.starts) - 1, flags.integrated, limits, table, lists, frame, outputs)
-        if limits.picture_step > 0:
-            threads.share(rounding.composite, len(lists.starts) - 1, limits, table, lists, frame, outputs)
-    return *outputs, Drawing(view, splats, table, slots, lists, frame, limits)
+def draw(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = True) -> list[Drawing]:
+    """Draw several views of the same splats. gradients: whether `draw_back` will be called."""
+    count = len(splats.means)
+    threads = team(sum(count + shot.camera.width * shot.camera.height for shot in shots))
+    views = [view_of(shot.camera, shot.effects, splats, gradients) for shot in shots]
+    flags = [flags_of(view, splats) for view in views]
+    tables = [(empty(count, layout.SPLAT_FIELDS), empty(count), np.empty(count, np.int64)) for _ in shots]
+    threads.share_all(projection.project, [(count, (*drawn, splats, *table)) for *drawn, table in zip(flags, views, tables, strict=True)])
+    projected = []
+    for shot, (table, depths, counts) in zip(shots, tables, strict=True):
+        slots = np.zeros(count + 1, np.int64)
+        np.cumsum(counts, out=slots[1:])
+        projected.append(sorting.Projected(table, depths if shot.ranks is None else shot.ranks, slots, shot.camera.size))
+    drawings = [
+        _blank(shot, view, own, of, lists)
+        for shot, view, own, of, lists in zip(shots, views, flags, projected, sorting.tile_lists(projected, threads), strict=True)
+    ]
+    _composite(drawings, threads)
+    return drawings
 
 
-def draw_back(drawing: Drawing, d_image: np.ndarray, d_alpha: np.ndarray, *, harmonics: bool = True) -> SplatArrays:
-    """The gradients of the splats from those of the image [H, W, 3] and its alpha [H, W].
+def _blank(shot: Shot, view: View, flags: Flags, of: sorting.Projected, lists: Lists) -> Drawing:
+    """A view whose picture is not drawn yet."""
+    (height, width), settings = of.size, shot.effects.settings
+    frame = Frame(np.array(shot.effects.background, np.float32), empty(height, width), empty(height, width))
+    limits = Limits(settings.max_alpha, settings.min_transmittance, settings.picture_step or 0.0)
+    return Drawing(view, flags, limits, of.table, of.slots, lists, frame, empty(height, width, 3), empty(height, width))
+
+
+def _composite(drawings: Sequence[Drawing], threads: Team) -> None:
+    """Draw the pictures."""
+    windows, points, rounded = [], [], []
+    for d in drawings:
+        tiles, arguments = len(d.lists.starts) - 1, (d.table, d.lists, d.frame, (d.image, d.alpha))
+        if d.view.sampling == OVER_WINDOW:
+            windows.append((tiles, arguments))
+        else:
+            points.append((tiles, (d.flags.integrated, d.limits, *arguments)))
+        if d.limits.picture_step > 0 and d.view.sampling != OVER_WINDOW:
+            rounded.append((tiles, (d.limits, *arguments)))
+    threads.share_all(window_tiles.composite, windows)
+    threads.share_all(compositing.composite, points)
+    threads.share_all(rounding.composite, rounded)
+
+
+def draw_back(
+    splats: SplatArrays, drawings: Sequence[Drawing], d_outputs: Sequence[tuple[np.ndarray, np.ndarray]], *, harmonics: bool = True
+) -> SplatArrays:
+    """The gradients of the splats, summed over the views, from those of each view's image [H, W, 3] and alpha [H, W].
 
     harmonics: whether to compute those of the coefficients, by far the largest array; else that array is empty.
     """
-    view, splats, table, slots, lists, frame, limits = drawing
-    tile_grads, grads = empty(len(lists.members), layout.GRADS), SplatArrays(*(empty(*array.shape) for array in splats))
+    threads = team(sum(len(splats.means) + drawn.alpha.size for drawn in drawings))
+    tile_grads = [empty(len(drawn.lists.members), layout.GRADS) for drawn in drawings]
+    windows, points = [], []
+    for d, outputs, into in zip(drawings, d_outputs, tile_grads, strict=True):
+        tiles = len(d.lists.starts) - 1
+        if d.view.sampling == OVER_WINDOW:
+            windows.append((tiles, (d.table, d.lists, d.frame, outputs, into)))
+        else:
+            points.append((tiles, (d.flags.integrated, d.flags.reshaped, d.flags.faded, d.limits, d.table, d.lists, d.frame, outputs, into)))
+    threads.share_all(window_tiles.composite_back, windows)
+    threads.share_all(compositing_back.composite_back, points)
+    grads = SplatArrays(*(empty(*array.shape) for array in splats))
     if not harmonics:
         grads = grads._replace(sh=grads.sh[:0])
-    threads, flags = team(len(splats.means) + view.width * view.height), flags_of(view, splats)
-    if view.sampling == OVER_WINDOW:
-        threads.share(window_tiles.composite_back, len(lists.starts) - 1, table, lists, frame, (d_image, d_alpha), tile_grads)
-    else:
-        arguments = flags.integrated, flags.reshaped, flags.faded, limits, table, lists, frame, (d_image, d_alpha), tile_grads
-        threads.share(compositing_back.composite_back, len(lists.starts) - 1, *arguments)
-    threads.share(projection_back.project_back, len(splats.means), flags, view, splats, table, slots, tile_grads, grads)
+
+    def add_views(start: int, stop: int) -> None:
+        """The gradients of the splats start..stop: what no view shows has none, and costs nothing but its zeros."""
+        for first in range(start, stop, ROWS):
+            last = min(first + ROWS, stop)
+            for array in grads:
+                array[first:last] = 0
+            for d, rows in zip(drawings, tile_grads, strict=True):
+                projection_back.project_back(first, last, d.flags, d.view, splats, d.table, d.slots, rows, grads)
+
+    threads.share(add_views, len(splats.means))
     return grads
 
 
@@ -91,6 +141,12 @@ def flags_of(view: View, splats: SplatArrays) -> Flags:
 
 def view_of(camera: Camera, effects: Effects, splats: SplatArrays, gradients: bool) -> View:
     """The camera, effects and settings as kernels need them."""
+    return _view_of(camera, effects, math.isqrt(splats.sh.shape[1]) - 1, gradients)
+
+
+@lru_cache(maxsize=1024)
+def _view_of(camera: Camera, effects: Effects, sh_degree: int, gradients: bool) -> View:
+    """`view_of` for splats of this degree: an adaptation draws the same views again and again, and this takes as long as 1000 splats."""
     settings = effects.settings
     left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy
@@ -114,7 +170,7 @@ def view_of(camera: Camera, effects: Effects, splats: SplatArrays, gradients: bo
         eps2d=float(effects.eps2d),
         min_compensation=LEAST_COMPENSATION.get(effects.screen_filter, 1.0),
         sampling=SAMPLING.get(effects.screen_filter, AT_CENTER),
-        sh_degree=min(effects.sh_degree, math.isqrt(splats.sh.shape[1]) - 1),
+        sh_degree=min(effects.sh_degree, sh_degree),
         max_color=math.inf if settings.max_color is None else settings.max_color,
         color_steps=settings.color_steps or (0.0, 0.0, 0.0),
         radial=settings.radial,

@@ -34,7 +34,7 @@ new_sums, new_rows = scratch(layout.GRADS * WIDTH, types.float64), scratch(WIDTH
 
 @kernel
 def project_back(start, stop, flags, view, splats, table, slots, tile_grads, grads):
-    """Write the gradients of the splats start..stop; splat i's tiles have the rows slots[i]..slots[i + 1] of tile_grads."""
+    """Add a view's gradients to those of the splats start..stop; splat i's tiles have the rows slots[i]..slots[i + 1] of tile_grads."""
     covariances, integrated, reshaped, _, fourth = flags
     stride = 3 * splats.sh.shape[1]
     colors = pointer(splats.sh), pointer(grads.sh), pointer(table), stride, len(grads.sh) > 0
@@ -46,37 +46,12 @@ def project_back(start, stop, flags, view, splats, table, slots, tile_grads, gra
             load_splat(i, size, arrays, covariances, world)
             rows[size] = i
             size += 1
-        else:
-            clear(i, targets, covariances, colors)
         if size == WIDTH or (i == stop - 1 and size > 0):
             grad_splats(view, covariances, integrated, reshaped, world, sums, d_world)
             grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d_world)
             for lane in range(size):
                 store_grads(rows[lane], lane, d_world, targets, covariances)
             size = 0
-
-
-@inner
-def clear(i, targets, has_covariances, colors):
-    """Write zero gradients for splat i."""
-    d_means, d_opacities, d_quats, d_scales, d_covariances = targets
-    _, d_sh, _, stride, wanted = colors
-    fill_zeros(d_means, 3 * i, 3)
-    fill_zeros(d_opacities, i, 1)
-    if wanted:
-        fill_zeros(d_sh, stride * i, stride)
-    if has_covariances is not None:
-        fill_zeros(d_covariances, 9 * i, 9)
-    else:
-        fill_zeros(d_scales, 3 * i, 3)
-        fill_zeros(d_quats, 4 * i, 4)
-
-
-@inner
-def fill_zeros(target, first, count):
-    """Set target[first : first + count] to 0."""
-    for at in range(first, first + count):
-        target[at] = 0
 
 
 @inner
@@ -91,19 +66,19 @@ def sum_tiles(tile_rows, first, last, lane, sums):
 
 @inner
 def store_grads(i, lane, d_world, targets, has_covariances):
-    """Write a lane of the block `d_world` to the gradients of splat i."""
+    """Add a lane of the block `d_world` to the gradients of splat i."""
     d_means, d_opacities, d_quats, d_scales, d_covariances = targets
     for k in range(3):
-        d_means[3 * i + k] = d_world[(MEAN + k) * WIDTH + lane]
-    d_opacities[i] = d_world[OPACITY * WIDTH + lane]
+        d_means[3 * i + k] += d_world[(MEAN + k) * WIDTH + lane]
+    d_opacities[i] += d_world[OPACITY * WIDTH + lane]
     if has_covariances is not None:
         for k in range(9):
-            d_covariances[9 * i + k] = d_world[(COVARIANCE + k) * WIDTH + lane]
+            d_covariances[9 * i + k] += d_world[(COVARIANCE + k) * WIDTH + lane]
     else:
         for k in range(4):
-            d_quats[4 * i + k] = d_world[(QUAT + k) * WIDTH + lane]
+            d_quats[4 * i + k] += d_world[(QUAT + k) * WIDTH + lane]
         for k in range(3):
-            d_scales[3 * i + k] = d_world[(SCALE + k) * WIDTH + lane]
+            d_scales[3 * i + k] += d_world[(SCALE + k) * WIDTH + lane]
 
 
 @inner
@@ -209,7 +184,7 @@ def grad_integral(view, shape, dilated, opacity, sums):
 
 @inner
 def grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d_world):
-    """The gradients through the color: write those of the coefficients if wanted, and add to those of the means."""
+    """The gradients through the color: add those of the coefficients if wanted, and those of the means in `d_world`."""
     direction, length = view_direction(view, get_vector(world, MEAN))
     harmonics.basis(narrowed(direction), view.sh_degree, fourth, bands)
     for lane in range(size):
@@ -237,5 +212,6 @@ def grad_color(i, lane, view, colors, sums, bands, d_bands):
     if wanted:
         for j in range(used):
             band = bands[j * WIDTH + lane]
-            d_sh[at + 3 * j], d_sh[at + 3 * j + 1], d_sh[at + 3 * j + 2] = d_red * band, d_green * band, d_blue * band
-        fill_zeros(d_sh, at + 3 * used, stride - 3 * used)
+            d_sh[at + 3 * j] += d_red * band
+            d_sh[at + 3 * j + 1] += d_green * band
+            d_sh[at + 3 * j + 2] += d_blue * band

@@ -7,6 +7,9 @@ splats of each tile. The runs are in order, so the lists do not depend on the nu
 # numba redefines calls and operators.
 # mypy: ignore-errors
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numba import types
 
@@ -34,17 +37,33 @@ new_block, new_spans = scratch(layout.OUTLINE_FIELDS * WIDTH, types.float32), sc
 new_slots, new_counts = scratch(WIDTH, types.int64), scratch(1 << DIGIT_BITS, types.int64)
 
 
-def tile_lists(table: np.ndarray, depths: np.ndarray, slots: np.ndarray, width: int, height: int, team: Team) -> Lists:
-    """Each tile's splats and their slots, not yet sorted by depth."""
-    tiles_x, tiles_y = binning.tile_grid(width, height)
-    pairs = int(slots[-1])
+class Projected(NamedTuple):
+    """A view's splats, of which lists are made."""
+
+    table: np.ndarray  # [N, SPLAT_FIELDS]
+    order: np.ndarray  # [N] depths, or ranks: by what splats are sorted
+    slots: np.ndarray  # [N + 1] each splat's first slot
+    size: tuple[int, int]  # height, width
+
+
+def tile_lists(views: Sequence[Projected], team: Team) -> list[Lists]:
+    """Each tile's splats and their slots, of each view, not yet sorted by depth."""
     runs = 1 if team.threads == 1 else RUNS_PER_THREAD * team.threads
-    tiles, splats, counts = empty(pairs, dtype=np.int32), empty(pairs, dtype=np.int32), np.empty((runs, tiles_x * tiles_y), np.int64)
-    team.share(write_slots, runs, table, slots, width, height, tiles, splats, counts)
-    starts = np.append(offsets(counts), pairs)
-    entries = empty(pairs, dtype=np.int64)
-    team.share(fill_entries, runs, depths.view(np.int32), slots, tiles, counts, entries)
-    return Lists(starts, empty(pairs, dtype=np.int32), entries, splats)
+    written = []
+    for _, _, slots, (height, width) in views:
+        tiles_x, tiles_y = binning.tile_grid(width, height)
+        pairs = int(slots[-1])
+        written.append((empty(pairs, dtype=np.int32), empty(pairs, dtype=np.int32), np.empty((runs, tiles_x * tiles_y), np.int64)))
+    team.share_all(write_slots, [(runs, (view.table, view.slots, *view.size, *places)) for view, places in zip(views, written, strict=True)])
+    starts = [np.append(offsets(counts), len(tiles)) for tiles, _, counts in written]
+    entries = [empty(len(tiles), dtype=np.int64) for tiles, _, _ in written]
+    jobs = [
+        (runs, (view.order.view(np.int32), view.slots, tiles, counts, into))
+        for view, (tiles, _, counts), into in zip(views, written, entries, strict=True)
+    ]
+    team.share_all(fill_entries, jobs)
+    splats_of = [splats for _, splats, _ in written]
+    return [Lists(*lists) for lists in zip(starts, [empty(len(splats), dtype=np.int32) for splats in splats_of], entries, splats_of, strict=True)]
 
 
 @inner
@@ -55,7 +74,7 @@ def run_bounds(slots, run, runs):
 
 
 @kernel
-def write_slots(start, stop, table, slots, width, height, tiles, splats, counts):
+def write_slots(start, stop, table, slots, height, width, tiles, splats, counts):
     """Write the tile and the splat of every slot in the runs start..stop, and count the slots per run and tile."""
     fields, block, spans, next_slots = pointer(table), new_block(), new_spans(), new_slots()
     for run in range(start, stop):

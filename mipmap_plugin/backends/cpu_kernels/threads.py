@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import ctypes
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,23 +30,34 @@ class Team:
 
     def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
         """Call `kernel(start, stop, *arguments)` on ranges that cover 0..count, in all threads."""
+        self.share_all(kernel, [(count, arguments)])
+
+    def share_all(self, kernel: Callable[..., None], jobs: Sequence[tuple[int, tuple[Any, ...]]]) -> None:
+        """`share` for several jobs at once: the count and the arguments of each."""
         if self.threads == 1:
-            kernel(0, count, *arguments)
+            for count, arguments in jobs:
+                kernel(0, count, *arguments)
             return
-        ends = [count * thread // self.threads for thread in range(self.threads + 1)]
-        queues = [deque(chunks(first, last, max(1, int(count * MIN_CHUNK_SHARE)))) for first, last in pairwise(ends)]
+        queues = [deque(self._ranges(thread, [count for count, _ in jobs])) for thread in range(self.threads)]
 
         def work(thread: int) -> None:
             # First the thread's own queue, whose data is still in its cache; then the ends of the other queues.
             for queue in queues[thread:] + queues[:thread]:
                 while queue:
                     try:
-                        start, stop = queue.popleft() if queue is queues[thread] else queue.pop()
+                        job, start, stop = queue.popleft() if queue is queues[thread] else queue.pop()
                     except IndexError:  # another thread was quicker
                         break
-                    kernel(start, stop, *arguments)
+                    kernel(start, stop, *jobs[job][1])
 
         threads.team(work, self.threads)
+
+    def _ranges(self, thread: int, counts: Sequence[int]) -> Iterator[tuple[int, int, int]]:
+        """What a thread begins with: the job, the start and the stop of each of its chunks."""
+        for job, count in enumerate(counts):
+            first, last = count * thread // self.threads, count * (thread + 1) // self.threads
+            for start, stop in chunks(first, last, max(1, int(sum(counts) * MIN_CHUNK_SHARE))):
+                yield job, start, stop
 
 
 def chunks(first: int, last: int, min_chunk: int) -> Iterator[tuple[int, int]]:

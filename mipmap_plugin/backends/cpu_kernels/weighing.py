@@ -29,7 +29,7 @@ def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarr
     threads, flags = team(count + width * height), flags_of(view, splats)
     threads.share(projection.project, count, flags, view, splats, table, depths, counts)
     np.cumsum(counts, out=slots[1:])
-    lists = sorting.tile_lists(table, depths if ranks is None else ranks, slots, width, height, threads)
+    [lists] = sorting.tile_lists([sorting.Projected(table, depths if ranks is None else ranks, slots, camera.size)], threads)
     by_pair, by_splat = empty(len(lists.members)), empty(count)
     threads.share(weigh_tiles, len(lists.starts) - 1, flags.integrated, limits, table, lists, (width, height), by_pair)
     threads.share(sum_pairs, count, slots, by_pair, by_splat)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -175,7 +174,7 @@ class LevelRun:
         states[f"the start, {name}"] = initial
         self.seconds["total"] = time.perf_counter() - began
         if self.config.steps:
-            task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, None, sys.maxsize, (), self.size)
+            task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, size=self.size)
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
             ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due)
