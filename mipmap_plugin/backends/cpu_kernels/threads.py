@@ -34,7 +34,7 @@ class Team:
 
     def share_all(self, kernel: Callable[..., None], jobs: Sequence[tuple[int, tuple[Any, ...]]]) -> None:
         """`share` for several jobs at once: the count and the arguments of each."""
-        if self.threads == 1:
+        if self.threads == 1 or not jobs:
             for count, arguments in jobs:
                 kernel(0, count, *arguments)
             return
