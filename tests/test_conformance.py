@@ -16,6 +16,7 @@ from mipmap_plugin.backends import get_backend, reference
 from mipmap_plugin.backends.base import Capabilities, Rendered
 from mipmap_plugin.backends.conformance import CASES, MORE, TOLERANCE, check_backend
 from mipmap_plugin.backends.conformance.cases import random_scene
+from mipmap_plugin.backends.conformance.checks import check_views
 from mipmap_plugin.backends.conformance.suite import BackendSuite
 from mipmap_plugin.backends.conformance.tolerance import PIXEL_BAND, differing_gradients, differing_images
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -87,6 +88,19 @@ FEW = {name: CASES[name] for name in ("no-splat", "one-splat", "sh-degree-1", "n
 
 def failed(backend):
     return {outcome.case: outcome.message for outcome in check_backend(backend, FEW) if not outcome.passed}
+
+
+class ForgetsAView(ReferenceBackend):
+    """Draws all views, and differentiates the first of them alone."""
+
+    def render_views(self, gaussians, shots):
+        drawn = [self.render(gaussians, *shot) for shot in shots]
+        return [drawn[0], *(Rendered(each.image.detach(), each.alpha.detach()) for each in drawn[1:])]
+
+
+def test_a_view_without_gradient_in_one_call_is_caught():
+    outcome = check_views(ForgetsAView(), CASES["sh-degree-3"])
+    assert not outcome.passed and "gradient of means" in outcome.message
 
 
 def test_gradients_one_percent_too_long_are_caught():

@@ -1,4 +1,4 @@
-"""The choice between rendering views in parallel, in one call, and one after the other."""
+"""The choice between rendering views in parallel, in one call, and one after the other, and of threads for torch."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from mipmap_plugin.models.base import SplatModel
 class Activation:
     """A model's activated splats for the views of a step; passes their gradients back to the model's parameters.
 
-    When shared, each view gets leaves of its own, so that views can be rendered in parallel; their gradients are summed in the order of the
-    views, whatever order they were rendered in. Activations, about a tenth of the time of small images, are computed and differentiated once.
+    When shared, the views that are drawn in one call get leaves of their own, so that no graph outlives its call; gradients are summed in the order
+    of the calls. Activations, about a tenth of the time of small images, are computed and differentiated once.
     """
 
     def __init__(self, model: SplatModel, *, share: bool) -> None:

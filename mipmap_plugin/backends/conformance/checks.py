@@ -77,9 +77,11 @@ def check_views(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.
     for renders in (backend.render_views, lambda splats, shots: [backend.render(splats, *shot) for shot in shots]):  # type: ignore[attr-defined]
         leaves = {f.name: getattr(splats, f.name) for f in fields(Gaussians)}
         leaves = {name: leaf.detach().clone().requires_grad_() for name, leaf in leaves.items() if leaf is not None}
-        images = torch.cat([rendered.image.flatten(0, 1) for rendered in renders(Gaussians(**leaves), shots)])
-        alphas = torch.cat([rendered.alpha.flatten() for rendered in renders(Gaussians(**leaves), shots)])
-        grads = torch.autograd.grad(images.square().sum(), list(leaves.values()), allow_unused=True, materialize_grads=True)
+        drawn = renders(Gaussians(**leaves), shots)
+        images = torch.cat([rendered.image.flatten(0, 1) for rendered in drawn])
+        alphas = torch.cat([rendered.alpha.flatten() for rendered in drawn])
+        loss = images.square().sum() + alphas.square().sum()
+        grads = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, materialize_grads=True)
         answers.append(Answer(_plain(images)[None], _plain(alphas)[None, :, None], dict(zip(leaves, map(_plain, grads), strict=True))))
     together, alone = answers
     return compare("views", together, alone, dtype)
