@@ -14,6 +14,7 @@ import torch
 from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
@@ -24,23 +25,37 @@ from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
+from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
-from mipmap_plugin.tiles import run, slabs, tile
-from mipmap_plugin.tiles.crops import crops
-from mipmap_plugin.tiles.cut import cut
+from mipmap_plugin.tiles import run, slabs, steering, tile
+from mipmap_plugin.tiles.cut import cut, front_to_back
+from mipmap_plugin.tiles.halo import draw_halos
+from mipmap_plugin.tiles.layers import draw_layers
+from mipmap_plugin.tiles.pictures import Album, write_pictures
 from mipmap_plugin.tiles.run import adapt_in_tiles, work_folder
+from mipmap_plugin.tiles.scene import make_cut, opened
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
-from mipmap_plugin.tiles.surroundings import Surroundings
+from mipmap_plugin.tiles.start import StartSearch
+from mipmap_plugin.tiles.steering import Steered, open_state
+from mipmap_plugin.tiles.store import Store, write_store
+from mipmap_plugin.tiles.surroundings import Surroundings, nothing
+from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
+from mipmap_plugin.tiles.truth import Truths, draw_truths, parts
 
 EFFECTS = Effects(1, background=(0.2, 0.4, 0.6))
+
+
+def stored(path, model):
+    write_store(path, len(model), [model.parameters()])
+    return Store(path)
 
 
 @pytest.fixture
 def on_disk(tmp_path):
     """300 splats in two files, and the same splats in memory."""
     models = [tiny.model(150, seed=seed) for seed in (0, 1)]
-    parts = [PlyRows(model.save(tmp_path / f"part_{number}.ply", provenance={})) for number, model in enumerate(models)]
+    parts = [stored(tmp_path / f"part_{number}.splats", model) for number, model in enumerate(models)]
     parameters = {name: torch.cat([model.parameters()[name].detach() for model in models]) for name in models[0].parameters()}
     return Splats.of(VanillaModel, parts), VanillaModel(parameters).gaussians().detach()
 
@@ -60,7 +75,7 @@ def job(tmp_path):
 def test_every_splat_lies_in_exactly_one_core_of_equal_size(count):
     means = torch.randn(1003, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([3.0, 1.0, 2.0])
     rows = torch.arange(1003)[torch.arange(1003) % 7 != 0]
-    cores = cut(means, rows, count)
+    cores, _ = cut(means, rows, count)
     assert torch.equal(torch.cat(cores).sort().values, rows)
     assert max(map(len, cores)) - min(map(len, cores)) <= 1
     assert all(torch.equal(core, core.sort().values) for core in cores)
@@ -68,15 +83,32 @@ def test_every_splat_lies_in_exactly_one_core_of_equal_size(count):
 
 def test_a_cut_is_a_plane_across_the_longest_axis():
     means = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 9.0, 1.0])
-    low, high = cut(means, torch.arange(500), 2)
+    (low, high), _ = cut(means, torch.arange(500), 2)
     assert means[low, 1].max() <= means[high, 1].min()
 
 
 def test_far_strays_do_not_decide_the_axis():
     means = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 9.0, 1.0])
     means[:5, 0] += 1e4
-    low, high = cut(means, torch.arange(500), 2)
+    (low, high), _ = cut(means, torch.arange(500), 2)
     assert means[low, 1].max() <= means[high, 1].min()
+
+
+@pytest.mark.parametrize("count", [2, 5, 8])
+def test_a_core_is_before_all_that_it_may_hide(count):
+    """Every line of sight meets the cores in their order."""
+    generator = torch.Generator().manual_seed(0)
+    _, tree = cut(torch.randn(800, 3, generator=generator), torch.arange(800), count)
+    center = torch.tensor([0.3, -0.2, 0.1])
+    order = front_to_back(tree, center.tolist())
+    assert sorted(order) == list(range(count))
+
+    def core_at(point, node=tree):
+        return node if isinstance(node, int) else core_at(point, node[2] if point[node[0]] <= node[1] else node[3])
+
+    for sight in torch.randn(50, 3, generator=generator):
+        met = [order.index(core_at(center + distance * sight)) for distance in torch.linspace(0, 3, 40)]
+        assert met == sorted(met)
 
 
 # Splats on the disk
@@ -88,6 +120,40 @@ def test_rows_are_read_in_any_order(on_disk):
     assert torch.equal(splats.gaussians(rows).sh, in_memory[rows].sh)
     assert torch.equal(splats.places[:, :3], in_memory.means)
     assert len(splats.gaussians(rows[:0])) == 0
+
+
+def test_splats_come_back_from_a_file_as_they_were(tmp_path):
+    model = tiny.model(50, degree=2)
+    for name, read in stored(tmp_path / "a.splats", model).parameters().items():
+        assert torch.equal(read, model.parameters()[name])
+
+
+def test_reading_in_pieces_makes_no_difference(on_disk, monkeypatch):
+    splats, in_memory = on_disk
+    monkeypatch.setattr("mipmap_plugin.tiles.splats.CHUNK", 7)
+    rows = torch.randperm(300, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(splats.gaussians(rows).means, in_memory[rows].means) and torch.equal(splats.gaussians(rows).sh, in_memory[rows].sh)
+    assert torch.equal(splats.gaussians(rows, colored=False).opacities, in_memory[rows].opacities)
+    camera = tiny.cameras(1)[0]
+    whole, depths = Splats.of(VanillaModel, splats.parts).seen_by(camera, 0.01)
+    monkeypatch.undo()
+    assert torch.equal(splats.seen_by(camera, 0.01)[0], whole) and torch.equal(splats.seen_by(camera, 0.01)[1], depths)
+
+
+def test_slabs_are_cut_by_depth():
+    depths = torch.tensor([5.0, 1.0, 4.0, 2.0, 3.0])
+    parts = slabs.slabs(torch.arange(5), depths, 2)
+    assert [part.tolist() for part in parts] == [[1, 3], [2, 4], [0]]
+    assert slabs.slabs(torch.arange(0), depths[:0], 2) == []
+
+
+def test_pictures_come_back_one_by_one(tmp_path):
+    small = torch.full((1, 1, 5), 7).to(torch.uint8)
+    pictures = {"1": torch.rand(3, 4, 3).half(), "2": torch.randint(-9, 9, (2, 5, 3), dtype=torch.int16), "2/0": small}
+    write_pictures(tmp_path / "a", ((name, picture, (1, 2, 3, 4) if "/" in name else None) for name, picture in pictures.items()))
+    album = Album([tmp_path / "a"])
+    assert all(torch.equal(album[name], picture) for name, picture in pictures.items())
+    assert album.entry("2/0").box == (1, 2, 3, 4) and album.entry("1").box is None and "3" not in album
 
 
 def test_slabs_give_the_picture_of_all_splats(on_disk, monkeypatch):
@@ -102,7 +168,7 @@ def test_slabs_give_the_picture_of_all_splats(on_disk, monkeypatch):
 def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch):
     splats, in_memory = on_disk
     views, backend = tiny.cameras(3), ReferenceBackend()
-    monkeypatch.setattr(slabs, "SLAB", 37)
+    monkeypatch.setattr(slabs, "COLORLESS_SLAB", 37)
     expected = blend_weights(in_memory, views, backend, EFFECTS)
     assert torch.allclose(Painter(backend, EFFECTS).blend_weights(splats, views), expected, atol=1e-3, rtol=1e-3)
 
@@ -117,67 +183,145 @@ def test_a_plain_text_file_is_refused(tmp_path):
 # The concatenation
 
 
-def test_a_concatenation_has_the_bytes_of_its_parts_in_their_order(tmp_path, on_disk):
-    splats, _ = on_disk
+def test_a_concatenation_has_the_bytes_of_its_parts_in_their_order(tmp_path):
+    parts = [tiny.model(150, seed=seed).save(tmp_path / f"part_{seed}.ply", provenance={}) for seed in (0, 1)]
     with (tmp_path / "whole.ply").open("wb") as out:
-        assert concatenate([part.path for part in splats.parts], ["of two parts"], out) == 300
-    bodies = b"".join(part.path.read_bytes()[part.header.body :] for part in splats.parts)
+        assert concatenate(parts, ["of two parts"], out) == 300
+    bodies = b"".join(part.read_bytes()[read_header(part).body :] for part in parts)
     header = read_header(tmp_path / "whole.ply")
     assert (tmp_path / "whole.ply").read_bytes()[header.body :] == bodies
     assert header.vertex.count == 300 and header.comments == ("of two parts",) and not header.notes
 
 
-def test_parts_of_other_columns_are_refused(tmp_path, on_disk):
+def test_parts_of_other_columns_are_refused(tmp_path):
+    first = tiny.model(degree=1).save(tmp_path / "first.ply", provenance={})
     other = tiny.model(degree=2).save(tmp_path / "other.ply", provenance={})
     with (tmp_path / "whole.ply").open("wb") as out, pytest.raises(CheckpointError, match="has other columns than"):
-        concatenate([on_disk[0].parts[0].path, other], [], out)
+        concatenate([first, other], [], out)
 
 
 # The halo
 
 
-def surroundings(splats, core, zoom=0.5):
-    found = crops(splats, core, torch.ones(len(core)), [view.zoomed(zoom) for view in tiny.cameras(4)], EFFECTS.near_plane)
-    return Surroundings(splats, core, found, Painter(ReferenceBackend(), EFFECTS)), found
+@pytest.fixture
+def halved(job):
+    """A scene in three tiles that begins with the base, and has the layers and halos of its first sweep."""
+    job = replace(job, settings=job.settings | {"closed_form": False})
+    folder = work_folder(job.target)
+    folder.mkdir()
+    make_cut(job.base.checkpoint, 3, folder)
+    scene = opened(job.base, job.scale, None, job.config(), folder)
+    for part in range(parts(scene.used_views)):
+        draw_truths(scene, part, folder)
+    StartSearch(scene, folder).run()
+    for number in range(3):
+        draw_layers(scene, number, scene.sweeps[0], folder)
+    draw_halos(scene, 0, scene.sweeps[0], folder)
+    return scene, folder
 
 
-def test_a_core_in_its_halo_looks_as_in_the_whole_scene(on_disk):
-    splats, in_memory = on_disk
-    core = cut(splats.places, torch.arange(300), 4)[1]
-    halo, found = surroundings(splats, core)
-    for crop in found:
-        whole = ReferenceBackend().render(in_memory, crop.camera, EFFECTS).image
-        assert torch.allclose(halo.render(in_memory[core], crop.camera), whole, atol=3e-3)  # the halo's pictures have 16 bits
-    assert 0 < halo.beside < 225
+def whole_and_tiles(halved):
+    """All splats, and of each tile its rows, its surroundings and its crop of a view that shows all."""
+    scene, folder = halved
+    splats = open_state(scene, folder, Steered.before(folder, 0))
+    view = scene.sweep_views(scene.sweeps[0])[0]
+    around = [Surroundings(scene, number, scene.sweeps[0], folder) for number in range(3)]
+    rows = [torch.arange(first, end) for first, end in zip(splats.starts, splats.starts[1:], strict=False)]
+    return splats.gaussians(torch.arange(len(splats))), view, rows, around
 
 
-def test_boxes_are_parts_of_their_views(on_disk):
-    splats, _ = on_disk
-    core = cut(splats.places, torch.arange(300), 8)[0]
-    _, found = surroundings(splats, core, zoom=4.0)
-    views = {view.name: view.zoomed(4.0) for view in tiny.cameras(4)}
-    for crop in found:
-        left, top, right, bottom = crop.box
-        view = views[crop.camera.name]
-        assert 0 <= left < right <= view.width and 0 <= top < bottom <= view.height and 0 < crop.share <= 1
-        assert (crop.camera.width, crop.camera.height) == (right - left, bottom - top)
-        assert crop.camera.cx == view.cx - left and crop.camera.fx == view.fx
-    assert any(crop.camera.width < views[crop.camera.name].width for crop in found)
+def shown_in(scene, splats, view, crop):
+    """What a crop shows of the picture of all splats."""
+    target = view.zoomed(scene.scale)
+    image = scene.backend.render(splats, target, scene.target).image
+    left, top = round(target.cx - crop.cx), round(target.cy - crop.cy)
+    return image[top : top + crop.height, left : left + crop.width]
 
 
-def test_all_tiles_together_are_asked_to_mend_the_whole_error(on_disk):
-    splats, in_memory = on_disk
-    cores = cut(splats.places, torch.arange(300), 3)
-    mended = {}
-    for core in cores:
-        halo, found = surroundings(splats, core)
-        for crop in found:
-            left, top, right, bottom = crop.box
-            image = halo.render(in_memory[core], crop.camera)
-            asked = mended.setdefault(crop.camera.name, torch.zeros(12, 16, 3))
-            asked[top:bottom, left:right] += halo.wanted(in_memory[core], crop.camera, image - 0.1).float() - image
-    middle = mended[tiny.cameras(1)[0].name][4:8, 6:10]
-    assert torch.allclose(middle, torch.full_like(middle, -0.1), atol=0.01)
+def test_a_core_in_its_halo_looks_as_in_the_whole_scene(halved):
+    splats, view, rows, around = whole_and_tiles(halved)
+    for own, halo in zip(rows, around, strict=True):
+        crop = halo.crop(view)
+        assert torch.allclose(halo.render(splats[own], crop), shown_in(halved[0], splats, view, crop), atol=3e-3)  # layers have 16 bits
+
+
+def test_a_change_of_the_core_shows_as_far_as_the_halo_lets_it_through(halved):
+    """Close to what the whole shows: only where splats overlap across a cut do layers differ from it."""
+    splats, view, rows, around = whole_and_tiles(halved)
+    for own, halo in zip(rows, around, strict=True):
+        crop = halo.crop(view)
+        brighter = splats.sh.clone()
+        brighter[own, 0] += 0.5
+        change = shown_in(halved[0], replace(splats, sh=brighter), view, crop) - shown_in(halved[0], splats, view, crop)
+        seen = halo.render(replace(splats, sh=brighter)[own], crop) - halo.render(splats[own], crop)
+        assert (seen - change).abs().mean() < 0.2 * change.abs().mean()
+
+
+def test_all_tiles_together_are_asked_to_mend_the_whole_error(halved):
+    splats, view, _, around = whole_and_tiles(halved)
+    size = view.zoomed(halved[0].scale).size
+    image = shown_in(halved[0], splats, view, view.zoomed(halved[0].scale))
+    error = Truths(*halved)(view) - image
+    asked = torch.zeros(*size, 3)
+    for halo in around:
+        crop = halo.crop(view)
+        left, top, right, bottom = halo._box(view.name)
+        asked[top:bottom, left:right] += halo.wanted(crop) - image[top:bottom, left:right]
+    assert error.abs().max() > 0.1
+    middle = (slice(2, 6), slice(3, 7))
+    assert torch.allclose(asked[middle], error[middle], atol=0.02)  # fractions have 8 bits
+
+
+def test_a_view_without_the_core_shows_nothing(halved):
+    splats, view, rows, around = whole_and_tiles(halved)
+    away = nothing(view)
+    core = splats[rows[0]].detach()
+    core.means.requires_grad_()
+    [image] = around[0].render_views(core, [away])
+    (image - around[0].wanted(away)).square().mean().backward()
+    assert image.shape == (1, 1, 3) and not image.any() and not core.means.grad.any()
+
+
+# Sweeps
+
+
+def config(**settings):
+    return recipe("default", 0.25, **settings)
+
+
+def test_a_run_is_cut_into_a_warm_up_and_sweeps():
+    found = sweeps(config(steps=600))
+    assert [(sweep.first, sweep.end) for sweep in found] == [(0, 60), (60, 330), (330, 600)]
+    assert found[0].checks == (10, 20, 30, 40, 50, 60) and found[1].checks == (195, 330)
+    assert [sweep.checks for sweep in sweeps(config(steps=4))] == [(1,), (2, 4)]
+    assert sweeps(config(steps=0)) == []
+    assert [sweep.end for sweep in sweeps(config(steps=30, warm_up=0.0))] == [15, 30]
+
+
+def test_only_views_that_steps_use_are_drawn():
+    views = tiny.cameras(30)
+    settings = config(steps=12)
+    first, both = views_of(views, settings, 0, 6), views_of(views, settings, 0, 12)
+    schedule = ViewSchedule(views, settings)
+    assert set(first) == {view for step in range(6) for view in schedule(step, step / 12)}
+    assert len(first) < len(both) < 30
+    assert views_of(views, config(steps=12, time_budget_s=1.0), 0, 6) == views
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "kept", "ceiling"),
+    [((31.0, 32.0), 2, 1.0), ((31.0, 30.0), 2, 1.0), ((31.0, 29.0), 1, 0.5), ((29.0,), 0, 0.5)],
+)
+def test_what_does_harm_to_the_whole_is_undone(halved, monkeypatch, psnrs, kept, ceiling):
+    scene, folder = halved
+    torch.save({"name": "the start", "psnr": 30.0}, folder / "start.pt")
+    measured = iter(psnrs)
+    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+    monkeypatch.setattr(steering, "rate_factor", lambda *_: 1.0)
+    steering.steer(scene, Sweep(0, 0, (1, 2)), folder)
+    after = Steered.before(folder, 1)
+    assert (max(after.step, 0), after.ceiling, tuple(after.psnrs)) == (kept, ceiling, psnrs)
 
 
 # The whole
@@ -185,18 +329,18 @@ def test_all_tiles_together_are_asked_to_mend_the_whole_error(on_disk):
 
 def test_a_scene_in_tiles_is_whole_and_better_than_its_base(job, monkeypatch):
     bodies = []
-    keep = SimpleNamespace(rmtree=lambda folder: bodies.extend((folder / f"tile_{n}.ply").read_bytes() for n in range(3)))
+    keep = SimpleNamespace(rmtree=lambda folder: bodies.extend((folder / f"part_{n}.ply").read_bytes() for n in range(3)))
     monkeypatch.setattr(run, "shutil", keep)
     joined = adapt_in_tiles(replace(job, settings=job.settings | {"merge_to": 0.6}), 3)
     report = joined.report
-    assert len(load_vanilla(joined.file)) == report.gaussians_after == sum(tile["splats_after"] for tile in joined.tiles)
+    assert len(load_vanilla(joined.file)) == report.gaussians_after == sum(tile["splats_after"] for tile in joined.tiles[-3:])
     assert report.gaussians_after < report.gaussians_before == 80
     assert report.psnr_after() > report.psnr_before() and report.returned == "the joined tiles"
     sidecar = json.loads(joined.file.with_name("out.ply.adaptation.json").read_text())
-    assert [tile["tile"] for tile in sidecar["tiles"]] == [0, 1, 2] and sidecar["validation"] == report.validation
+    assert [(tile["sweep"], tile["tile"]) for tile in sidecar["tiles"]] == [(sweep, number) for sweep in (0, 1) for number in range(3)]
+    assert sidecar["validation"] == report.validation
     assert '"tiles": 3' in " ".join(read_header(joined.file).comments)
-    # The cores stand in the file as their jobs wrote them, each once; the halo, which was drawn with them, does not.
-    assert sum(tile["drawn_beside"] for tile in joined.tiles) > 0
+    # The cores stand in the file one after the other.
     cores = b"".join(body[body.index(b"end_header\n") + 11 :] for body in bodies)
     assert joined.file.read_bytes()[read_header(joined.file).body :] == cores
 
@@ -237,10 +381,12 @@ def test_the_result_does_not_depend_on_what_was_done_before(job, monkeypatch):
             yield outcome
 
     joined = adapt_in_tiles(job, 3, engine)
-    tiles = [outcome.status for outcome in outcomes if outcome.job.work == "tile"]
+    tiles = [outcome.status for outcome in outcomes if outcome.job.work == "tile" and outcome.job.sweep == 0]
     assert tiles == ["finished before", "done", "finished before"]
-    assert {outcome.status for outcome in outcomes if outcome.job.work != "tile"} == {"finished before"}
-    assert [*read_ply(joined.file).columns["x"]] == [*read_ply(undisturbed).columns["x"]]
+    before = [outcome.status for outcome in outcomes if outcome.job.work not in ("tile", "steering") and outcome.job.sweep == 0]
+    assert set(before) == {"finished before"}
+    assert read_ply(joined.file).columns["x"].tobytes() == read_ply(undisturbed).columns["x"].tobytes()
+    assert read_ply(joined.file).columns["f_rest_0"].tobytes() == read_ply(undisturbed).columns["f_rest_0"].tobytes()
 
 
 def test_an_interrupted_tile_is_resumed(job, monkeypatch):
@@ -253,7 +399,7 @@ def test_an_interrupted_tile_is_resumed(job, monkeypatch):
             adapt_in_tiles(job, 2)
     first_steps = []
     monkeypatch.setattr(tile, "adapt", lambda run, *rest: (first_steps.append(run.step), real_adapt(run, *rest))[1])
-    assert adapt_in_tiles(job, 2).file.exists() and first_steps == [2, 0]
+    assert adapt_in_tiles(job, 2).file.exists() and first_steps == [2, 1]
 
 
 def test_invalid_splats_are_left_out(tmp_path, job):
@@ -324,8 +470,8 @@ def test_saving_the_base_leaves_the_starts_to_the_next_run(job, monkeypatch):
         patched.setattr(run, "judged", lambda scene, folder: ({}, AS_IT_IS))
         patched.setattr(run, "_save", failing)
         adapt_in_tiles(job, 2)
-    starts = load_vanilla(folder / "start_0.ply").parameters()["opacities"]
-    assert not torch.equal(starts, load_vanilla(folder / "base_0.ply").parameters()["opacities"])
+    starts = Store(folder / "start_0.splats").parameters()["opacities"]
+    assert not torch.equal(starts, load_vanilla(folder / "part_0.ply").parameters()["opacities"])
 
 
 def test_a_damaged_plan_is_said_in_a_sentence(job):

@@ -1,4 +1,4 @@
-"""The jobs of a scene in tiles: some of its truths, its start, or one tile. Each can be sent to any process, and done again without harm."""
+"""The jobs of a scene in tiles, from its truths to its tiles. Each can be sent to any process, and done again without harm."""
 
 from __future__ import annotations
 
@@ -6,22 +6,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from mipmap_plugin import pool
 from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.formats.atomic import together, write_json
+from mipmap_plugin.formats.torch_file import save_torch
+from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.jobs.job import Job, Outcome
 
-CUT, START = "cut.pt", "start.pt"
+Work = Literal["truth", "start", "layer", "halo", "tile", "steering"]
 
 
 @dataclass(frozen=True)
 class TileJob(Job):
     """A job of one scene; its target is the file that it leaves in the scene's folder."""
 
-    work: Literal["truth", "start", "tile"] = "tile"
+    work: Work = "tile"
     number: int = 0
+    sweep: int = 0
 
     def __str__(self) -> str:
-        return f"{self.base.checkpoint.name} x{self.scale:g}: {self.work}{'' if self.work == 'start' else f' {self.number + 1}'}"
+        number = "" if self.work in ("start", "steering") else f" {self.number + 1}"
+        sweep = "" if self.work in ("truth", "start") else f" in sweep {self.sweep + 1}"
+        return f"{self.base.checkpoint.name} x{self.scale:g}: {self.work}{number}{sweep}"
 
     def own_work(self, threads: int | None) -> Outcome:
         """Do the work, unless its file is there already. Raises what `TiledScene` raises."""
@@ -29,10 +35,11 @@ class TileJob(Job):
             return Outcome(self, "finished before", self.target, _facts(self.target))
         from mipmap_plugin.tiles.scene import opened
 
-        folder = self.target.parent
-        scene = opened(self.base, self.scale, self.viewer, self.config(), folder / CUT)
+        scene = opened(self.base, self.scale, self.viewer, self.config(), self.target.parent)
         with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
-            self._do(scene, folder)
+            self._do(scene, self.target.parent)
+        pool.release()
+        return_freed_memory()
         return Outcome(self, "done", self.target, _facts(self.target))
 
     def _do(self, scene: Any, folder: Path) -> None:
@@ -44,6 +51,18 @@ class TileJob(Job):
             from mipmap_plugin.tiles.start import StartSearch
 
             StartSearch(scene, folder).run()
+        elif self.work == "layer":
+            from mipmap_plugin.tiles.layers import draw_layers
+
+            draw_layers(scene, self.number, scene.sweeps[self.sweep], folder)
+        elif self.work == "halo":
+            from mipmap_plugin.tiles.halo import draw_halos
+
+            draw_halos(scene, self.number, scene.sweeps[self.sweep], folder)
+        elif self.work == "steering":
+            from mipmap_plugin.tiles.steering import steer
+
+            steer(scene, scene.sweeps[self.sweep], folder)
         else:
             self._adapt(scene, folder)
 
@@ -51,9 +70,9 @@ class TileJob(Job):
         from mipmap_plugin.tiles.tile import Tile
         from mipmap_plugin.wrapped import state_path
 
-        model, facts, keeper = Tile(scene, self.number, folder).adapt(state_path(self.target))
+        saved, facts, keeper = Tile(scene, self.number, scene.sweeps[self.sweep], folder).adapt(state_path(self.target))
         with together(self.target):
-            model.save(self.target, provenance={}, overwrite=True)
+            save_torch(self.target, saved, overwrite=True)
             write_json(facts_file(self.target), facts, overwrite=True)
         if keeper is not None and (state := keeper.remaining_file()) is not None:
             state.remove()

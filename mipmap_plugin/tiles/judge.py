@@ -6,8 +6,10 @@ from pathlib import Path
 
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.formats.torch_file import load_torch
+from mipmap_plugin.tiles.folder import START
 from mipmap_plugin.tiles.scene import TiledScene
-from mipmap_plugin.tiles.start import open_starts, open_tiles, psnr
+from mipmap_plugin.tiles.start import psnr
+from mipmap_plugin.tiles.steering import Steered, open_state, result
 from mipmap_plugin.tiles.truth import Truths
 
 JOINED = "the joined tiles"
@@ -17,10 +19,9 @@ def judged(scene: TiledScene, folder: Path) -> tuple[dict[str, float], str]:
     """The PSNR (dB) of each on whole views, and the name of what is returned: the best, or the last where the settings say so."""
     if not scene.views.choosing:
         return {}, JOINED
-    truths = Truths.whole(folder, scene.views.choosing)
-    joined = open_tiles(scene, folder)
-    start = f"the start, {load_torch(folder / 'start.pt')['name']}"
-    states = {AS_IT_IS: scene.base, start: open_starts(scene, folder), JOINED: joined}
+    truths, last = Truths(scene, folder), result(scene, folder)
+    start = f"the start, {load_torch(folder / START)['name']}"
+    states = {AS_IT_IS: scene.base, start: open_state(scene, folder, Steered.before(folder, 0)), JOINED: open_state(scene, folder, last)}
     psnrs = {name: psnr(scene, splats, truths, scene.views.choosing) for name, splats in states.items()}
     best = max(reversed(psnrs), key=psnrs.__getitem__)
     return psnrs, JOINED if scene.config.returns == "last" else best

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.errors import CheckpointError, JobsFailed, SettingsError
@@ -24,12 +26,14 @@ from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
 from mipmap_plugin.models.outputs import REPORT, parts_of
 from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.splatting.viewers import viewers_for
-from mipmap_plugin.tiles.job import CUT, START, TileJob
+from mipmap_plugin.tiles.folder import CUT, START, halo_file, layer_file, part_file, run_file, steered_file, tile_file, truth_file
+from mipmap_plugin.tiles.job import TileJob, Work
 from mipmap_plugin.tiles.judge import JOINED, judged
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import TiledScene, find_splats, make_cut, opened
-from mipmap_plugin.tiles.start import base_file, start_file, tile_file, write_base
-from mipmap_plugin.tiles.truth import parts, truth_file
+from mipmap_plugin.tiles.steering import Steered, open_state, result
+from mipmap_plugin.tiles.sweeps import Sweep
+from mipmap_plugin.tiles.truth import parts
 
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
 Engine = Callable[[Sequence[Job]], Generator[Outcome, None, None]]
@@ -70,44 +74,87 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
     if not (folder / CUT).exists():
         with announced("cutting"):
             try:
-                make_cut(job.base.checkpoint, tiles, folder / CUT)
+                make_cut(job.base.checkpoint, tiles, folder)
             except CheckpointError:
                 shutil.rmtree(folder)  # nothing was done yet
                 raise
-    scene = opened(job.base, job.scale, job.viewer, job.config(), folder / CUT)
+    scene = opened(job.base, job.scale, job.viewer, job.config(), folder)
     scene.wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
-    seconds = {"cutting": time.perf_counter() - began}
-
-    def do(work: str, targets: list[Path]) -> list[Outcome]:
-        stage = time.perf_counter()
-        jobs = [
-            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number)  # type: ignore[arg-type]
-            for number, target in enumerate(targets)
-        ]
-        outcomes = _done(jobs, engine, work)
-        seconds[{"truth": "pseudo truth", "start": "start", "tile": "optimization"}[work]] = time.perf_counter() - stage
-        return outcomes
-
-    do("truth", [truth_file(folder, part) for part in range(parts(scene.views.all))])
-    do("start", [folder / START])
-    files = [tile_file(folder, number) for number in range(tiles)]
-    outcomes = do("tile", files)
-    outcomes.sort(key=lambda outcome: outcome.job.number)  # type: ignore[attr-defined]
+    stages = _Stages(job, engine, {"cutting": time.perf_counter() - began})
+    facts = _adapted(scene, folder, stages)
     last = time.perf_counter()
     with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
         validation, returned = judged(scene, folder)
-    seconds["validation"] = time.perf_counter() - last
-    seconds["total"] = time.perf_counter() - began
-    facts = [outcome.report for outcome in outcomes]
-    if returned != JOINED:
-        name_of = base_file if returned == AS_IT_IS else start_file
-        files = [name_of(folder, number) for number in range(tiles)]
-    if returned == AS_IT_IS:
-        write_base(scene, files)
-    report = make_report(scene, files, seconds, validation, returned)
+    stages.seconds["validation"] = time.perf_counter() - last
+    stages.seconds["total"] = time.perf_counter() - began
+    files = _write_parts(scene, folder, returned)
+    report = make_report(scene, files, stages.seconds, validation, returned)
     saved = _save(scene, job, files, Joined(job.target, report, facts))
     shutil.rmtree(folder)
     return saved
+
+
+@dataclass(frozen=True)
+class _Stages:
+    """Does the jobs of one stage after the other."""
+
+    job: Job  # of the whole
+    engine: Engine
+    seconds: dict[str, float]  # by what they were spent on
+
+    def __call__(self, work: Work, targets: list[Path], sweep: int = 0) -> list[dict[str, Any]]:
+        """Do one job for each target, and return what there is to say of each. Raises JobsFailed, KeyboardInterrupt."""
+        began, job = time.perf_counter(), self.job
+        jobs = [
+            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number, sweep=sweep)
+            for number, target in enumerate(targets)
+        ]
+        outcomes = _done(jobs, self.engine, work)
+        name = {"truth": "pseudo truth", "start": "start", "tile": "optimization"}.get(work, "halo")
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+        return [outcome.report for outcome in sorted(outcomes, key=lambda outcome: outcome.job.number)]  # type: ignore[attr-defined]
+
+
+def _adapted(scene: TiledScene, folder: Path, do: _Stages) -> list[dict[str, Any]]:
+    """Adapt all tiles; return what there is to say of each in each sweep."""
+    tiles = range(len(scene.cores))
+    do("truth", [truth_file(folder, part) for part in range(parts(scene.used_views))])
+    do("start", [folder / START])
+    facts: list[dict[str, Any]] = []
+    for sweep in scene.sweeps:
+        runs = [run_file(folder, number, sweep.number) for number in tiles]
+        layers = [layer_file(folder, number, sweep.number) for number in tiles]
+        halos = [halo_file(folder, part, sweep.number) for part in range(parts(scene.sweep_views(sweep)))]
+        if not all(file.exists() for file in runs):
+            do("layer", layers, sweep.number)
+            do("halo", halos, sweep.number)
+        facts += do("tile", runs, sweep.number)
+        do("steering", [steered_file(folder, sweep.number)], sweep.number)
+        _forget(scene, folder, sweep, [*layers, *halos])
+        if scene.config.target_db is not None and Steered.before(folder, sweep.number + 1).psnrs[-1] >= scene.config.target_db:
+            break
+    return facts
+
+
+def _forget(scene: TiledScene, folder: Path, sweep: Sweep, pictures: list[Path]) -> None:
+    """Make room on the disk: of what a sweep left, only the splats that are gone on with and their moments are needed."""
+    state = Steered.before(folder, sweep.number + 1)
+    kept = {state.file(folder, number) for number in range(len(scene.cores))}
+    made = [(each.number, step) for each in scene.sweeps[: sweep.number + 1] for step in each.checks]
+    done = [tile_file(folder, number, *each) for number in range(len(scene.cores)) for each in made]
+    for file in (*pictures, *(file for file in done if file not in kept)):
+        file.unlink(missing_ok=True)
+
+
+def _write_parts(scene: TiledScene, folder: Path, returned: str) -> list[Path]:
+    """Write the splats of each tile to a PLY of its own."""
+    files = [part_file(folder, number) for number in range(len(scene.cores))]
+    state = result(scene, folder) if returned == JOINED else Steered.before(folder, 0)
+    splats = scene.base if returned == AS_IT_IS else open_state(scene, folder, state)
+    cores = scene.cores if returned == AS_IT_IS else torch.arange(len(splats)).split([*map(len, splats.parts)])
+    for file, core in zip(files, cores, strict=True):
+        scene.for_target(splats.parameters(core)).save(file, provenance={}, overwrite=True)
+    return files
 
 
 def _refuse(job: Job, tiles: int) -> None:
@@ -168,7 +215,7 @@ def _done(jobs: Sequence[Job], engine: Engine, what: str) -> list[Outcome]:
 def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) -> Joined:
     """Write the cores one after the other, as a .ply or within a model folder, and the report beside it."""
     provenance = {**joined.report.provenance(), "tiles": len(files)}
-    comments = with_tags(scene.base.parts[0].header.comments, scene.target.screen_filter, provenance)
+    comments = with_tags(scene.comments, scene.target.screen_filter, provenance)
 
     def write(ply: Path) -> None:
         with new_file(ply, overwrite=True) as temporary, temporary.open("xb") as out:

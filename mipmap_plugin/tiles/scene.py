@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -31,9 +31,12 @@ from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.tiles.cut import cut
+from mipmap_plugin.tiles.cut import Tree, cut
+from mipmap_plugin.tiles.folder import BASE, CUT
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import CHUNK, Splats
+from mipmap_plugin.tiles.store import Store, write_store
+from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
 from mipmap_plugin.wrap import wrap_model
 from mipmap_plugin.wrapped import Wrapped
 
@@ -70,48 +73,63 @@ def find_splats(path: Path) -> tuple[Checkpoint, type[VanillaModel]]:
     return checkpoint, kind
 
 
-def make_cut(path: Path, tiles: int, file: Path) -> None:
-    """Read the splats at `path` once, cut them into cores, and write what all jobs need of them to `file`. Raises CheckpointError."""
+def make_cut(path: Path, tiles: int, folder: Path) -> None:
+    """Read the splats at `path` once, and leave them and their cut into cores in `folder`, as all jobs need them. Raises CheckpointError."""
     checkpoint, kind = find_splats(path)
-    part = PlyRows(checkpoint.path)
-    splats = Splats.of(kind, [part])
-    valid, degree_at = _examined(splats)
-    rows = valid.nonzero()[:, 0]
-    if len(rows) < tiles:
-        raise CheckpointError(f"{checkpoint.path} has {len(rows):,} splats, which cannot be cut into {tiles} tiles; give fewer")
-    cores = cut(splats.places, rows, tiles)
-    sample = torch.cat([rows[:: -(-len(rows) // SAMPLE)], torch.tensor([degree_at])]).unique()
+    rows = PlyRows(checkpoint.path)
+    found = _Found()
+    write_store(folder / BASE, len(rows), (found(kind, part) for part in _read(kind, rows)))
+    splats = Splats.of(kind, [Store(folder / BASE)])
+    valid = torch.cat(found.valid)
+    kept = valid.nonzero()[:, 0]
+    if len(kept) < tiles:
+        raise CheckpointError(f"{checkpoint.path} has {len(kept):,} splats, which cannot be cut into {tiles} tiles; give fewer")
+    cores, tree = cut(splats.places, kept, tiles)
+    degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
+    sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()
     places = torch.where(valid[:, None], splats.places, torch.nan)  # an invalid splat is seen by no camera
-    digest = sha256(checkpoint.path)
-    save_torch(file, {"places": places, "cores": cores, "sample": sample, "digest": digest}, overwrite=True)
+    stored = {"places": places, "cores": cores, "tree": tree, "sample": sample, "digest": sha256(checkpoint.path)}
+    save_torch(folder / CUT, stored, overwrite=True)
 
 
-def _examined(splats: Splats) -> tuple[Tensor, int]:
-    """Which splats are finite, [N] bool, and a row that has the highest SH band of all that are not zero."""
-    valid, at, highest = torch.ones(len(splats), dtype=torch.bool), 0, -1
-    for rows in torch.arange(len(splats)).split(CHUNK):
-        model = splats.kind(splats.parameters(rows))
-        valid[rows] = ~examine(model).invalid
-        used = (model.parameters()["shN"].abs().amax(dim=2) > 0) & valid[rows, None]
+def _read(kind: type[VanillaModel], rows: PlyRows) -> Iterator[dict[str, Tensor]]:
+    """The raw parameters of a PLY, some rows at a time."""
+    for start in range(0, len(rows), CHUNK):
+        yield kind.parameters_of(rows.columns(slice(start, start + CHUNK)), rows.path)
+        rows.release()
+
+
+class _Found:
+    """Which splats are finite, and one that has the highest SH band of all that are not zero."""
+
+    def __init__(self) -> None:
+        self.valid: list[Tensor] = []
+        self.degree_at, self.highest = 0, -1
+
+    def __call__(self, kind: type[VanillaModel], parameters: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Examine the next splats, and return them."""
+        valid = ~examine(kind(parameters)).invalid
+        used = (parameters["shN"].abs().amax(dim=2) > 0) & valid[:, None]
         if used.any():
             row, band = used.nonzero()[used.nonzero()[:, 1].argmax()].tolist()
-            at, highest = (int(rows[row]), band) if band > highest else (at, highest)
-    if highest < 0 and valid.any():
-        at = int(valid.nonzero()[0])
-    splats.release()
-    return valid, at
+            if band > self.highest:
+                self.degree_at, self.highest = sum(map(len, self.valid)) + row, band
+        self.valid.append(valid)
+        return parameters
 
 
 class TiledScene:
     """A scene and its cores."""
 
-    def __init__(self, base: Base, scale: float, viewer: str | None, config: AdaptConfig, cut_file: Path) -> None:
-        """`cut_file`: what `make_cut` wrote. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
+    def __init__(self, base: Base, scale: float, viewer: str | None, config: AdaptConfig, folder: Path) -> None:
+        """`folder`: holds what `make_cut` wrote. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
         self.scale, self.viewer, self.config = scale, viewer, config
         self.checkpoint, self.kind = find_splats(base.checkpoint)
-        stored: dict[str, Any] = load_torch(cut_file)
-        self.base = Splats(self.kind, [PlyRows(self.checkpoint.path)], stored["places"])
+        stored: dict[str, Any] = load_torch(folder / CUT)
+        self.base = Splats(self.kind, [Store(folder / BASE)], stored["places"])
         self.cores: list[Tensor] = stored["cores"]
+        self.tree: Tree = stored["tree"]
+        self.comments = PlyRows(self.checkpoint.path).header.comments
         self.digest: str = stored["digest"]
         self.options, _ = read_options(self.checkpoint.folder)
         self.wrapped = self._wrapped(base, stored["sample"])
@@ -122,7 +140,7 @@ class TiledScene:
     def _wrapped(self, base: Base, sample: Tensor) -> Wrapped:
         """Some of the splats with the cameras of all."""
         checkpoint, options = self.checkpoint, self.options
-        comments = self.base.parts[0].header.comments
+        comments = self.comments
         origin = Origin(
             checkpoint.path, self.digest, checkpoint.folder, checkpoint.iteration, comments, {}, read_exposures(checkpoint.folder)
         )  # fmt: skip
@@ -156,6 +174,20 @@ class TiledScene:
         judged = named[len(adapted) :]
         return Views(named[: len(adapted)], judged[::2], judged[1::2], note)
 
+    @cached_property
+    def sweeps(self) -> list[Sweep]:
+        """The parts of the run."""
+        return sweeps(self.config)
+
+    def sweep_views(self, sweep: Sweep) -> list[Camera]:
+        """The views that a sweep adapts to."""
+        return views_of(self.views.adapted, self.config, sweep.first, sweep.end)
+
+    @cached_property
+    def used_views(self) -> list[Camera]:
+        """The views of all sweeps, and those of validation."""
+        return [*views_of(self.views.adapted, self.config, 0, self.config.steps), *self.views.steering, *self.views.choosing]
+
     def for_target(self, parameters: dict[str, Tensor]) -> VanillaModel:
         """A model of some splats, as it is saved for the target; its parameters are leaves that require gradients."""
         trained = replace(self.wrapped.model.trained, screen_filter=self.target.screen_filter, eps2d=self.target.eps2d)
@@ -166,12 +198,12 @@ class TiledScene:
         return Painter(self.backend, effects)
 
 
-def opened(base: Base, scale: float, viewer: str | None, config: AdaptConfig, cut_file: Path) -> TiledScene:
-    """A scene, kept open for the next job of the same process."""
-    status = cut_file.stat()
-    return _opened(base, scale, viewer, config.model_dump_json(), cut_file, (status.st_mtime_ns, status.st_ino))
+def opened(base: Base, scale: float, viewer: str | None, config: AdaptConfig, folder: Path) -> TiledScene:
+    """A scene whose cut lies in `folder`, kept open for the next job of the same process."""
+    status = (folder / CUT).stat()
+    return _opened(base, scale, viewer, config.model_dump_json(), folder, (status.st_mtime_ns, status.st_ino))
 
 
 @lru_cache(maxsize=1)
-def _opened(base: Base, scale: float, viewer: str | None, config: str, cut_file: Path, _: tuple[int, int]) -> TiledScene:
-    return TiledScene(base, scale, viewer, AdaptConfig.model_validate_json(config), cut_file)
+def _opened(base: Base, scale: float, viewer: str | None, config: str, folder: Path, _: tuple[int, int]) -> TiledScene:
+    return TiledScene(base, scale, viewer, AdaptConfig.model_validate_json(config), folder)

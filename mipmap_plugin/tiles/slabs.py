@@ -14,11 +14,15 @@ from torch import Tensor
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.tiles.splats import Splats
 
 # Splats of a slab: about 100 MB while it is drawn.
 SLAB = 200_000
+
+# The same without colors, which are four fifths of a splat.
+COLORLESS_SLAB = 4 * SLAB
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -43,12 +47,11 @@ class Painter:
     effects: Effects
 
     @torch.no_grad()
-    def draw(self, splats: Splats, camera: Camera, rows: Tensor | None = None) -> Layer:
-        """The picture of `rows` of the splats, in rising depth (None: of all that the camera sees)."""
+    def draw(self, splats: Splats, camera: Camera) -> Layer:
+        """The picture of all splats that the camera sees."""
         effects = replace(self.effects, background=BLACK)
-        rows = splats.seen_by(camera, effects.near_plane)[0] if rows is None else rows
         image, through = torch.zeros(*camera.size, 3), torch.ones(*camera.size, 1)
-        for slab in rows.split(SLAB):
+        for slab in slabs(*splats.seen_by(camera, effects.near_plane), SLAB):
             rendered = self.backend.render(splats.gaussians(slab), camera, effects)
             image += through * rendered.image
             through *= (1 - rendered.alpha)[..., None]
@@ -66,17 +69,40 @@ class Painter:
         effects = replace(self.effects, background=BLACK, sh_degree=0, settings=settings)
         weights = torch.zeros(len(splats))
         for camera in cameras:
+            parts = slabs(*splats.seen_by(camera, effects.near_plane), COLORLESS_SLAB)
             through = torch.ones(*camera.size, 1)
-            for slab in splats.seen_by(camera, effects.near_plane)[0].split(SLAB):
-                gaussians = splats.gaussians(slab)
-                color = torch.zeros_like(gaussians.sh[:, :1]).requires_grad_()
-                with torch.enable_grad():
-                    rendered = self.backend.render(replace(gaussians, sh=color), camera, effects)
-                    (through * rendered.image).sum().backward()
-                assert color.grad is not None
-                weights[slab] += color.grad[:, 0].mean(dim=1) / (C0 * len(cameras))
-                through = through * (1 - rendered.alpha.detach())[..., None]
+            for slab in parts:
+                gaussians = splats.gaussians(slab, colored=False)
+                if len(parts) == 1 and (known := self._known_weights(gaussians, camera, effects)) is not None:
+                    weights[slab] += known / len(cameras)
+                    break
+                weights[slab] += self._slab_weights(gaussians, camera, effects, through) / len(cameras)
                 if float(through.max()) < effects.settings.min_transmittance:
                     break
-            splats.release()
         return weights
+
+    def _known_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor | None:
+        """The blend weights [M] that the backend computes itself, if it can, of splats with nothing in front of them."""
+        weigh = getattr(self.backend, "blend_weights", None)
+        known: Tensor | None = None if weigh is None else weigh(gaussians, camera, effects)
+        return known
+
+    @torch.enable_grad()
+    def _slab_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects, through: Tensor) -> Tensor:
+        """The blend weights [M] of a slab behind what lets `through` [H, W, 1], which becomes what the slab lets through."""
+        color = gaussians.sh.requires_grad_()
+        rendered = self.backend.render(replace(gaussians, sh=color), camera, effects)
+        (through * rendered.image).sum().backward()
+        assert color.grad is not None
+        through *= (1 - rendered.alpha.detach())[..., None]
+        return color.grad[:, 0].mean(dim=1) / C0
+
+
+def slabs(rows: Tensor, depths: Tensor, most: int) -> list[Tensor]:
+    """`rows` [M] of splats at `depths` [M] in slabs of rising depth, of at most `most` rows but for equal depths; rows keep their order."""
+    count = -(-len(rows) // most)
+    if count < 2:
+        return [rows] if count else []
+    ends = depths.sort().values[most::most].contiguous()
+    slab_of = torch.bucketize(depths, ends, right=True)
+    return [rows[slab_of == number] for number in range(count)]

@@ -1,21 +1,21 @@
-"""Splats that stay on the disk: in one PLY or in several, one after the other. Only their places and sizes are in memory."""
+"""Splats that stay on the disk: in one file or in several, one after the other. Only their places and sizes are in memory."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.tiles.store import SHAPE, Store, as_parameters
 
 # Rows that are read at a time.
-CHUNK = 1 << 17
+CHUNK = 1 << 16
 
 # Standard deviations, and pixels, by which a splat may reach into a picture from outside. It ends at 3.3 deviations, and oblique ones are longer.
 REACH, MARGIN = 5.0, 4.0
@@ -25,8 +25,8 @@ REACH, MARGIN = 5.0, 4.0
 class Splats:
     """N splats in files."""
 
-    kind: type[VanillaModel]  # what reads their columns
-    parts: Sequence[PlyRows]
+    kind: type[VanillaModel]  # what their raw parameters mean
+    parts: Sequence[Store]
     places: Tensor  # [N, 4]: the mean of each, and its largest scale, in world units
     opacities: Tensor | None = None  # [N], 0..1, in place of those in the files
 
@@ -40,37 +40,32 @@ class Splats:
         return [int(start) for start in counts.cumsum(0)]
 
     @classmethod
-    def of(cls, kind: type[VanillaModel], parts: Sequence[PlyRows]) -> Splats:
-        """The splats of these files, all of which are read once."""
-        places = torch.empty(sum(map(len, parts)), 4)
+    def of(cls, kind: type[VanillaModel], parts: Sequence[Store]) -> Splats:
+        """The splats of these files, whose places are read once."""
+        places = torch.cat([_places(shapes) for part in parts for shapes in part.shapes.split(CHUNK)])
         splats = cls(kind, parts, places)
-        for start in range(0, len(places), CHUNK):
-            rows = torch.arange(start, min(start + CHUNK, len(places)))
-            parameters = splats.parameters(rows)
-            places[rows] = torch.cat([parameters["means"], parameters["scales"].amax(dim=1, keepdim=True).exp()], dim=1)
         splats.release()
         return splats
 
-    def parameters(self, rows: Tensor) -> dict[str, Tensor]:
-        """The raw parameters of rows [M], in their order."""
+    def parameters(self, rows: Tensor, *, colored: bool = True) -> dict[str, Tensor]:
+        """The raw parameters of rows [M], in their order; without colors: of SH degree 0, and gray."""
         order = rows.argsort()
-        sorted_rows = rows[order]
-        pieces = []
+        sorted_rows, coefficients = rows[order], self.parts[0].sh.shape[1] if colored else 1
+        shapes, sh = torch.empty(len(rows), SHAPE), torch.zeros(len(rows), coefficients, 3)
         for part, first, end in zip(self.parts, self.starts, self.starts[1:], strict=False):
-            low, high = torch.searchsorted(sorted_rows, torch.tensor([first, end])).tolist()
-            if high > low:
-                pieces.append(self.kind.parameters_of(part.columns((sorted_rows[low:high] - first).numpy()), part.path))
-        if not pieces:
-            pieces = [self.kind.parameters_of(self.parts[0].columns(slice(0, 0)), self.parts[0].path)]
-        back = torch.empty_like(order).index_copy_(0, order, torch.arange(len(order)))
-        return {name: torch.cat([piece[name] for piece in pieces])[back] for name in pieces[0]}
+            for start in range(first, end, CHUNK):  # so that little of a file is in memory at a time
+                low, high = torch.searchsorted(sorted_rows, torch.tensor([start, min(start + CHUNK, end)])).tolist()
+                part.read(sorted_rows[low:high] - first, shapes[low:high], sh[low:high] if colored else None)
+        if not torch.equal(rows, sorted_rows):
+            shapes, sh = (torch.empty_like(part).index_copy_(0, order, part) for part in (shapes, sh))
+        return as_parameters(shapes, sh)
 
     @torch.no_grad()
-    def gaussians(self, rows: Tensor) -> Gaussians:
-        """The activated splats of rows [M], in their order."""
-        splats = self.kind(self.parameters(rows)).gaussians()
+    def gaussians(self, rows: Tensor, *, colored: bool = True) -> Gaussians:
+        """The activated splats of rows [M], in their order; without colors: of SH degree 0, and gray."""
+        splats = self.kind(self.parameters(rows, colored=colored)).gaussians()
         if self.opacities is not None:
-            splats = Gaussians(splats.means, splats.quats, splats.scales, self.opacities[rows], splats.sh)
+            splats = replace(splats, opacities=self.opacities[rows])
         return splats
 
     def release(self) -> None:
@@ -78,13 +73,23 @@ class Splats:
         for part in self.parts:
             part.release()
 
-    def seen_by(self, camera: Camera, near: float, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """The rows (of `rows`; None: of all) that may reach into a view, and the depth of each, by rising depth."""
-        places = self.places if rows is None else self.places[rows]
-        x, y, z = camera.to_camera(places[:, :3]).unbind(1)
-        reach = REACH * places[:, 3] * max(camera.fx, camera.fy) / z + MARGIN
-        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-        inside = (z > near) & (u > -reach) & (u < camera.width + reach) & (v > -reach) & (v < camera.height + reach)
-        found = inside.nonzero()[:, 0]
-        found = found[z[found].argsort(stable=True)]
-        return found if rows is None else rows[found], z[found]
+    def seen_by(self, camera: Camera, near: float) -> tuple[Tensor, Tensor]:
+        """The rows that may reach into a view, and the depth of each."""
+        found = [_seen(part, camera, near) for part in self.places.split(CHUNK)]  # some at a time, which stay in the cache
+        rows = torch.cat([each + number * CHUNK for number, (each, _) in enumerate(found)])
+        return rows, torch.cat([depths for _, depths in found])
+
+
+def _places(shapes: Tensor) -> Tensor:
+    return torch.cat([shapes[:, :3], shapes[:, 3:6].amax(dim=1, keepdim=True).exp()], dim=1)
+
+
+def _seen(places: Tensor, camera: Camera, near: float) -> tuple[Tensor, Tensor]:
+    """The rows of places [M, 4] that may reach into a view, and the depth of each."""
+    x, y, z = camera.to_camera(places[:, :3]).unbind(1)
+    before = (z > near).nonzero()[:, 0]
+    x, y, z = x[before], y[before], z[before]
+    reach = REACH * places[before, 3] * max(camera.fx, camera.fy) / z + MARGIN
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    inside = ((u > -reach) & (u < camera.width + reach) & (v > -reach) & (v < camera.height + reach)).nonzero()[:, 0]
+    return before[inside], z[inside]

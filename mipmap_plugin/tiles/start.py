@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -17,47 +16,17 @@ from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings,
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.camera import evenly
-from mipmap_plugin.formats.ply_rows import PlyRows
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.tiles.folder import START, start_file
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.splats import Splats
+from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.truth import Truths
 
 # What is tried after `merge_to`, where merging loses too much: its roots.
 ROOTS = (1, 2, 4)
-
-
-def start_file(folder: Path, number: int) -> Path:
-    """The file of the splats that a tile begins with."""
-    return folder / f"start_{number}.ply"
-
-
-def base_file(folder: Path, number: int) -> Path:
-    """The file of a tile's splats in the base, where nothing was better than that."""
-    return folder / f"base_{number}.ply"
-
-
-def tile_file(folder: Path, number: int) -> Path:
-    """The file of an adapted tile."""
-    return folder / f"tile_{number}.ply"
-
-
-def open_starts(scene: TiledScene, folder: Path) -> Splats:
-    """The splats that all tiles begin with, tile after tile."""
-    return Splats.of(scene.kind, [PlyRows(start_file(folder, number)) for number in range(len(scene.cores))])
-
-
-def open_tiles(scene: TiledScene, folder: Path) -> Splats:
-    """All adapted tiles, one after the other."""
-    return Splats.of(scene.kind, [PlyRows(tile_file(folder, number)) for number in range(len(scene.cores))])
-
-
-def write_base(scene: TiledScene, files: Sequence[Path]) -> None:
-    """Write the base's own splats of each tile to its file."""
-    for file, core in zip(files, scene.cores, strict=True):
-        scene.for_target(scene.base.parameters(core)).save(file, provenance={}, overwrite=True)
 
 
 class StartSearch:
@@ -65,44 +34,45 @@ class StartSearch:
 
     def __init__(self, scene: TiledScene, folder: Path) -> None:
         self.scene, self.folder = scene, folder
-        self.truths = Truths.whole(folder, scene.views.steering)
+        self.truths = Truths(scene, folder)
         self.matches = scene.scale <= 1 and not filter_suffices(scene.scale, scene.base_effects, scene.target)
         self.views = evenly(scene.views.adapted, WEIGHT_VIEWS)
 
     @torch.no_grad()
     def run(self) -> None:
-        """Write the start of each tile, and `start.pt`: its name, and the blend weight of each splat in target pixels of a view."""
+        """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
         scene, config = self.scene, self.scene.config
         weights = scene.painter(scene.base_effects).blend_weights(scene.base, self.views) * scene.scale**2
         if not (config.closed_form or config.merge_to < 1):
-            return self._take_base(weights)
-        formed = self._candidate(weights, 1.0)
-        formed_db = self.steer(open_starts(scene, self.folder))
-        base_db = self.steer(self.scene.base)
+            return self._take_base(self.steer(scene.base))
+        self._candidate("formed", weights, 1.0)
+        formed_db, base_db = self.steer(self._open("formed")), self.steer(self.scene.base)
         for fraction in (config.merge_to ** (1 / root) for root in ROOTS) if config.merge_to < 1 else ():
-            merged = self._candidate(weights, fraction)
-            merged_db = self.steer(open_starts(scene, self.folder))
+            self._candidate("merged", weights, fraction)
+            merged_db = self.steer(self._open("merged"))
             if merged_db >= formed_db - config.merging_costs:
-                return self._done("the closed form of merged splats", merged) if merged_db >= base_db else self._take_base(weights)
-        if formed_db < base_db:
-            return self._take_base(weights)
-        if config.merge_to < 1:
-            formed = self._candidate(weights, 1.0)
-        return self._done("the closed form", formed)
+                return self._take("merged", "the closed form of merged splats", merged_db) if merged_db >= base_db else self._take_base(base_db)
+        return self._take_base(base_db) if formed_db < base_db else self._take("formed", "the closed form", formed_db)
 
     def steer(self, splats: Splats) -> float:
         """PSNR (dB) on the steering views."""
         return psnr(self.scene, splats, self.truths, self.scene.views.steering)
 
-    def _candidate(self, weights: Tensor, fraction: float) -> Tensor:
-        """Write the closed form of the base after merging each core down to a fraction; return the blend weight that each splat should have."""
-        wanted = torch.cat([self._merged(number, weights, fraction) for number in range(len(self.scene.cores))])
-        if self.matches:
-            self._match(wanted)
-        return wanted
+    def _file(self, name: str, number: int) -> Path:
+        return self.folder / f"{name}_{number}.splats"
 
-    def _merged(self, number: int, weights: Tensor, fraction: float) -> Tensor:
-        scene, core = self.scene, self.scene.cores[number]
+    def _open(self, name: str) -> Splats:
+        return Splats.of(self.scene.kind, [Store(self._file(name, number)) for number in range(len(self.scene.cores))])
+
+    def _candidate(self, name: str, weights: Tensor, fraction: float) -> None:
+        """Write the closed form of the base after merging each core down to a fraction."""
+        cores = range(len(self.scene.cores))
+        wanted = torch.cat([self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores])
+        if self.matches:
+            self._match(name, wanted)
+
+    def _merged(self, file: Path, core: Tensor, weights: Tensor, fraction: float) -> Tensor:
+        scene = self.scene
         model = scene.for_target(scene.base.parameters(core))
         merged_weights = [weights[core]]
 
@@ -119,13 +89,12 @@ class StartSearch:
             model.rebuild(merged)
         if scene.config.closed_form:
             model.reshape(formed)
-        model.save(start_file(self.folder, number), provenance={}, overwrite=True)
-        scene.base.release()
+        write_store(file, len(model), [model.parameters()])
         return merged_weights[0]
 
-    def _match(self, wanted: Tensor) -> None:
+    def _match(self, name: str, wanted: Tensor) -> None:
         """Give the splats opacities with which they have the `wanted` blend weights [N] (`start.matching`), and write them again."""
-        splats = open_starts(self.scene, self.folder)
+        splats = self._open(name)
         views = [view.zoomed(self.scene.scale) for view in self.views]
         painter = self.scene.painter(self.scene.target)
 
@@ -133,20 +102,23 @@ class StartSearch:
             splats.opacities = opacities
             return painter.blend_weights(splats, views)
 
-        opacities = splats.gaussians(torch.arange(len(splats))).opacities
+        opacities = torch.cat([part.shapes[:, -1] for part in splats.parts]).sigmoid()
         opacities = matched_opacities(opacities, wanted, weights_of)
-        for number, (first, end) in enumerate(zip(splats.starts, splats.starts[1:], strict=False)):
-            model = self.scene.for_target(splats.parameters(torch.arange(first, end)))
-            _set_opacities(model, opacities[first:end])
-            model.save(start_file(self.folder, number), provenance={}, overwrite=True)
+        for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
+            model = self.scene.for_target(part.parameters())
+            _set_opacities(model, matched)
+            write_store(self._file(name, number), len(model), [model.parameters()])
 
-    def _take_base(self, weights: Tensor) -> None:
-        write_base(self.scene, [start_file(self.folder, number) for number in range(len(self.scene.cores))])
-        self._done(AS_IT_IS, weights[torch.cat(self.scene.cores)])
+    def _take_base(self, psnr: float) -> None:
+        for number, core in enumerate(self.scene.cores):
+            write_store(self._file("formed", number), len(core), [self.scene.base.parameters(core)])
+        self._take("formed", AS_IT_IS, psnr)
 
-    def _done(self, name: str, weights: Tensor) -> None:
-        facts: dict[str, Any] = {"name": name, "weights": weights}
-        save_torch(self.folder / "start.pt", facts, overwrite=True)
+    def _take(self, name: str, title: str, psnr: float) -> None:
+        """Leave the splats of a candidate as the start."""
+        for number in range(len(self.scene.cores)):
+            self._file(name, number).replace(start_file(self.folder, number))
+        save_torch(self.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
 
 
 def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:
@@ -161,5 +133,4 @@ def psnr(scene: TiledScene, splats: Splats, truths: Truths, views: Any) -> float
     for view in views:
         image = painter.image(splats, view.zoomed(scene.scale)).clamp(0, 1)
         psnrs.append(decibel(float((image - truths(view)).square().mean())))
-        splats.release()
     return fmean(psnrs) if psnrs else 0.0

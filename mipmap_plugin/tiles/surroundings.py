@@ -1,115 +1,124 @@
-"""What a tile's core is drawn with: the halo, which is all other tiles as the run begins. It is frozen, neither merged nor moved.
+"""What a tile is drawn with: the halo, which is all other tiles as a sweep begins. It is frozen, neither merged nor moved.
 
-A renderer blends splats by rising depth. So of the halo in a view, all that is nearer than every splat of the core is one picture in
-front of it, and all that is farther is one picture behind it; both are drawn once. Only splats of depths between are drawn together with
-the core in each step, and only within the core's box. The image is the one that drawing all splats would give, as long as the core keeps
-its range of depths: for that the range is a little wider than the core's.
-
-Memory: 22 bytes for each pixel of the boxes with its truth, 4 for each splat and view that is drawn with the core, and those splats.
+With the transmittance T of what is in front of the core and the picture B of what is behind it, the core's own picture c and transmittance
+t make the view V = T (c + t B) and what is in front. As the sweep begins, the view is the exact picture of all splats; later it is that
+picture and the change of T (c + t B) since then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Lock
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
+from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.progress import counted
-from mipmap_plugin.splatting.harmonics import C0
-from mipmap_plugin.tiles.crops import Crop
-from mipmap_plugin.tiles.slabs import BLACK, Painter
-from mipmap_plugin.tiles.splats import Splats
+from mipmap_plugin.tiles.folder import halo_file, layer_file
+from mipmap_plugin.tiles.halo import FINE
+from mipmap_plugin.tiles.layers import unrounded, within
+from mipmap_plugin.tiles.pictures import Album, Box
+from mipmap_plugin.tiles.scene import TiledScene
+from mipmap_plugin.tiles.sweeps import Sweep
+from mipmap_plugin.tiles.truth import Truths, from_16_bits, parts
 
-# The range of depths is wider than the core's by this fraction of it at both ends.
-SPARE = 0.02
+# Views whose surroundings are kept: those of a step are needed twice.
+KEPT = 2 * VIEWS_AT_ONCE
 
-# Blend weights of a pixel that are too small to be seen.
-INVISIBLE = 1 / 255
+# The name of a view that does not show the core.
+NOTHING = "nothing"
 
 
 @dataclass(frozen=True, eq=False)
 class _Surrounding:
-    """The halo in one view."""
+    """The halo in the core's box [h, w] of one view."""
 
-    front: Tensor  # [h, w, 3] half, on black
-    through: Tensor  # [h, w, 1] half, the transmittance of the front
-    back: Tensor  # [h, w, 3] half, background included
-    beside: Tensor  # [B] int32, rows of the halo's splats that are drawn with the core
-    clear: Tensor  # [h, w, 1] half, the transmittance of the back
+    rest: Tensor  # [h, w, 3]: what has to be added to T (c + t B)
+    through: Tensor  # [h, w, 1]: T
+    behind: Tensor  # [h, w, 3]: T B
+    wanted: Tensor  # [h, w, 3]: what the box should look like
 
 
 class Surroundings:
-    """The halo of one core in its views; called with splats of the core and a crop's camera, it renders both together."""
+    """The halo of a tile in a sweep's views; with splats of the core and a crop's camera, it renders both together."""
 
-    def __init__(self, splats: Splats, core: Tensor, crops: Sequence[Crop], painter: Painter) -> None:
-        """`splats`: what all tiles begin with; `core` [M]: rows of one of them. Draws the halo of each crop."""
-        self._painter = painter
-        is_halo = torch.ones(len(splats), dtype=torch.bool)
-        is_halo[core] = False
-        self._views = {crop.camera.name: self._surrounding(splats, core, crop.camera, is_halo) for crop in counted(crops, len(crops), "halo", "view")}
-        rows, beside = torch.cat([torch.empty(0, dtype=torch.int32), *(view.beside for view in self._views.values())]).unique(return_inverse=True)
-        self._halo = splats.gaussians(rows.long())
-        splats.release()
-        places = beside.to(torch.int32).split([len(view.beside) for view in self._views.values()])
-        self._views = {name: replace(view, beside=own) for (name, view), own in zip(self._views.items(), places, strict=True)}
+    def __init__(self, scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> None:
+        self._scene, self._number = scene, number
+        self._effects = unrounded(scene.target)
+        self._truths = Truths(scene, folder)
+        self._layers = Album([layer_file(folder, number, sweep.number)])
+        self._halos = Album(halo_file(folder, part, sweep.number) for part in range(parts(scene.sweep_views(sweep))))
+        self._kept: dict[str, _Surrounding] = {}
+        self._lock = Lock()  # views are asked for side by side
 
-    def _surrounding(self, splats: Splats, core: Tensor, camera: Camera, is_halo: Tensor) -> _Surrounding:
-        near = self._painter.effects.near_plane
-        _, depths = splats.seen_by(camera, near, core)
-        spare = SPARE * float(depths[-1] - depths[0])
-        rows, halo_depths = splats.seen_by(camera, near)
-        halo = is_halo[rows]
-        rows, halo_depths = rows[halo], halo_depths[halo]
-        ends = torch.tensor([float(depths[0]) - spare, float(depths[-1]) + spare])
-        first, last = torch.searchsorted(halo_depths, ends).tolist()
-        front = self._painter.draw(splats, camera, rows[:first])
-        back = self._painter.draw(splats, camera, rows[last:])
-        splats.release()
-        behind = back.over(torch.tensor(self._painter.effects.background))
-        beside = rows[first:last].to(torch.int32)
-        return _Surrounding(front.image.half(), front.transmittance.half(), behind.half(), beside, back.transmittance.half())
+    def crop(self, view: Camera) -> Camera | None:
+        """The core's box, at the new scale, in a view of the base; None if it shows too little of the core."""
+        name = f"{view.name}/{self._number}"
+        if name not in self._halos:
+            return None
+        left, top, right, bottom = self._box(view.name)
+        target = view.zoomed(self._scene.scale)
+        return replace(target, width=right - left, height=bottom - top, cx=target.cx - left, cy=target.cy - top, zoom=1.0)
 
-    @property
-    def beside(self) -> float:
-        """The mean number of splats that are drawn with the core."""
-        return sum(len(view.beside) for view in self._views.values()) / len(self._views)
+    def _box(self, name: str) -> Box:
+        box = self._halos.entry(f"{name}/{self._number}").box
+        assert box is not None  # since those of tiles have one
+        return box
+
+    def _surrounding(self, name: str) -> _Surrounding:
+        with self._lock:
+            if name not in self._kept:
+                self._kept[name] = self._read(name)
+                if len(self._kept) > KEPT:
+                    del self._kept[next(iter(self._kept))]
+            return self._kept[name]
+
+    def _read(self, name: str) -> _Surrounding:
+        box = self._box(name)
+        through, behind, share = (self._halos[f"{name}/{self._number}"].float() / FINE).split((1, 3, 1), dim=2)
+        image = within(from_16_bits(self._halos[name]), box)
+        truth = within(self._truths.named(name), box)
+        x, y = (self._layers.entry(name).box or (0, 0))[:2]
+        left, top, right, bottom = box
+        before = within(self._layers[name], (left - x, top - y, right - x, bottom - y)).float()
+        core = through * before[..., :3] + before[..., 3:] * behind
+        return _Surrounding(image - core, through, behind, truth + (1 - share) * (image - truth))
 
     def render(self, core: Gaussians, camera: Camera) -> Tensor:
         """The image [h, w, 3] of a crop, differentiable in the core's splats."""
-        view = self._views[camera.name]
-        both = _joined(core, self._halo[view.beside.long()])
-        rendered = self._painter.backend.render(both, camera, replace(self._painter.effects, background=BLACK))
-        inner = rendered.image + (1 - rendered.alpha)[..., None] * view.back.float()
-        return view.front.float() + view.through.float() * inner
+        return self._whole(camera, self._scene.backend.render(core, camera, self._effects))
 
+    def render_views(self, core: Gaussians, cameras: Sequence[Camera], _: int = 0) -> list[Tensor]:
+        """The same of several cameras, in one call if the backend can."""
+        shown = [camera for camera in cameras if camera.name != NOTHING]
+        together = getattr(self._scene.backend, "render_views", None)
+        if together is None or len(shown) < 2:
+            images = [self.render(core, camera) for camera in shown]
+        else:
+            rendered = together(core, [(camera, self._effects) for camera in shown])
+            images = [self._whole(camera, each) for camera, each in zip(shown, rendered, strict=True)]
+        following = iter(images)
+        black = 0 * core.means[:1, None]  # a step whose views all show nothing has a gradient too, of 0
+        return [next(following) if camera.name != NOTHING else black for camera in cameras]
 
-    @torch.no_grad()
-    def wanted(self, core: Gaussians, camera: Camera, truth: Tensor) -> Tensor:
-        """[h, w, 3] half: what the core should look like in front of, behind and among a halo that is not right yet either.
+    def _whole(self, camera: Camera, core: Rendered) -> Tensor:
+        around = self._surrounding(camera.name)
+        return around.rest + around.through * core.image + (1 - core.alpha)[..., None] * around.behind
+
+    def wanted(self, camera: Camera) -> Tensor:
+        """[h, w, 3]: what a crop should look like, in front of, behind and among a halo that is not right yet either.
 
         The other tiles learn too, and each pixel's error must not be mended once by every tile that it shows: a tile mends the fraction
         of the error that it has of the pixel's blend weights. All tiles together then mend all of it, to first order.
         """
-        error = self.render(core, camera) - truth
-        return (truth + (1 - self._share(core, camera)) * error).half()
-
-    def _share(self, core: Gaussians, camera: Camera) -> Tensor:
-        """[h, w, 1]: the core's fraction of the blend weights of all splats in each pixel of a crop."""
-        view, settings = self._views[camera.name], self._painter.effects.settings.without_color_rounding()
-        halo = self._halo[view.beside.long()]
-        white, black = (torch.full((len(splats), 1, 3), (color - 0.5) / C0) for splats, color in ((core, 1.0), (halo, 0.0)))
-        effects = replace(self._painter.effects, background=BLACK, sh_degree=0, settings=settings)
-        rendered = self._painter.backend.render(_joined(replace(core, sh=white), replace(halo, sh=black)), camera, effects)
-        through = view.through.float()
-        all_weights = 1 - through * (1 - rendered.alpha)[..., None] * view.clear.float()
-        return through * rendered.image[..., :1] / all_weights.clamp_min(INVISIBLE)
+        return self._surrounding(camera.name).wanted if camera.name != NOTHING else torch.zeros(1, 1, 3)
 
 
-def _joined(first: Gaussians, second: Gaussians) -> Gaussians:
-    """The splats of both; they have no covariances."""
-    names = [field.name for field in fields(Gaussians) if field.name != "covariances"]
-    return Gaussians(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))
+def nothing(view: Camera) -> Camera:
+    """In place of a view that does not show the core: all tiles draw the same views in a step, each what it has in them."""
+    return replace(view, width=1, height=1, name=NOTHING)

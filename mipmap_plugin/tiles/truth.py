@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,16 +12,12 @@ from torch import Tensor
 from mipmap_plugin.adaptation.target.image_store import MOST, STEPS
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.formats.torch_file import load_torch, save_torch
+from mipmap_plugin.tiles.folder import truth_file
+from mipmap_plugin.tiles.pictures import Album, write_pictures
 from mipmap_plugin.tiles.scene import TiledScene
 
 # Views of a file, which one job draws.
 VIEWS = 12
-
-
-def truth_file(folder: Path, part: int) -> Path:
-    """The file of the `part`-th views."""
-    return folder / f"truth_{part}.pt"
 
 
 def parts(views: Sequence[Camera]) -> int:
@@ -29,11 +25,15 @@ def parts(views: Sequence[Camera]) -> int:
     return -(-len(views) // VIEWS)
 
 
+def part_of(views: Sequence[Camera], number: int) -> Sequence[Camera]:
+    """The views of one file."""
+    return views[number * VIEWS : (number + 1) * VIEWS]
+
+
 def draw_truths(scene: TiledScene, part: int, folder: Path) -> None:
     """Draw the `part`-th views, and write them to their file in `folder`, in 16 bits."""
-    views = scene.views.all[part * VIEWS : (part + 1) * VIEWS]
-    images = {view.name: (draw_truth(scene, view) * STEPS).round().clamp(-MOST, MOST).to(torch.int16) for view in views}
-    save_torch(truth_file(folder, part), images, overwrite=True)
+    views = part_of(scene.used_views, part)
+    write_pictures(truth_file(folder, part), ((view.name, in_16_bits(draw_truth(scene, view)), None) for view in views))
 
 
 def draw_truth(scene: TiledScene, view: Camera) -> Tensor:
@@ -43,28 +43,30 @@ def draw_truth(scene: TiledScene, view: Camera) -> Tensor:
     camera = view.resized(max(1, round(view.width * fraction)), max(1, round(view.height * fraction)))
     effects = replace(scene.base_effects, eps2d=scene.base_effects.eps2d * fraction**2)
     image = scene.painter(effects).image(scene.base, camera).clamp(0, 1)
-    scene.base.release()
     target = resize(image, view.zoomed(scene.scale).size, config.resize)
     return target.clamp(0, 1).mul(255).round().div(255) if config.quantize_truth else target
 
 
+def in_16_bits(image: Tensor) -> Tensor:
+    """An image as it is stored (`image_store`)."""
+    return (image * STEPS).round().clamp(-MOST, MOST).to(torch.int16)
+
+
+def from_16_bits(stored: Tensor) -> Tensor:
+    """An image that was stored."""
+    return stored.float() / STEPS
+
+
 class Truths:
-    """The truths of some views, each within a box of it."""
+    """The truths of all views that are used, on the disk."""
 
-    def __init__(self, folder: Path, boxes: dict[str, tuple[int, int, int, int] | None]) -> None:
-        """`boxes`: by the name of a view, (left, top, right, bottom) in target pixels; None for the whole view."""
-        self._images: dict[str, Tensor] = {}
-        for part in sorted({int(name) // VIEWS for name in boxes}):
-            images = load_torch(truth_file(folder, part))
-            for name in images.keys() & boxes.keys():
-                left, top, right, bottom = boxes[name] or (0, 0, images[name].shape[1], images[name].shape[0])
-                self._images[name] = images[name][top:bottom, left:right].clone()
-
-    @classmethod
-    def whole(cls, folder: Path, views: Iterable[Camera]) -> Truths:
-        """The truths of whole views."""
-        return cls(folder, {view.name: None for view in views})
+    def __init__(self, scene: TiledScene, folder: Path) -> None:
+        self._album = Album(truth_file(folder, part) for part in range(parts(scene.used_views)))
 
     def __call__(self, view: Camera) -> Tensor:
-        """The truth [h, w, 3] of a view."""
-        return self._images[view.name].float() / STEPS
+        """The truth [h, w, 3] of a whole view, which is found by its name."""
+        return self.named(view.name)
+
+    def named(self, name: str) -> Tensor:
+        """The truth [h, w, 3] of the view of this name."""
+        return from_16_bits(self._album[name])

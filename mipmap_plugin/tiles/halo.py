@@ -1,0 +1,75 @@
+"""What each tile has around it in each view as a sweep begins: the layers of the others, in the order in which the camera sees the cores.
+
+The order of the cores is right for points, but a splat that reaches across a plane may be drawn on the wrong side of its neighbors. So
+layers say only how much a tile shows of what it changes (the transmittance in front of it, the picture behind it); what the view looks like
+with all of it is drawn exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.tiles.cut import front_to_back
+from mipmap_plugin.tiles.folder import halo_file, layer_file
+from mipmap_plugin.tiles.layers import box_of, unrounded, within
+from mipmap_plugin.tiles.pictures import Album, Box, write_pictures
+from mipmap_plugin.tiles.scene import TiledScene
+from mipmap_plugin.tiles.slabs import Layer
+from mipmap_plugin.tiles.steering import Steered, open_state
+from mipmap_plugin.tiles.sweeps import Sweep
+from mipmap_plugin.tiles.truth import in_16_bits, part_of
+
+# Blend weights of a pixel that are too small to be seen.
+INVISIBLE = 1 / 255
+
+# A tile is left out of a view of which it has less than this fraction, and has so many pixels around what it has.
+LEAST, PAD = 1e-3, 8
+
+# Steps from 0 to 1 of what is stored in 8 bits: it decides how strongly a splat is moved, and not what a view looks like.
+FINE = 255
+
+
+def draw_halos(scene: TiledScene, part: int, sweep: Sweep, folder: Path) -> None:
+    """Draw the `part`-th of a sweep's views as it begins, and write the picture, NAME, and what each tile TILE has in it around it, NAME/TILE."""
+    splats, painter = open_state(scene, folder, Steered.before(folder, sweep.number)), scene.painter(unrounded(scene.target))
+    layers = [Album([layer_file(folder, number, sweep.number)]) for number in range(len(scene.cores))]
+    background = torch.tensor(scene.target.background)
+
+    def pictures() -> Iterator[tuple[str, Tensor, Box | None]]:
+        for view in part_of(scene.sweep_views(sweep), part):
+            yield view.name, in_16_bits(painter.draw(splats, view.zoomed(scene.scale)).over(background)), None
+            for number, halo, box in _halos(scene, view, layers):
+                yield f"{view.name}/{number}", halo, box
+
+    write_pictures(halo_file(folder, part, sweep.number), pictures())
+
+
+def _halos(scene: TiledScene, view: Camera, layers: list[Album]) -> Iterator[tuple[int, Tensor, Box]]:
+    """Tiles with their halos in a view, [h, w, 5] in 8 bits: the transmittance of what is in front, what is seen of what is behind,
+    and the fraction of the pixel's blend weights that the tile has."""
+    size = view.zoomed(scene.scale).size
+    seen = [number for number in front_to_back(scene.tree, view.center.tolist()) if view.name in layers[number]]
+    boxes = {number: layers[number].entry(view.name).box or (0, 0, size[1], size[0]) for number in seen}
+    pictures = {number: layers[number][view.name].float() for number in seen}
+    fronts, through = {}, torch.ones(*size, 1)
+    for number in seen:
+        front = within(through, boxes[number])
+        fronts[number] = front.clone()
+        front *= pictures[number][..., 3:]
+    all_weights = (1 - through).clamp_min(INVISIBLE)
+    behind = torch.tensor(scene.target.background).expand(*size, 3).clone()
+    for number in reversed(seen):
+        layer, front, back = Layer(pictures[number][..., :3], pictures[number][..., 3:]), fronts[number], within(behind, boxes[number])
+        weights = front * (1 - layer.transmittance)
+        halo = torch.cat([front, front * back, weights / within(all_weights, boxes[number])], dim=2)
+        back.copy_(layer.over(back))
+        inner = box_of(weights[..., 0] > INVISIBLE, PAD)
+        if inner is not None and float(weights.sum()) > LEAST * size[0] * size[1]:
+            left, top, right, bottom = inner
+            x, y = boxes[number][:2]
+            yield number, (within(halo, inner) * FINE).round().clamp(0, FINE).to(torch.uint8), (x + left, y + top, x + right, y + bottom)

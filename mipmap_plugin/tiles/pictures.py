@@ -1,0 +1,86 @@
+"""Pictures in one file, each read by itself when it is needed, so that memory holds one at a time."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.formats.atomic import new_file
+
+# The last bytes of a file: where its table begins.
+END = struct.Struct("<q")
+
+KINDS = {"half": torch.float16, "int16": torch.int16, "uint8": torch.uint8}
+
+Box = tuple[int, int, int, int]  # left, top, right, bottom, px of the view
+
+
+class Entry(NamedTuple):
+    """One picture of a file."""
+
+    start: int  # byte
+    shape: tuple[int, ...]
+    kind: str  # of `KINDS`
+    box: Box | None  # what it shows of its view; None: all
+
+
+class Pictures:
+    """The pictures of a file, by name."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with path.open("rb") as file:
+            file.seek(-END.size, 2)
+            end = file.tell()
+            (start,) = END.unpack(file.read(END.size))
+            file.seek(start)
+            table = json.loads(file.read(end - start))
+        self.entries = {name: Entry(at, tuple(shape), kind, box and tuple(box)) for name, (at, shape, kind, box) in table.items()}
+
+    def __getitem__(self, name: str) -> Tensor:
+        """A picture, read anew each time."""
+        entry = self.entries[name]
+        kind = KINDS[entry.kind]
+        picture = torch.empty(entry.shape, dtype=kind)
+        with self._path.open("rb") as file:
+            file.seek(entry.start)
+            file.readinto(picture.view(-1).view(torch.uint8).numpy().data)
+        return picture
+
+
+def write_pictures(path: Path, pictures: Iterable[tuple[str, Tensor, Box | None]]) -> None:
+    """Write pictures of the types of `KINDS` as they come, atomically; an old file is replaced. Raises OutputError."""
+    names = {kind: name for name, kind in KINDS.items()}
+    table = {}
+    with new_file(path, overwrite=True) as temporary, temporary.open("wb") as file:
+        for name, picture, box in pictures:
+            table[name] = (file.tell(), list(picture.shape), names[picture.dtype], box)
+            file.write(picture.contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        start = file.tell()
+        file.write(json.dumps(table).encode())
+        file.write(END.pack(start))
+
+
+class Album:
+    """The pictures of several files, by name."""
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        files = [Pictures(path) for path in paths]
+        self._file_of = {name: file for file in files for name in file.entries}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._file_of
+
+    def __getitem__(self, name: str) -> Tensor:
+        """A picture, read anew each time."""
+        return self._file_of[name][name]
+
+    def entry(self, name: str) -> Entry:
+        """What the table says of a picture."""
+        return self._file_of[name].entries[name]
