@@ -47,7 +47,7 @@ EFFECTS = Effects(1, background=(0.2, 0.4, 0.6))
 
 
 def stored(path, model):
-    write_store(path, len(model), [model.parameters()])
+    write_store(path, model.parameters())
     return Store(path)
 
 
@@ -142,8 +142,7 @@ def test_reading_in_pieces_makes_no_difference(on_disk, monkeypatch):
 
 def test_slabs_are_cut_by_depth():
     depths = torch.tensor([5.0, 1.0, 4.0, 2.0, 3.0])
-    parts = slabs.slabs(torch.arange(5), depths, 2)
-    assert [part.tolist() for part in parts] == [[1, 3], [2, 4], [0]]
+    assert [part.tolist() for part in slabs.slabs(torch.arange(5), depths, 2)] == [[1], [3, 4], [0, 2]]
     assert slabs.slabs(torch.arange(0), depths[:0], 2) == []
 
 
@@ -171,6 +170,15 @@ def test_slabs_give_the_blend_weights_of_all_splats(on_disk, monkeypatch):
     monkeypatch.setattr(slabs, "COLORLESS_SLAB", 37)
     expected = blend_weights(in_memory, views, backend, EFFECTS)
     assert torch.allclose(Painter(backend, EFFECTS).blend_weights(splats, views), expected, atol=1e-3, rtol=1e-3)
+
+
+def test_strips_give_the_blend_weights_of_their_view(on_disk, monkeypatch):
+    splats, _ = on_disk
+    view, painter = tiny.cameras(1), Painter(ReferenceBackend(), EFFECTS)
+    whole = painter.blend_weights(splats, view)
+    monkeypatch.setattr(slabs, "MOST_PIXELS", 300)
+    assert [strip.height for strip in slabs.strips(view[0])] == [8, 8, 8]
+    assert torch.allclose(painter.blend_weights(splats, view), whole, atol=0.02, rtol=0.01)  # the frame limits how oblique a splat may be drawn
 
 
 def test_a_plain_text_file_is_refused(tmp_path):

@@ -20,6 +20,7 @@ from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.formats.tags import with_tags
+from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
@@ -78,6 +79,7 @@ def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threa
             except CheckpointError:
                 shutil.rmtree(folder)  # nothing was done yet
                 raise
+        return_freed_memory()
     scene = opened(job.base, job.scale, job.viewer, job.config(), folder)
     scene.wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
     stages = _Stages(job, engine, {"cutting": time.perf_counter() - began})

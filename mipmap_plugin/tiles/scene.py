@@ -35,7 +35,7 @@ from mipmap_plugin.tiles.cut import Tree, cut
 from mipmap_plugin.tiles.folder import BASE, CUT
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import CHUNK, Splats
-from mipmap_plugin.tiles.store import Store, write_store
+from mipmap_plugin.tiles.store import Store, write_pieces
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
 from mipmap_plugin.wrap import wrap_model
 from mipmap_plugin.wrapped import Wrapped
@@ -78,7 +78,7 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     checkpoint, kind = find_splats(path)
     rows = PlyRows(checkpoint.path)
     found = _Found()
-    write_store(folder / BASE, len(rows), (found(kind, part) for part in _read(kind, rows)))
+    write_pieces(folder / BASE, len(rows), (found(kind, part) for part in _read(kind, rows)))
     splats = Splats.of(kind, [Store(folder / BASE)])
     valid = torch.cat(found.valid)
     kept = valid.nonzero()[:, 0]

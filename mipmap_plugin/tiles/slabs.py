@@ -7,6 +7,7 @@ slab behind what the slabs before it let through: C = C_1 + T_1 (C_2 + T_2 (...)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -23,6 +24,12 @@ SLAB = 200_000
 
 # The same without colors, which are four fifths of a splat.
 COLORLESS_SLAB = 4 * SLAB
+
+# Pixels of a strip, of which blend weights are found.
+MOST_PIXELS = 1 << 19
+
+# Splats whose depths tell where slabs begin.
+SAMPLE = 1 << 14
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -50,13 +57,17 @@ class Painter:
     def draw(self, splats: Splats, camera: Camera) -> Layer:
         """The picture of all splats that the camera sees."""
         effects = replace(self.effects, background=BLACK)
-        image, through = torch.zeros(*camera.size, 3), torch.ones(*camera.size, 1)
-        for slab in slabs(*splats.seen_by(camera, effects.near_plane), SLAB):
-            rendered = self.backend.render(splats.gaussians(slab), camera, effects)
-            image += through * rendered.image
-            through *= (1 - rendered.alpha)[..., None]
+        parts = slabs(*splats.seen_by(camera, effects.near_plane), SLAB)
+        if not parts:
+            return Layer(torch.zeros(*camera.size, 3), torch.ones(*camera.size, 1))
+        first = self.backend.render(splats.gaussians(parts[0]), camera, effects)
+        image, through = first.image, (1 - first.alpha)[..., None]
+        for slab in parts[1:]:
             if float(through.max()) < effects.settings.min_transmittance:
                 break
+            rendered = self.backend.render(splats.gaussians(slab), camera, effects)
+            image.addcmul_(through, rendered.image)
+            through.mul_((1 - rendered.alpha)[..., None])
         return Layer(image, through)
 
     def image(self, splats: Splats, camera: Camera) -> Tensor:
@@ -68,7 +79,7 @@ class Painter:
         settings = self.effects.settings.without_color_rounding()
         effects = replace(self.effects, background=BLACK, sh_degree=0, settings=settings)
         weights = torch.zeros(len(splats))
-        for camera in cameras:
+        for camera in (strip for view in cameras for strip in strips(view)):
             parts = slabs(*splats.seen_by(camera, effects.near_plane), COLORLESS_SLAB)
             through = torch.ones(*camera.size, 1)
             for slab in parts:
@@ -99,10 +110,17 @@ class Painter:
 
 
 def slabs(rows: Tensor, depths: Tensor, most: int) -> list[Tensor]:
-    """`rows` [M] of splats at `depths` [M] in slabs of rising depth, of at most `most` rows but for equal depths; rows keep their order."""
+    """`rows` [M] of splats at `depths` [M] in slabs of rising depth, of about `most` rows at most; rows keep their order."""
     count = -(-len(rows) // most)
     if count < 2:
         return [rows] if count else []
-    ends = depths.sort().values[most::most].contiguous()
-    slab_of = torch.bucketize(depths, ends, right=True)
+    some = depths[:: max(1, len(depths) // SAMPLE)].sort().values
+    slab_of = torch.bucketize(depths, some[[len(some) * number // count for number in range(1, count)]], right=True)
     return [rows[slab_of == number] for number in range(count)]
+
+
+def strips(camera: Camera) -> list[Camera]:
+    """A view in strips of at most `MOST_PIXELS`, whose blend weights add up to its own: the lists of many splats take memory for each pixel."""
+    count = -(-camera.width * camera.height // MOST_PIXELS)
+    ends = [camera.height * number // count for number in range(count + 1)]
+    return [replace(camera, height=end - top, cy=camera.cy - top) for top, end in pairwise(ends) if end > top]

@@ -51,7 +51,7 @@ class Splats:
         """The raw parameters of rows [M], in their order; without colors: of SH degree 0, and gray."""
         order = rows.argsort()
         sorted_rows, coefficients = rows[order], self.parts[0].sh.shape[1] if colored else 1
-        shapes, sh = torch.empty(len(rows), SHAPE), torch.zeros(len(rows), coefficients, 3)
+        shapes, sh = torch.empty(len(rows), SHAPE), (torch.empty if colored else torch.zeros)(len(rows), coefficients, 3)
         for part, first, end in zip(self.parts, self.starts, self.starts[1:], strict=False):
             for start in range(first, end, CHUNK):  # so that little of a file is in memory at a time
                 low, high = torch.searchsorted(sorted_rows, torch.tensor([start, min(start + CHUNK, end)])).tolist()

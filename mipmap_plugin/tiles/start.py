@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mipmap_plugin import pool
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.candidates import WEIGHT_VIEWS
@@ -17,6 +18,7 @@ from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.torch_file import save_torch
+from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles.folder import START, start_file
@@ -43,6 +45,7 @@ class StartSearch:
         """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
         scene, config = self.scene, self.scene.config
         weights = scene.painter(scene.base_effects).blend_weights(scene.base, self.views) * scene.scale**2
+        _free_memory()
         if not (config.closed_form or config.merge_to < 1):
             return self._take_base(self.steer(scene.base))
         self._candidate("formed", weights, 1.0)
@@ -68,8 +71,10 @@ class StartSearch:
         """Write the closed form of the base after merging each core down to a fraction."""
         cores = range(len(self.scene.cores))
         wanted = torch.cat([self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores])
+        _free_memory()
         if self.matches:
             self._match(name, wanted)
+            _free_memory()
 
     def _merged(self, file: Path, core: Tensor, weights: Tensor, fraction: float) -> Tensor:
         scene = self.scene
@@ -89,7 +94,7 @@ class StartSearch:
             model.rebuild(merged)
         if scene.config.closed_form:
             model.reshape(formed)
-        write_store(file, len(model), [model.parameters()])
+        write_store(file, model.parameters())
         return merged_weights[0]
 
     def _match(self, name: str, wanted: Tensor) -> None:
@@ -107,11 +112,11 @@ class StartSearch:
         for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
             model = self.scene.for_target(part.parameters())
             _set_opacities(model, matched)
-            write_store(self._file(name, number), len(model), [model.parameters()])
+            write_store(self._file(name, number), model.parameters())
 
     def _take_base(self, psnr: float) -> None:
         for number, core in enumerate(self.scene.cores):
-            write_store(self._file("formed", number), len(core), [self.scene.base.parameters(core)])
+            write_store(self._file("formed", number), self.scene.base.parameters(core))
         self._take("formed", AS_IT_IS, psnr)
 
     def _take(self, name: str, title: str, psnr: float) -> None:
@@ -119,6 +124,12 @@ class StartSearch:
         for number in range(len(self.scene.cores)):
             self._file(name, number).replace(start_file(self.folder, number))
         save_torch(self.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
+
+
+def _free_memory() -> None:
+    """Give the system what one step needed and the next one does not."""
+    pool.release()
+    return_freed_memory()
 
 
 def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:

@@ -24,6 +24,9 @@ SHAPE = sum(WIDTHS)
 
 FLOAT = 4  # bytes
 
+# Rows that are written at a time.
+PIECE = 1 << 14
+
 
 class Store:
     """The splats of a file, mapped into memory."""
@@ -63,7 +66,13 @@ def as_parameters(shapes: Tensor, sh: Tensor) -> dict[str, Tensor]:
     return {**parts, "opacities": parts["opacities"][:, 0], "sh0": sh[:, :1], "shN": sh[:, 1:]}
 
 
-def write_store(path: Path, count: int, pieces: Iterable[dict[str, Tensor]]) -> None:
+def write_store(path: Path, parameters: dict[str, Tensor]) -> None:
+    """Write splats with these raw parameters, atomically; an old file is replaced. Raises OutputError."""
+    count = len(parameters["means"])
+    write_pieces(path, count, ({name: rows[start : start + PIECE] for name, rows in parameters.items()} for start in range(0, count, PIECE)))
+
+
+def write_pieces(path: Path, count: int, pieces: Iterable[dict[str, Tensor]]) -> None:
     """Write `count` splats, whose raw parameters come in pieces, atomically; an old file is replaced. Raises OutputError."""
     with new_file(path, overwrite=True) as temporary, temporary.open("wb") as file:
         done = 0

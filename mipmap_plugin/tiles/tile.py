@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ from typing import Any
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.optimization.validation import no_validation
+from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
+from mipmap_plugin.adaptation.optimization.validation import Steering, no_validation
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.tiles.folder import run_file, tile_file
 from mipmap_plugin.tiles.scene import TiledScene
@@ -31,7 +33,7 @@ class Tile:
         self.scene, self.number, self.sweep, self.folder = scene, number, sweep, folder
         self.config = scene.config.model_copy(update=STEERED_AS_A_WHOLE)
         self.before = Steered.before(folder, sweep.number)
-        self.start = scene.for_target(Store(self.before.file(folder, number)).parameters())
+        self.student = scene.for_target(Store(self.before.file(folder, number)).parameters())
         self.surroundings = Surroundings(scene, number, sweep, folder)
         self.crops = [*map(self.surroundings.crop, scene.views.adapted)]
 
@@ -41,8 +43,8 @@ class Tile:
         Returns what the next sweep goes on with, what there is to say, and what keeps the state until that is saved.
         """
         began, seen = time.perf_counter(), sum(crop is not None for crop in self.crops)
-        facts: dict[str, Any] = {"tile": self.number, "sweep": self.sweep.number, "splats": len(self.start), "views": seen}
-        student = self.start.copy()
+        facts: dict[str, Any] = {"tile": self.number, "sweep": self.sweep.number, "splats": len(self.student), "views": seen}
+        student = self.student
         if not seen:
             self._write(student.parameters(), self.sweep.checks)
             return {}, facts | {"splats_after": len(student), "ended_by": "no view shows enough of it", "seconds": 0.0}, None
@@ -66,11 +68,11 @@ class Tile:
 
     def _write(self, parameters: dict[str, Any], steps: Any) -> None:
         for step in steps:
-            write_store(tile_file(self.folder, self.number, self.sweep.number, step), len(parameters["means"]), [parameters])
+            write_store(tile_file(self.folder, self.number, self.sweep.number, step), parameters)
 
     def _continue(self, run: Run) -> None:
         """Let a run go on where the sweep before ended, with its moments unless what they led to was undone."""
-        run.step, run.steering.ceiling = self.sweep.first, self.before.ceiling
+        run.step, run.steering = self.sweep.first, Steering(0.0, math.inf, Snapshot({}, {}), ceiling=self.before.ceiling)  # no best state is kept
         run.curve[0] = run.curve[0].model_copy(update={"step": run.step})
         if not self.sweep.number:
             return
@@ -90,6 +92,6 @@ class Tile:
     def _fingerprint(self) -> str:
         """A hash of everything that the run depends on."""
         poses = [[*crop.size, crop.fx, crop.cx, crop.cy, *crop.viewmat.flatten().tolist()] for crop in self.crops if crop is not None]
-        start = [hashlib.sha256(tensor.detach().numpy().tobytes()).hexdigest() for tensor in self.start.parameters().values()]
+        start = [hashlib.sha256(tensor.detach().numpy().tobytes()).hexdigest() for tensor in self.student.parameters().values()]
         facts = [self.scene.digest, self.sweep.number, self.before.ceiling, start, self.config.model_dump(), poses]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
