@@ -22,7 +22,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
-from mipmap_plugin.adaptation.renderers import renderer, unrounded, views_renderer
+from mipmap_plugin.adaptation.renderers import renderer, stepping_renderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
 from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch
 from mipmap_plugin.adaptation.start.compilation import warm_up
@@ -110,7 +110,8 @@ class Session:
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())
             merging = self.config.merge_to < 1 and self._has_blend_weights
-            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0, merging=merging)
+            steps, plain = self.config.steps > 0, self.base.traits.plain
+            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=steps, merging=merging, by_rows=plain)
         as_it_is = self._for_target(self._base_in_viewer, shared=True)
         initial, start = StartSearch(self._start_problem()).best()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
@@ -167,8 +168,8 @@ class Session:
         max_splats = min(max_splats, self.config.most_splats or sys.maxsize)
         targets = [unrounded(target) for target in self.extremes.values()]
         first, *further = [renderer(self.backend, target) for target in targets]
-        together = views_renderer(self.backend, targets)
-        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together)
+        together, stepping = views_renderer(self.backend, targets), stepping_renderer(self.backend, targets)
+        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together, stepping)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient

@@ -36,6 +36,11 @@ def neighbors(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {**parameters, "sh0": whole[:, :1], "shN": whole[:, 1:]}
 
 
+def one_tensor(sh0: Tensor, shN: Tensor) -> Tensor | None:
+    """The contiguous tensor [N, K, 3] that both neighbors are parts of, without a gradient; None for others."""
+    return _whole(sh0, shN) if _are_neighbors(sh0, shN) else None
+
+
 def _whole(sh0: Tensor, shN: Tensor) -> Tensor:
     """The tensor that both neighbors are parts of, without a gradient."""
     count, others, channels = shN.shape

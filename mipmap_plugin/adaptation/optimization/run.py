@@ -17,6 +17,7 @@ from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
 from mipmap_plugin.adaptation.target.resize import difference_from
+from mipmap_plugin.backends.base import Later
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
@@ -28,6 +29,9 @@ AGREEMENT_VIEWS = 8
 
 # Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
 ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
+
+# The same, and what moves the splats once the gradients of the images are known.
+SteppingRenderer = Callable[[Gaussians, Sequence[Camera], int], tuple[list[Tensor], Later]]
 
 
 @dataclass(frozen=True)
@@ -44,16 +48,19 @@ class Task:
     max_splats: int = sys.maxsize  # growing stops at this number
     further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
+    render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
 
     def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
         return (self.render, *self.further_renders)[draw % (1 + len(self.further_renders))]
 
-    def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
-        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
+    def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int, *, to_step: bool) -> tuple[list[Tensor], Later | None]:
+        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it; with `to_step` also what moves the splats."""
+        if to_step and self.render_to_step is not None:
+            return self.render_to_step(gaussians, cameras, draw)
         if self.render_views is not None:
-            return self.render_views(gaussians, cameras, draw)
-        return [self.renderer(draw + number)(gaussians, camera) for number, camera in enumerate(cameras)]
+            return self.render_views(gaussians, cameras, draw), None
+        return [self.renderer(draw + number)(gaussians, camera) for number, camera in enumerate(cameras)], None
 
     def pixel(self, means: Tensor) -> float:
         """The size of a target pixel at the median of `means` [N, 3], in world units."""
