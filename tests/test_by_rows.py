@@ -1,14 +1,14 @@
 """Steps that the CPU backend takes itself, against autograd's gradients and the dense optimizer."""
 
 import importlib.util
-import math
 
 import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.by_rows import adam_step, moves_by_rows
+from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
+from mipmap_plugin.adaptation.renderers import SteppingRenderer
 from mipmap_plugin.backends.base import AdamStep
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -16,10 +16,15 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.splatting.bands import neighbors
+from mipmap_plugin.splatting.viewers import BUILT_IN
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
 BACKEND, VIEWS = CpuBackend(), tiny.cameras(3)
 SHOTS = [(view, Effects(1)) for view in VIEWS]
+
+
+known: dict[VanillaModel, ByRows] = {}
 
 
 def student(count: int = 77, degree: int = 1) -> VanillaModel:
@@ -41,12 +46,12 @@ def dense_step(model, optimizer, shots=SHOTS):
 
 
 def step_by_rows(model, optimizer, shots=SHOTS):
-    leaves = model.gaussians().detach()
-    leaves.means.requires_grad_()
-    drawn, later = BACKEND.render_to_step(leaves, shots)
-    loss(drawn).backward()
-    assert leaves.means.grad is None
-    later.step(adam_step(optimizer))
+    draw = SteppingRenderer(BACKEND.stepper, [Effects(1)])
+    rows = ByRows.of(model, draw, known.get(model))
+    known[model] = rows
+    loss(rows.stepper.render(shots)).backward()
+    assert all(tensor.grad is None for tensor in model.parameters().values())
+    rows.step(optimizer)
 
 
 def after(steps, **options) -> dict[str, torch.Tensor]:
@@ -105,14 +110,49 @@ def test_the_kernel_of_a_step_against_float64():
     torch.testing.assert_close(model.parameters()["opacities"].detach().double(), opacity, atol=2e-4, rtol=1e-3)
 
 
+def of(model, previous=None) -> ByRows | None:
+    return ByRows.of(model, SteppingRenderer(BACKEND.stepper, [Effects(1)]), previous)
+
+
+def test_what_is_drawn_after_a_step_are_the_moved_parameters():
+    model = student()
+    rows = of(model)
+    loss(rows.stepper.render(SHOTS)).backward()
+    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    assert of(model, rows) is rows
+    with torch.no_grad():
+        for drawn, expected in zip(rows.stepper.render(SHOTS), BACKEND.render_views(model.gaussians(), SHOTS), strict=True):
+            torch.testing.assert_close(drawn.image, expected.image, atol=1e-5, rtol=1e-4)
+
+
+def test_changed_parameters_are_activated_anew_to_the_same_bytes():
+    model = student()
+    rows = of(model)
+    loss(rows.stepper.render(SHOTS)).backward()
+    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    with torch.no_grad():
+        model.parameters()["scales"].add_(0)
+        again = of(model, rows)
+        assert again is not rows
+        assert torch.equal(again.stepper.render(SHOTS)[0].image, rows.stepper.render(SHOTS)[0].image)  # so a run can be resumed
+    model.replace_parameters(neighbors({name: tensor.detach().clone() for name, tensor in model.parameters().items()}))
+    assert of(model, again) not in (None, again)
+
+
 def test_only_plain_splats_that_all_move_go_by_rows():
     model, surfels = student(), SurfelModel(tiny.model().parameters()).copy()
-    assert moves_by_rows(model) and not moves_by_rows(surfels)
+    assert of(model) is not None and of(surfels) is None and ByRows.of(model, None, None) is None
     model.parameters()["shN"].requires_grad_(False)
-    assert not moves_by_rows(model)
+    assert of(model) is None
     apart = student()
-    apart.replace_parameters({name: tensor.detach().clone() for name, tensor in apart.parameters().items()})
-    assert not moves_by_rows(apart)
+    apart.replace_parameters({name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in apart.parameters().items()})
+    assert of(apart) is None
+
+
+def test_packed_effects_do_not_go_by_rows():
+    packed = next(viewer for viewer in BUILT_IN if viewer.settings.packing).effects(Effects(1))
+    assert SteppingRenderer.of(BACKEND, [Effects(1), packed]) is None
+    assert SteppingRenderer.of(ReferenceBackend(), [Effects(1)]) is None
 
 
 def test_a_family_that_activates_otherwise_is_not_plain():
@@ -124,8 +164,7 @@ def test_a_family_that_activates_otherwise_is_not_plain():
 
 
 def test_a_step_before_the_gradients_are_known_is_refused():
-    leaves = student().gaussians().detach()
-    leaves.means.requires_grad_()
-    _, later = BACKEND.render_to_step(leaves, SHOTS)
+    rows = of(student())
+    rows.stepper.render(SHOTS)
     with pytest.raises(RuntimeError, match="backward"):
-        later.step(AdamStep({}, {}, {}, {}, (0.9, 0.999), math.nan, 0.0))
+        rows.stepper.step(AdamStep({}, {}, {}, {}, (0.9, 0.999), 1.0, 0.0))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.optimization.run import SteppingRenderer, ViewsRenderer
-from mipmap_plugin.backends.base import Backend, Later
+from mipmap_plugin.backends.base import Backend, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+
+# Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
+ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
 
 
 def renderer(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
@@ -31,17 +33,22 @@ def views_renderer(backend: Backend, targets: Sequence[Effects]) -> ViewsRendere
     return images
 
 
-def stepping_renderer(backend: Backend, targets: Sequence[Effects]) -> SteppingRenderer | None:
-    """The same for images whose gradients the backend hands to Adam itself; None if it does not, or the effects do not allow it."""
-    render_to_step = getattr(backend, "render_to_step", None)
-    if render_to_step is None or any(target.settings.packing is not None for target in targets):
-        return None
+@dataclass(frozen=True)
+class SteppingRenderer:
+    """Draws the images of a step by what moves the splats afterwards; the targets take turns."""
 
-    def images(gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> tuple[list[Tensor], Later]:
-        drawn, later = render_to_step(gaussians, _shots(cameras, targets, draw))
-        return [rendered.image for rendered in drawn], later
+    stepper: Callable[[Mapping[str, Tensor]], Stepper]  # `Backend.stepper`
+    targets: Sequence[Effects]
 
-    return images
+    @classmethod
+    def of(cls, backend: Backend, targets: Sequence[Effects]) -> SteppingRenderer | None:
+        """None if the backend moves no splats, or the effects do not allow it."""
+        stepper = getattr(backend, "stepper", None)
+        return None if stepper is None or any(target.settings.packing is not None for target in targets) else cls(stepper, targets)
+
+    def images(self, stepper: Stepper, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
+        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
+        return [rendered.image for rendered in stepper.render(_shots(cameras, self.targets, draw))]
 
 
 def _shots(cameras: Sequence[Camera], targets: Sequence[Effects], draw: int) -> list[tuple[Camera, Effects]]:

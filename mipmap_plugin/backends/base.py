@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -145,11 +145,14 @@ class AdamStep:
     eps: float
 
 
-class Later(Protocol):
-    """What follows once the gradients of the images are known."""
+class Stepper(Protocol):
+    """Draws splats of 3DGS and moves them, by their raw parameters, which only it changes."""
+
+    def render(self, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
+        """Several views, each with effects of its own, differentiable for `step` alone."""
 
     def step(self, step: AdamStep) -> None:
-        """Move the raw parameters of the splats that the images were rendered from. Raises RuntimeError before `backward()`."""
+        """Move the raw parameters down the gradient of what `backward` of the latest `render` was called for. Raises RuntimeError before that."""
 
 
 class Backend(Protocol):
@@ -164,8 +167,8 @@ class Backend(Protocol):
     # (`threads.for_kernels`), return the same bytes on any number, and may run in several threads at once; then torch has one while adapting.
     # `blend_weights(gaussians, camera, effects) -> Tensor | None`: the sum of each splat's blend weights over the image, [N], or None where it has
     # to be found from gradients. `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call, each shot a
-    # (camera, effects); adaptation steps are drawn so. `render_to_step(gaussians, shots) -> tuple[list[Rendered], Later]`: the same for splats
-    # of 3DGS, whose gradients the backend keeps from autograd and hands to Adam itself, row by row: that takes less time, and far less memory.
+    # (camera, effects); adaptation steps are drawn so. `stepper(raw) -> Stepper`: for splats of 3DGS, with `raw` as `AdamStep.raw`; it
+    # keeps gradients from autograd and hands them to Adam itself, row by row, which takes less time, and far less memory.
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""

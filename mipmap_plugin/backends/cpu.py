@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, SETTINGS, AdamStep, Capabilities, Later, Needs, Rendered
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, AdamStep, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import INTEGRATED, Effects
 from mipmap_plugin.errors import BackendUnavailable
@@ -58,12 +59,11 @@ class CpuBackend:
             return [self.render(gaussians, camera, effects) for camera, effects in shots]
         return self._drawn(gaussians, shots)
 
-    def render_to_step(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> tuple[list[Rendered], Later]:
-        """As `render_views` for splats without covariances and effects without packing; no tensor of the splats gets a gradient."""
-        later = _Later()
-        return self._drawn(gaussians, shots, later), later
+    def stepper(self, raw: Mapping[str, Tensor]) -> Stepper:
+        """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`; effects without packing only."""
+        return _Stepper(self, raw)
 
-    def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]], later: _Later | None = None) -> list[Rendered]:
+    def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]], later: _Stepper | None = None) -> list[Rendered]:
         prepared = [self._prepared(gaussians, camera, effects) for camera, effects in shots]
         wanted = [(*shot, ranks) for shot, (_, ranks) in zip(shots, prepared, strict=True)]
         outputs = _Draw.apply(wanted, later, *prepared[0][0])  # type: ignore[no-untyped-call]  # torch's
@@ -119,28 +119,37 @@ def _ahead() -> ModuleType:
     return ahead
 
 
-class _Later:
-    """The backward pass of a call of `_Draw` that waits for the optimizer; see `base.Later`."""
+class _Stepper:
+    """See `base.Stepper`. It keeps the activated splats from step to step: the kernel that moves a row activates it anew."""
 
-    _draw_back: Callable[..., None] | None = None  # ends with a step, once the gradients of the images are known
+    def __init__(self, backend: CpuBackend, raw: Mapping[str, Tensor]) -> None:
+        _drawing()  # reports what numba lacks
+        from mipmap_plugin.backends.cpu_kernels import descending
+
+        self._backend, self._descend = backend, descending.descend
+        self._splats = Gaussians(**{name: torch.from_numpy(array) for name, array in descending.activated(raw).items()})
+        self._draw_back: Callable[[AdamStep], None] | None = None  # ends with a step, once the gradients of the images are known
+
+    def render(self, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
+        leaf = self._splats.opacities.detach().requires_grad_(torch.is_grad_enabled())  # one is enough for autograd to come back
+        return self._backend._drawn(replace(self._splats, opacities=leaf), shots, later=self)
 
     def step(self, step: AdamStep) -> None:
         if self._draw_back is None:
             raise RuntimeError("a step needs the gradients of the images; call backward() on a loss of them first")
-        self._draw_back(step)
+        draw_back, self._draw_back = self._draw_back, None
+        draw_back(step)
 
     def wait_for_step(self, *drawn: Any) -> None:
         """Keep what `descending.descend` needs besides the step."""
-        from mipmap_plugin.backends.cpu_kernels import descending
-
-        self._draw_back = partial(descending.descend, *drawn)
+        self._draw_back = partial(self._descend, *drawn)
 
 
 class _Draw(torch.autograd.Function):
     """The image and the alpha of each shot, one after the other. `later`: takes the place of the backward pass, if there is one."""
 
     @staticmethod
-    def forward(ctx: Any, shots: Sequence[tuple[Camera, Effects, Any]], later: _Later | None, *tensors: Any) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, shots: Sequence[tuple[Camera, Effects, Any]], later: _Stepper | None, *tensors: Any) -> tuple[Tensor, ...]:
         drawing, gradients = _drawing(), any(ctx.needs_input_grad)
         ctx.kinds = {(tensors[-1] is not None, effects) for _, effects, _ in shots}
         if gradients:

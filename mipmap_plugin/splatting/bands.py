@@ -19,7 +19,8 @@ def joined(sh0: Tensor, shN: Tensor) -> Tensor:
     is used again, and so do their gradients: above a million splats, joining and splitting them in fresh memory takes a third of an
     optimization step.
     """
-    if _are_neighbors(sh0, shN) and not (sh0.requires_grad or shN.requires_grad):
+    differentiated = torch.is_grad_enabled() and (sh0.requires_grad or shN.requires_grad)
+    if _are_neighbors(sh0, shN) and not differentiated:
         return _whole(sh0, shN)
     large = sh0.device.type == "cpu" and sh0.dtype == torch.float32 and 4 * shN.numel() >= LARGE
     return _Joined.apply(sh0, shN) if large else torch.cat([sh0, shN], dim=1)  # type: ignore[no-untyped-call]  # torch's

@@ -18,27 +18,24 @@ class Activation:
     """A model's activated splats for the views of a step; passes their gradients back to the model's parameters.
 
     When shared, the views that are drawn in one call get leaves of their own, so that no graph outlives its call; gradients are summed in the order
-    of the calls. Activations, about a tenth of the time of small images, are computed and differentiated once. `by_rows`: always shared, and
-    not differentiated, because the backend does that (`by_rows`).
+    of the calls. Activations, about a tenth of the time of small images, are computed and differentiated once.
     """
 
-    def __init__(self, model: SplatModel, *, share: bool, by_rows: bool = False) -> None:
-        self._model, self._by_rows = model, by_rows
-        self.shares = (share or by_rows) and model.traits.same_for_all_views
+    def __init__(self, model: SplatModel, *, share: bool) -> None:
+        self._model, self.shares = model, share and model.traits.same_for_all_views
         self._splats: Gaussians | None = None
         self._gradients: dict[str, Tensor] = {}
         self._before: Tensor | None = None  # the gradient of the means from the views so far, if not shared
 
     def activate(self, camera: Camera) -> None:
         """Activate the shared splats, before the first view."""
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not self._by_rows):
-            self._splats = self._model.gaussians(camera) if self.shares else None
+        self._splats = self._model.gaussians(camera) if self.shares else None
 
     def __call__(self, camera: Camera) -> Gaussians:
         """Return the splats that the camera sees."""
         if self._splats is None:
             return self._model.gaussians(camera)
-        leaves = {name: tensor.detach().requires_grad_(self._by_rows or tensor.requires_grad) for name, tensor in _tensors(self._splats).items()}
+        leaves = {name: tensor.detach().requires_grad_(tensor.requires_grad) for name, tensor in _tensors(self._splats).items()}
         return replace(self._splats, **leaves)
 
     def accumulate(self, splats: Gaussians) -> None:

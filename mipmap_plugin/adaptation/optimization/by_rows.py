@@ -1,29 +1,61 @@
-"""Steps that the backend takes itself, row by row, so that no gradient of all splats exists (`backends.base.Backend.render_to_step`)."""
+"""Steps that the backend takes itself, row by row, so that no gradient of all splats exists (`backends.base.Stepper`)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.adam import Adam
-from mipmap_plugin.backends.base import AdamStep
+from mipmap_plugin.adaptation.renderers import SteppingRenderer
+from mipmap_plugin.backends.base import AdamStep, Stepper
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.bands import neighbors, one_tensor
 
 SH = ("sh0", "shN")
 
 
-def moves_by_rows(model: SplatModel) -> bool:
-    """Whether all parameters are those of 3DGS and move, with sh0 and shN in one tensor, as in any copy of a model."""
-    parameters = model.parameters()
-    return model.traits.plain and all(tensor.requires_grad for tensor in parameters.values()) and _joined(parameters) is not None
+@dataclass(frozen=True, eq=False)
+class ByRows:
+    """A model that a backend draws and moves, and what its parameters were after that."""
+
+    draw: SteppingRenderer
+    stepper: Stepper
+    parameters: tuple[Tensor, ...]
+    versions: tuple[int, ...]  # torch counts the changes in place that it makes; those of kernels it does not see
+
+    @classmethod
+    def of(cls, model: SplatModel, draw: SteppingRenderer | None, known: ByRows | None) -> ByRows | None:
+        """`known` if it still holds, else a new one; None without `draw`, or if the model's parameters are not all those of 3DGS, and move."""
+        if draw is None or not model.traits.plain:
+            return None
+        parameters = tuple(model.parameters().values())
+        if known is not None and known._holds_for(parameters):
+            return known
+        joined = _joined(model.parameters())
+        if joined is None or not all(tensor.requires_grad for tensor in parameters):
+            return None
+        return cls(draw, draw.stepper(joined), parameters, tuple(tensor._version for tensor in parameters))
+
+    def _holds_for(self, parameters: tuple[Tensor, ...]) -> bool:
+        same = len(parameters) == len(self.parameters) and all(one is other for one, other in zip(parameters, self.parameters, strict=True))
+        return same and self.versions == tuple(tensor._version for tensor in parameters)
+
+    def images(self, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
+        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it, all views of a step."""
+        return self.draw.images(self.stepper, cameras, draw)
+
+    def step(self, optimizer: Adam) -> None:
+        """Move the parameters, after `backward` for a loss of the images."""
+        self.stepper.step(adam_step(optimizer))
 
 
 @torch.no_grad()
 def adam_step(optimizer: Adam) -> AdamStep:
-    """The optimizer's next step over a model that `moves_by_rows`."""
+    """The optimizer's next step over the parameters of 3DGS, of which sh0 and shN lie in one tensor."""
     tensors = {group["name"]: group["params"][0] for group in optimizer.param_groups}
     states = {name: optimizer.state_of(tensor) for name, tensor in tensors.items()}
     first, second = (_joined_moments(states, name) for name in ("exp_avg", "exp_avg_sq"))
@@ -32,7 +64,7 @@ def adam_step(optimizer: Adam) -> AdamStep:
     count, (beta1, beta2) = int(counts[0]), optimizer.betas
     rates = {group["name"]: group["lr"] / (1 - beta1**count) for group in optimizer.param_groups}
     raw = _joined(tensors)
-    assert raw is not None  # since the model `moves_by_rows`
+    assert raw is not None  # since `ByRows` has checked it
     return AdamStep(raw, first, second, rates, optimizer.betas, (1 - beta2**count) ** -0.5, optimizer.eps)
 
 

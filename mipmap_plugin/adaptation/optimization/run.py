@@ -11,13 +11,14 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
 from mipmap_plugin.adaptation.optimization.adam import Adam
+from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
+from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
 from mipmap_plugin.adaptation.target.resize import difference_from
-from mipmap_plugin.backends.base import Later
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
@@ -25,13 +26,6 @@ from mipmap_plugin.models.base import SplatModel
 
 # Number of views on which a student is compared with the base to assess a growth.
 AGREEMENT_VIEWS = 8
-
-
-# Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
-ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
-
-# The same, and what moves the splats once the gradients of the images are known.
-SteppingRenderer = Callable[[Gaussians, Sequence[Camera], int], tuple[list[Tensor], Later]]
 
 
 @dataclass(frozen=True)
@@ -54,13 +48,11 @@ class Task:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
         return (self.render, *self.further_renders)[draw % (1 + len(self.further_renders))]
 
-    def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int, *, to_step: bool) -> tuple[list[Tensor], Later | None]:
-        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it; with `to_step` also what moves the splats."""
-        if to_step and self.render_to_step is not None:
-            return self.render_to_step(gaussians, cameras, draw)
+    def images(self, gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
+        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
         if self.render_views is not None:
-            return self.render_views(gaussians, cameras, draw), None
-        return [self.renderer(draw + number)(gaussians, camera) for number, camera in enumerate(cameras)], None
+            return self.render_views(gaussians, cameras, draw)
+        return [self.renderer(draw + number)(gaussians, camera) for number, camera in enumerate(cameras)]
 
     def pixel(self, means: Tensor) -> float:
         """The size of a target pixel at the median of `means` [N, 3], in world units."""
@@ -109,6 +101,7 @@ class Run:
     square_error: Tensor | float = 0.0  # summed since the last point of the curve, on the device of the images, so that no step waits for it
     rows_changed: bool = False  # splats were added or removed
     costs: Costs = field(default_factory=Costs)  # in this process
+    by_rows: ByRows | None = None  # the student, while the backend moves it
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:

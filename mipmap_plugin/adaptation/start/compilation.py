@@ -29,16 +29,16 @@ def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], 
             merge(few, torch.ones_like(weights), weights, fraction=0.5)
         if gradients and image.requires_grad:
             image.sum().backward()
-    if by_rows and gradients and hasattr(backend, "render_to_step"):
+    if by_rows and gradients and hasattr(backend, "stepper"):
         _step(backend, few, effects[0])
 
 
 def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:
     """A step that moves nothing."""
-    tensors = {name: getattr(splats, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
+    raw = {name: getattr(splats, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
+    stepper = backend.stepper(raw)
     unpacked = replace(effects, settings=replace(effects.settings, packing=None))
-    drawn, later = backend.render_to_step(replace(splats, means=tensors["means"].requires_grad_()), [(CAMERA, unpacked)])
-    drawn[0].image.sum().backward()
-    moments = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
+    stepper.render([(CAMERA, unpacked)])[0].image.sum().backward()
+    moments = {name: torch.zeros_like(tensor) for name, tensor in raw.items()}
     rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 0.0)
-    later.step(AdamStep(tensors, moments, moments, rates, betas=(0.9, 0.999), correction=1.0, eps=1.0))
+    stepper.step(AdamStep(raw, moments, moments, rates, betas=(0.9, 0.999), correction=1.0, eps=1.0))

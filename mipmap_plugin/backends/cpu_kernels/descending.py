@@ -5,6 +5,7 @@ No gradient of all splats exists, which would take as much memory as they do, an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -18,7 +19,7 @@ from mipmap_plugin.backends.cpu_kernels.records import SplatArrays
 from mipmap_plugin.backends.cpu_kernels.threads import team
 
 # Rows that are moved at a time: with their gradients, parameters and moments (four times 236 bytes each) they stay in the cache.
-ROWS = 1 << 10
+ROWS = 1 << 11
 
 
 def descend(splats: SplatArrays, drawings: Sequence[Drawing], d_outputs: Sequence[tuple[np.ndarray, np.ndarray]], step: AdamStep) -> None:
@@ -31,14 +32,40 @@ def descend(splats: SplatArrays, drawings: Sequence[Drawing], d_outputs: Sequenc
     settings = tuple(np.float32(number) for number in (1 - step.betas[0], 1 - step.betas[1], step.correction, step.eps))
 
     def move(start: int, stop: int) -> None:
-        room = SplatArrays(*(np.empty((min(ROWS, stop - start), *array.shape[1:]), np.float32) if len(array) else array for array in splats))
+        room = _Room(splats, min(ROWS, stop - start))
         for first in range(start, stop, ROWS):
             last = min(first + ROWS, stop)
-            grads = SplatArrays(*(array[: last - first] for array in room))
+            grads = room.zeros(last - first)
             add_views(first, last, splats, drawings, tiles, grads)
             adam.step(first, last, splats, grads, raw, firsts, seconds, rates, settings)
 
     threads.share(move, count)
+
+
+def activated(raw: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
+    """The activated splats of raw parameters, by the names of `Gaussians`. They share means and coefficients with these."""
+    given = _arrays(raw)
+    splats = given._replace(quats=np.empty_like(given.quats), scales=np.empty_like(given.scales), opacities=np.empty_like(given.opacities))
+    team(len(given.means)).share(adam.activate_rows, len(given.means), given, splats)
+    return {name: array for name, array in splats._asdict().items() if name != "covariances"}
+
+
+class _Room:
+    """Memory for the gradients of some rows, as one block, so that it is cleared at once."""
+
+    def __init__(self, splats: SplatArrays, rows: int) -> None:
+        self._shapes = [array.shape[1:] if len(array) else None for array in splats]
+        self._block = np.empty(rows * sum(math.prod(shape) for shape in self._shapes if shape is not None), np.float32)
+
+    def zeros(self, rows: int) -> SplatArrays:
+        """Gradients of so many rows, all 0."""
+        self._block.fill(0)
+        arrays, at = [], 0
+        for shape in self._shapes:
+            size = 0 if shape is None else rows * math.prod(shape)
+            arrays.append(self._block[at : at + size].reshape(-1, *(shape or (3, 3))) if shape != () else self._block[at : at + size])
+            at += size
+        return SplatArrays(*arrays)
 
 
 def compile_step() -> None:

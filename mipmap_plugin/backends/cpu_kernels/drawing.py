@@ -108,7 +108,10 @@ def draw_back(
     def add(start: int, stop: int) -> None:
         for first in range(start, stop, ROWS):
             last = min(first + ROWS, stop)
-            add_views(first, last, splats, drawings, tiles, SplatArrays(*(array[first:last] for array in grads)))
+            own = SplatArrays(*(array[first:last] for array in grads))
+            for array in own:
+                array[:] = 0
+            add_views(first, last, splats, drawings, tiles, own)
 
     threads.share(add, len(splats.means))
     return grads
@@ -130,9 +133,7 @@ def tile_gradients(drawings: Sequence[Drawing], d_outputs: Sequence[tuple[np.nda
 
 
 def add_views(start: int, stop: int, splats: SplatArrays, drawings: Sequence[Drawing], tiles: Sequence[np.ndarray], grads: SplatArrays) -> None:
-    """Fill `grads` with the gradients of the splats start..stop: what no view shows has none, and costs nothing but its zeros."""
-    for array in grads:
-        array[:] = 0
+    """Add the gradients of the splats start..stop to the rows of `grads`: what no view shows has none, and costs nothing."""
     for drawn, table in zip(drawings, tiles, strict=True):
         projection_back.project_back(start, stop, drawn.flags, drawn.view, splats, drawn.table, drawn.slots, table, grads)
 
