@@ -19,9 +19,12 @@ def test_splats_in_view_are_those_whose_centers_are_on_the_image():
     assert splats_in_view(VanillaModel(parameters), [view], near=0.2) == pytest.approx(2, abs=1e-4)
 
 
-@pytest.mark.parametrize(("in_view", "steps"), [(10.0, 600), (MOST_DRAWS / 1800, 600), (MOST_DRAWS / 900, 300), (1e9, 600 * LEAST_FRACTION)])
-def test_steps_fall_with_what_views_show_but_not_to_none(in_view, steps):
-    assert affordable(recipe("default", 1 / 4), in_view).steps == pytest.approx(steps, abs=1)
+@pytest.mark.parametrize(
+    ("in_view", "steps", "views"), [(10.0, 600, 150), (MOST_DRAWS / 1800, 600, 150), (MOST_DRAWS / 900, 300, 106), (1e9, 600 * LEAST_FRACTION, 75)]
+)
+def test_steps_and_views_fall_with_what_views_show_but_not_to_none(in_view, steps, views):
+    settings = affordable(recipe("default", 1 / 4), in_view)
+    assert (settings.steps, settings.extra_views) == (pytest.approx(steps, abs=1), pytest.approx(views, abs=1))
 
 
 def test_steps_that_somebody_asks_for_are_taken():

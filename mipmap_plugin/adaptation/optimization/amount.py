@@ -35,8 +35,12 @@ def _in_frame(means: torch.Tensor, view: Camera, near: float) -> float:
 
 
 def affordable(config: AdaptConfig, in_view: float) -> AdaptConfig:
-    """The settings with as many steps as `most_draws` allows, where a view shows `in_view` splats."""
+    """The settings with as many steps as `most_draws` allows, where a view shows `in_view` splats, and with fewer extra views for fewer steps.
+
+    Every view costs a picture of the base. With a fourth of the steps, half of the extra views are as good on flowers and better on bird.
+    """
     if config.most_draws is None:
         return config
     most = int(config.most_draws / max(1.0, in_view * config.views_per_step))
-    return config.model_copy(update={"steps": min(config.steps, max(most, math.ceil(LEAST_FRACTION * config.steps)))})
+    fraction = min(1.0, max(most / max(1, config.steps), LEAST_FRACTION))
+    return config.model_copy(update={"steps": math.ceil(fraction * config.steps), "extra_views": math.ceil(fraction**0.5 * config.extra_views)})

@@ -53,11 +53,12 @@ def draw(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = True) 
     threads = team(sum(count + shot.camera.width * shot.camera.height for shot in shots))
     views = [view_of(shot.camera, shot.effects, splats, gradients) for shot in shots]
     flags = [flags_of(view, splats) for view in views]
-    tables = [(empty(count, layout.SPLAT_FIELDS), empty(count), np.empty(count, np.int64)) for _ in shots]
+    tables = [(empty(count, layout.SPLAT_FIELDS), empty(count), empty(count, dtype=np.int64)) for _ in shots]
     threads.share_all(projection.project, [(count, (*drawn, splats, *table)) for *drawn, table in zip(flags, views, tables, strict=True)])
     projected = []
     for shot, (table, depths, counts) in zip(shots, tables, strict=True):
-        slots = np.zeros(count + 1, np.int64)
+        slots = empty(count + 1, dtype=np.int64)
+        slots[0] = 0
         np.cumsum(counts, out=slots[1:])
         projected.append(sorting.Projected(table, depths if shot.ranks is None else shot.ranks, slots, shot.camera.size))
     drawings = [
