@@ -17,6 +17,7 @@ from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import affordable, splats_in_view
+from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
@@ -186,12 +187,13 @@ class Session:
                 self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
+        task, config = within_budget(run, task, self.config)
 
         def after_step(run: Run) -> object:
             keeper.save_if_due(run)
             return observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
 
-        ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
+        ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
         run.optimizer.state.clear()
         _free_memory()
         self.state = keeper.remaining_file()
