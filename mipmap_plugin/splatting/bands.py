@@ -37,6 +37,11 @@ def neighbors(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {**parameters, "sh0": whole[:, :1], "shN": whole[:, 1:]}
 
 
+def lie_in_one_tensor(parameters: Mapping[str, Tensor]) -> bool:
+    """Whether sh0 and shN are there, and neighbors in memory."""
+    return {"sh0", "shN"} <= parameters.keys() and _are_neighbors(parameters["sh0"], parameters["shN"])
+
+
 def one_tensor(sh0: Tensor, shN: Tensor) -> Tensor | None:
     """The contiguous tensor [N, K, 3] that both neighbors are parts of, without a gradient; None for others."""
     return _whole(sh0, shN) if _are_neighbors(sh0, shN) else None
