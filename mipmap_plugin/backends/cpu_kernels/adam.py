@@ -28,11 +28,12 @@ def step(start, stop, splats, grads, raw, firsts, seconds, rates, settings):
     Afterwards `splats` are those of the moved parameters, and `grads` has the gradients of these. rates: [16 · columns] each, those of 16 rows.
     """
     through_activations(start, stop, splats, grads, raw)
-    move(start, stop, grads.means, raw.means, firsts.means, seconds.means, rates.means, settings)
-    move(start, stop, grads.quats, raw.quats, firsts.quats, seconds.quats, rates.quats, settings)
-    move(start, stop, grads.scales, raw.scales, firsts.scales, seconds.scales, rates.scales, settings)
-    move(start, stop, grads.opacities, raw.opacities, firsts.opacities, seconds.opacities, rates.opacities, settings)
-    move(start, stop, grads.sh, raw.sh, firsts.sh, seconds.sh, rates.sh, settings)
+    bands = 3 * raw.sh.shape[1]
+    move(start, stop, 3, moved(grads.means, raw.means, firsts.means, seconds.means, rates.means), settings)
+    move(start, stop, 4, moved(grads.quats, raw.quats, firsts.quats, seconds.quats, rates.quats), settings)
+    move(start, stop, 3, moved(grads.scales, raw.scales, firsts.scales, seconds.scales, rates.scales), settings)
+    move(start, stop, 1, moved(grads.opacities, raw.opacities, firsts.opacities, seconds.opacities, rates.opacities), settings)
+    move(start, stop, bands, moved(grads.sh, raw.sh, firsts.sh, seconds.sh, rates.sh), settings)
     activate(start, stop, raw, splats)
 
 
@@ -56,10 +57,15 @@ def through_activations(start, stop, splats, grads, raw):
 
 
 @inner
-def move(start, stop, grads, raw, first, second, rates, settings):
+def moved(grads, raw, first, second, rates):
+    """The arrays of one parameter as pointers, so that `move` is compiled once for all."""
+    return pointer(grads), pointer(raw), pointer(first), pointer(second), pointer(rates)
+
+
+@inner
+def move(start, stop, columns, arrays, settings):
     """Adam on the rows start..stop of one parameter. settings: 1 - beta1, 1 - beta2, 1 / sqrt(1 - beta2^t) and epsilon."""
-    columns = raw.size // len(raw)
-    d, p, m, v, rate = pointer(grads), pointer(raw), pointer(first), pointer(second), pointer(rates)
+    d, p, m, v, rate = arrays
     new_first, new_second, correction, eps = settings
     at, count, of_rate = start * columns, (stop - start) * columns, 0
     whole = count - count % WIDTH
@@ -71,7 +77,7 @@ def move(start, stop, grads, raw, first, second, rates, settings):
         store(m, at + i, mean)
         store(v, at + i, square)
         store(p, at + i, load(p, at + i) - load(rate, of_rate) * mean / (sqrt(square) * correction + eps))
-        of_rate = of_rate + WIDTH if of_rate + WIDTH < len(rates) else 0
+        of_rate = of_rate + WIDTH if of_rate + WIDTH < WIDTH * columns else 0
     for i in range(whole, count):
         m[at + i] += (d[i] - m[at + i]) * new_first
         v[at + i] += (d[i] * d[i] - v[at + i]) * new_second
