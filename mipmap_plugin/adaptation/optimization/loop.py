@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.optimization.estimate import BAR, Bar, Forecast
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
+from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, views_at_once
 from mipmap_plugin.adaptation.target.resize import difference_from
@@ -43,11 +44,14 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     checks = [step for step in range(1, config.steps + 1) if is_checked(step, config)]
     forecast, began = Forecast(order, config, checks, run.step), run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
+    quickest = QuickestThreads()
     with bar, interruptible() as interrupted:
         reason = STOPPED if observe(run) is True else reason_to_stop(run.curve, run.watch.seconds, config)
         while reason is None and run.step < config.steps:
             with run.watch:
-                _step(run, task, config, order(run.step, run.progress(config)), cameras)
+                views = order(run.step, run.progress(config))
+                with quickest.step(len(views), run.costs):
+                    _step(run, task, config, views, cameras)
                 if is_checked(run.step, config):
                     _check(run, task, config)
             bar.seconds_left = min(forecast.left(run.step, run.watch.seconds - began, run.costs), _budget_left(run, config))
