@@ -7,7 +7,7 @@ import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.optimization.amount import LEAST_FRACTION, affordable, splats_in_view
+from mipmap_plugin.adaptation.optimization.amount import LEAST_FRACTION, OVERSAMPLING, affordable, splats_in_view
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import MOST_DRAWS, recipe
 
@@ -25,6 +25,7 @@ def test_splats_in_view_are_those_whose_centers_are_on_the_image():
 def test_steps_and_views_fall_with_what_views_show_but_not_to_none(in_view, steps, views):
     settings = affordable(recipe("default", 1 / 4), in_view)
     assert (settings.steps, settings.extra_views) == (pytest.approx(steps, abs=1), pytest.approx(views, abs=1))
+    assert settings.truth_oversampling == (4 if steps == 600 else OVERSAMPLING)
 
 
 def test_steps_that_somebody_asks_for_are_taken():

@@ -17,6 +17,9 @@ VIEWS, SPLATS = 12, 1 << 16
 # At least this fraction of the steps is taken: the last fourth of a run, in which the rates fall, gains most.
 LEAST_FRACTION = 1 / 4
 
+# The base is drawn so many times finer than the target at most.
+OVERSAMPLING = 3
+
 
 @torch.no_grad()
 def splats_in_view(model: SplatModel, views: Sequence[Camera], near: float) -> float:
@@ -35,12 +38,18 @@ def _in_frame(means: torch.Tensor, view: Camera, near: float) -> float:
 
 
 def affordable(config: AdaptConfig, in_view: float) -> AdaptConfig:
-    """The settings with as many steps as `most_draws` allows, where a view shows `in_view` splats, and with fewer extra views for fewer steps.
+    """The settings with as many steps as `most_draws` allows, where a view shows `in_view` splats.
 
-    Every view costs a picture of the base. With a fourth of the steps, half of the extra views are as good on flowers and better on bird.
+    Fewer steps have fewer extra views, of which each costs a picture of the base, and smaller pictures: with a fourth of the steps, half of the
+    extra views are as good on flowers and better on bird, and the base drawn three times as fine as the target is worth what four times are.
     """
     if config.most_draws is None:
         return config
     most = int(config.most_draws / max(1.0, in_view * config.views_per_step))
     fraction = min(1.0, max(most / max(1, config.steps), LEAST_FRACTION))
-    return config.model_copy(update={"steps": math.ceil(fraction * config.steps), "extra_views": math.ceil(fraction**0.5 * config.extra_views)})
+    if fraction == 1:
+        return config
+    fewer = {"steps": math.ceil(fraction * config.steps), "extra_views": math.ceil(fraction**0.5 * config.extra_views)}
+    if config.truth_oversampling is not None:
+        fewer["truth_oversampling"] = min(OVERSAMPLING, config.truth_oversampling)
+    return config.model_copy(update=fewer)
