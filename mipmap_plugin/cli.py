@@ -22,6 +22,7 @@ from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
 from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.freed_memory import keep_freed_memory
+from mipmap_plugin.garbage import leave_at_exit
 from mipmap_plugin.limits import is_out_of_memory
 
 DESCRIPTION = (
@@ -41,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mipmap-plugin {version('mipmap-plugin')}")
         return 0
     keep_freed_memory()
+    leave_at_exit()
     try:
         words, quiet, log = voice.options(words)
         common.WORDS.set(tuple(words))

@@ -7,7 +7,7 @@ import platform
 
 # Numbers of glibc's mallopt (malloc.h), and what a process keeps: blocks up to 32 MiB, the largest that it allows, and 1 GiB in all.
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
-KEPT_BLOCK, KEPT_IN_ALL = 32 << 20, 1 << 30
+KEPT_BLOCK, KEPT_IN_ALL = 32 << 20, 3 << 26
 
 
 def return_freed_memory() -> None:

@@ -21,6 +21,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import read_scale
 from mipmap_plugin.evaluation import backends as backends_module
+from mipmap_plugin.evaluation import viewer_differences
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
@@ -103,6 +104,15 @@ def test_inspect_says_how_far_viewers_are_from_training(run, model_folder):
     [line] = [line for line in run("inspect", model_folder)[1].splitlines() if line.startswith("viewers:")]
     assert re.fullmatch(r"viewers: +spark .* dB, classic the same, antialiased .* dB, compared with its training, at x1 in 3 views", line)
     assert "viewers:      not requested" in run("inspect", model_folder, "--no-viewers")[1]
+
+
+def test_inspect_says_what_it_knows_before_it_draws(run, model_folder, monkeypatch, capsys):
+    said = []
+    monkeypatch.setattr(viewer_differences, "viewer_differences", lambda wrapped: said.append(capsys.readouterr().out) or "none")
+    rest = run("inspect", model_folder)[1]
+    assert said[0].startswith("verdict:") and "health:" in said[0] and rest.startswith("viewers:      none\nnotes:")
+    run("inspect", model_folder, "--json")
+    assert said[1] == ""
 
 
 def test_inspect_of_an_iteration(run, model_folder):

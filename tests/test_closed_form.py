@@ -4,8 +4,10 @@ import math
 from dataclasses import replace
 
 import pytest
+import samples
 import torch
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.start.closed_form import CULL_MARGIN, MIN_AXIS, FormSettings, closed_form, filter_suffices, pixel_size
 from mipmap_plugin.adaptation.start.surfel_form import visible_area
 from mipmap_plugin.adaptation.target.resize import resize
@@ -224,3 +226,12 @@ def test_a_splat_that_a_viewer_would_cull_is_seen():
     splat, target = disc(0.8, 0.8), drawn_by("playcanvas")
     shown = [BACKEND.render(each, VIEW.zoomed(1 / 8), target).image.max() for each in (splat, adapted(splat, 1 / 8, target=target))]
     assert shown[0] == 0 and shown[1] > 0.01
+
+
+def test_parts_that_threads_share_make_the_same_whole(monkeypatch):
+    g, views = samples.gaussians(70), [samples.camera()]
+    whole = closed_form(g, views, 1 / 4, Effects(1), Effects(1))
+    monkeypatch.setattr("mipmap_plugin.adaptation.start.closed_form.CHUNK", 16)
+    with threads.limited(3, shared=True):
+        parts = closed_form(g, views, 1 / 4, Effects(1), Effects(1))
+    assert all(torch.equal(part, each) for part, each in zip(parts, whole, strict=True))

@@ -16,11 +16,13 @@ from mipmap_plugin.backends import get_backend, reference
 from mipmap_plugin.backends.base import Capabilities, Rendered
 from mipmap_plugin.backends.conformance import CASES, MORE, TOLERANCE, check_backend
 from mipmap_plugin.backends.conformance.cases import random_scene
-from mipmap_plugin.backends.conformance.checks import check_views
+from mipmap_plugin.backends.conformance.checks import check_steps, check_views
 from mipmap_plugin.backends.conformance.suite import BackendSuite
 from mipmap_plugin.backends.conformance.tolerance import PIXEL_BAND, differing_gradients, differing_images
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.rotations import unit_quaternions
 
 CPU = "mipmap_plugin.backends.cpu"
 MISSING = next((name for name in ("numba", CPU) if importlib.util.find_spec(name) is None), None)
@@ -101,6 +103,30 @@ class ForgetsAView(ReferenceBackend):
 def test_a_view_without_gradient_in_one_call_is_caught():
     outcome = check_views(ForgetsAView(), CASES["sh-degree-3"])
     assert not outcome.passed and "gradient of means" in outcome.message
+
+
+class ForgetsTheOpacity:
+    """Takes the gradients of opacities for those of their logits."""
+
+    def __init__(self, raw):
+        self._raw = {name: tensor.requires_grad_() for name, tensor in raw.items()}
+
+    def render(self, shots):
+        raw = self._raw
+        self._opacities = raw["opacities"].detach().sigmoid().requires_grad_()
+        splats = Gaussians(raw["means"], unit_quaternions(raw["quats"]), raw["scales"].exp(), self._opacities, raw["sh"])
+        return [ReferenceBackend().render(splats, *shot) for shot in shots]
+
+    def step(self, step):
+        for name, moment in step.first.items():
+            moment.copy_((1 - step.betas[0]) * (self._opacities if name == "opacities" else self._raw[name]).grad)
+
+
+def test_a_step_along_wrong_gradients_is_caught():
+    backend = ReferenceBackend()
+    backend.stepper = ForgetsTheOpacity
+    outcome = check_steps(backend, CASES["sh-degree-3"])
+    assert outcome.message.startswith("gradient of opacities") and "means" not in outcome.message
 
 
 def test_gradients_one_percent_too_long_are_caught():

@@ -29,6 +29,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig, LearningRates
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.bands import lie_in_one_tensor
 from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.rotations import rotations
 
@@ -82,6 +83,17 @@ def test_pruning_keeps_rows_and_their_moments(student, optimizer):
     prune(student, optimizer, mask(1, 4))
     assert torch.equal(student.parameters()["means"], means[[1, 4]])
     assert moments(student, optimizer) == [2, 5]
+
+
+def test_what_is_kept_moves_up_in_its_own_memory(student, optimizer, monkeypatch):
+    """In pieces of two rows, of which none is written to before it is read; sh0 and shN stay in one tensor."""
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.density.ROWS_MOVED", 2)
+    before = {name: (tensor.detach().clone(), tensor.data_ptr()) for name, tensor in student.parameters().items()}
+    kept = [row for row in range(COUNT) if row != 1]
+    prune(student, optimizer, mask(*kept))
+    for name, tensor in student.parameters().items():
+        assert torch.equal(tensor, before[name][0][kept]) and tensor.data_ptr() == before[name][1]
+    assert lie_in_one_tensor(student.parameters())
 
 
 def test_the_optimizer_moves_the_models_own_leaves_after_pruning(student, optimizer):

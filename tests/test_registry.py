@@ -1,8 +1,9 @@
 """Registries: third-party backends are listed with their reasons, and a broken one breaks nothing."""
 
+import os
 import sys
 from dataclasses import replace
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, entry_points
 
 import pytest
 import torch
@@ -199,3 +200,16 @@ def test_targets_are_imported_only_when_used(tmp_path, monkeypatch):
     assert things.names() == ["lazy"] and "lazy_plugin" not in sys.modules
     assert things.get("lazy") == "made"
     sys.modules.pop("lazy_plugin")
+
+
+def test_installed_packages_are_read_again_only_when_a_folder_of_them_changes(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(registry, "entry_points", lambda group: (asked.append(group), entry_points(group=group))[1])
+    monkeypatch.syspath_prepend(tmp_path)
+    plug_ins = Registry("mipmap_plugin.nothing", {})
+    assert (plug_ins.names(), plug_ins.names(), len(asked)) == ([], [], 1)
+    (tmp_path / "stranger-1.0.dist-info").mkdir()
+    (tmp_path / "stranger-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    (tmp_path / "stranger-1.0.dist-info" / "entry_points.txt").write_text("[mipmap_plugin.nothing]\nstrange = stranger:Strange\n")
+    os.utime(tmp_path, (1, 1))
+    assert (plug_ins.names(), plug_ins.names(), len(asked)) == (["strange"], ["strange"], 2)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.optimization.run import ViewsRenderer
-from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.backends.base import Backend, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+
+# Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
+ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
 
 
 def renderer(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
@@ -26,10 +28,32 @@ def views_renderer(backend: Backend, targets: Sequence[Effects]) -> ViewsRendere
         return None
 
     def images(gaussians: Gaussians, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
-        shots = [(camera, targets[(draw + number) % len(targets)]) for number, camera in enumerate(cameras)]
-        return [rendered.image for rendered in render_views(gaussians, shots)]
+        return [rendered.image for rendered in render_views(gaussians, _shots(cameras, targets, draw))]
 
     return images
+
+
+@dataclass(frozen=True)
+class SteppingRenderer:
+    """Draws the images of a step by what moves the splats afterwards; the targets take turns."""
+
+    stepper: Callable[[Mapping[str, Tensor]], Stepper]  # `Backend.stepper`
+    targets: Sequence[Effects]
+
+    @classmethod
+    def of(cls, backend: Backend, targets: Sequence[Effects]) -> SteppingRenderer | None:
+        """None if the backend moves no splats, or the effects do not allow it."""
+        stepper = getattr(backend, "stepper", None)
+        return None if stepper is None or any(target.settings.packing is not None for target in targets) else cls(stepper, targets)
+
+    def images(self, stepper: Stepper, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
+        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
+        return [rendered.image for rendered in stepper.render(_shots(cameras, self.targets, draw))]
+
+
+def _shots(cameras: Sequence[Camera], targets: Sequence[Effects], draw: int) -> list[tuple[Camera, Effects]]:
+    """The `draw`-th view since the beginning and those after it, each with the effects of the target whose turn it is."""
+    return [(camera, targets[(draw + number) % len(targets)]) for number, camera in enumerate(cameras)]
 
 
 def unrounded(effects: Effects) -> Effects:

@@ -16,13 +16,15 @@ from torch import Tensor
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.adaptation.optimization.amount import affordable, splats_in_view
+from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
-from mipmap_plugin.adaptation.renderers import renderer, unrounded, views_renderer
+from mipmap_plugin.adaptation.renderers import SteppingRenderer, renderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
 from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch
 from mipmap_plugin.adaptation.start.compilation import warm_up
@@ -70,6 +72,7 @@ class Session:
         self.targets, self.has_gradients, self.backend_note = request.targets, request.has_gradients, request.backend_note
         self.effects = next(iter(self.targets.values()))
         self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
+        self.asked_steps, config = config.steps, self._affordable(config, cameras)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs = request.finer, dict(request.inputs)
         self.seconds, self.peak = {"optimization": 0.0}, PeakMemory(self.base.parameters()["means"].device)
@@ -87,6 +90,12 @@ class Session:
         truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
         first, *further = [renderer(self.backend, target) for target in self.extremes.values()]
         self.validation = Validation(steering, choosing, scale, truth, first, config.resize, further)
+
+    def _affordable(self, config: AdaptConfig, cameras: list[Camera]) -> AdaptConfig:
+        """The settings with no more steps than a scene of this size can have."""
+        if config.most_draws is None or not (self.base.traits.same_for_all_views and cameras):
+            return config
+        return affordable(config, splats_in_view(self.base, cameras, self.effects.near_plane))
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
@@ -110,7 +119,8 @@ class Session:
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())
             merging = self.config.merge_to < 1 and self._has_blend_weights
-            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self.config.steps > 0, merging=merging)
+            steps, plain = self.config.steps > 0, self.base.traits.plain
+            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=steps, merging=merging, by_rows=plain)
         as_it_is = self._for_target(self._base_in_viewer, shared=True)
         initial, start = StartSearch(self._start_problem()).best()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
@@ -167,8 +177,8 @@ class Session:
         max_splats = min(max_splats, self.config.most_splats or sys.maxsize)
         targets = [unrounded(target) for target in self.extremes.values()]
         first, *further = [renderer(self.backend, target) for target in targets]
-        together = views_renderer(self.backend, targets)
-        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together)
+        together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
+        task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together, stepping)
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -177,12 +187,13 @@ class Session:
                 self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
+        task, config = within_budget(run, task, self.config)
 
         def after_step(run: Run) -> object:
             keeper.save_if_due(run)
             return observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
 
-        ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
+        ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
         run.optimizer.state.clear()
         _free_memory()
         self.state = keeper.remaining_file()
@@ -190,7 +201,8 @@ class Session:
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
-        return run, ended_by + growth_note(run)
+        large = f" (of {self.asked_steps}, because the scene is large; --steps takes more)" if self.config.steps < self.asked_steps else ""
+        return run, ended_by + large + growth_note(run)
 
     def copy_of_base(self) -> SplatModel:
         """A copy of the base that is rendered with the target's screen filter."""

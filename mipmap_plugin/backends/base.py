@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -129,6 +129,32 @@ class Capabilities:
         return reasons
 
 
+@dataclass(frozen=True)
+class AdamStep:
+    """A step of Adam (Kingma and Ba 2015) over the raw parameters of 3DGS: log scales, logits, quaternions of any norm.
+
+    By name means [N, 3], quats [N, 4], scales [N, 3], opacities [N], and sh [N, K, 3], which is sh0 and shN in one; all are changed in place.
+    """
+
+    raw: Mapping[str, Tensor]
+    first: Mapping[str, Tensor]  # moments
+    second: Mapping[str, Tensor]
+    rates: Mapping[str, float]  # by name, with sh0 and shN apart; over 1 - beta1^t, where this is step t
+    betas: tuple[float, float]
+    correction: float  # 1 / sqrt(1 - beta2^t)
+    eps: float
+
+
+class Stepper(Protocol):
+    """Draws splats of 3DGS and moves them, by their raw parameters, which only it changes."""
+
+    def render(self, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
+        """Several views, each with effects of its own, differentiable for `step` alone."""
+
+    def step(self, step: AdamStep) -> None:
+        """Move the raw parameters down the gradient of what `backward` of the latest `render` was called for. Raises RuntimeError before that."""
+
+
 class Backend(Protocol):
     """Renders Gaussians to an image with one sample per pixel; supersampling, depth and normals are built on top (`supersample`, `geometry`)."""
 
@@ -141,7 +167,8 @@ class Backend(Protocol):
     # (`threads.for_kernels`), return the same bytes on any number, and may run in several threads at once; then torch has one while adapting.
     # `blend_weights(gaussians, camera, effects) -> Tensor | None`: the sum of each splat's blend weights over the image, [N], or None where it has
     # to be found from gradients. `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call, each shot a
-    # (camera, effects); adaptation steps are drawn so.
+    # (camera, effects); adaptation steps are drawn so. `stepper(raw) -> Stepper`: for splats of 3DGS, with `raw` as `AdamStep.raw`; it
+    # keeps gradients from autograd and hands them to Adam itself, row by row, which takes less time, and far less memory.
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""

@@ -5,15 +5,17 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts, summary
 from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
+from mipmap_plugin.garbage import uncollected
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
     from mipmap_plugin.effects import Effect
     from mipmap_plugin.models.health import Health
+    from mipmap_plugin.wrap import Wrapped
 
 
 def inspect(
@@ -34,24 +36,34 @@ def inspect(
         all: Also list the effects that are off, with reasons. The JSON always has them.
         json: Print JSON instead of sentences.
     """
+    with announced(f"reading {checkpoint.name}"), uncollected():
+        from mipmap_plugin.models import load_model
+        from mipmap_plugin.wrap import wrap_model
+
+        model = load_model(checkpoint, iteration=iteration)
+        wrapped = wrap_model(model, screen_filter=screen_filter)
+    facts = _facts(checkpoint, wrapped, whole=all or json)
+    if not json:
+        print_facts(facts, json)  # before pictures are drawn, which takes longer
+    with announced("drawing as viewers do"):
+        differences = _differences(wrapped) if viewers else "not requested"
+    last = {"viewers": differences, "notes": model.notes}
+    print_facts(facts | last if json else last, json)
+
+
+def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]:
+    """What is known without a picture, by name; `whole`: with the effects that are off."""
     from mipmap_plugin.effects import explain
-    from mipmap_plugin.evaluation.viewer_differences import viewer_differences
-    from mipmap_plugin.models import load_model
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
     from mipmap_plugin.models.vanilla import VanillaModel
-    from mipmap_plugin.wrap import wrap_model
 
-    with announced(f"reading {checkpoint.name}"):
-        model = load_model(checkpoint, iteration=iteration)
+    model = wrapped.model
     with announced("examining"):
-        wrapped = wrap_model(model, screen_filter=screen_filter)
         gaussians = model.gaussians(wrapped.views()[0])
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
-    with announced("drawing as viewers do"):
-        differences = viewer_differences(wrapped) if viewers else "not requested"
-    facts = {
+    return {
         "verdict": _verdict(checkpoint, health),
         "file": str(model.source),
         "family": model.family,
@@ -59,12 +71,15 @@ def inspect(
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
         "cameras": summary(wrapped.cameras),
-        "effects": [str(effect) for effect in effects if effect.on or all or json] + _off(effects, shown=all or json),
+        "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
         "health": health.sentences() or ["nothing found"],
-        "viewers": differences,
-        "notes": model.notes,
     }
-    print_facts(facts, json)
+
+
+def _differences(wrapped: Wrapped) -> str:
+    from mipmap_plugin.evaluation.viewer_differences import viewer_differences
+
+    return viewer_differences(wrapped)
 
 
 def _verdict(checkpoint: Path, health: Health) -> str:

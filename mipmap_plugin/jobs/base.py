@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mipmap_plugin.garbage import uncollected
+
 if TYPE_CHECKING:
     from mipmap_plugin.wrap import Wrapped
 
@@ -39,6 +41,10 @@ class Base:
 
     def load(self, threads: int | None = None) -> Wrapped:
         """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
+        with uncollected():  # torch is imported here
+            return self._loaded(threads)
+
+    def _loaded(self, threads: int | None) -> Wrapped:
         from mipmap_plugin.backends import BACKENDS
         from mipmap_plugin.models.inria_folder import read_options
         from mipmap_plugin.scenes import load_scene

@@ -37,6 +37,7 @@ class Traits:
     """Properties of a model. No other code depends on its family."""
 
     same_for_all_views: bool = False  # rows are splats, the same for every camera: the model has `rebuild`, and splats may be merged
+    plain: bool = False  # the parameters are those of 3DGS, activated as there, so that a backend may move them itself (`Backend.render_to_step`)
     moves: bool = False  # Gaussians depend on the camera's time
     filtered: bool = False  # each splat has a 3D filter, which only the original project's viewer applies: the model has `fused` and `bare`
     placed: bool = False  # trained in a coordinate frame or at an image size of its own: the model has `as_trained`

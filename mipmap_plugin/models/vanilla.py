@@ -71,7 +71,10 @@ class VanillaModel:
         if origin.host:
             self.family = origin.host.family
         self.source, self.folder, self.digest = origin.source, origin.folder, origin.digest
-        self.traits = Traits(same_for_all_views=True, placed=origin.host is not None, no_viewer=self._no_viewer, exposures=origin.exposures)
+        self.traits = Traits(
+            same_for_all_views=True, plain=self._activates_as_3dgs(), placed=origin.host is not None, no_viewer=self._no_viewer,
+            exposures=origin.exposures,
+        )  # fmt: skip
         self.trained = trained
         self.notes: list[str] = list(notes)
         self.shares = False  # tensors with another model, so that they are replaced and never changed in place
@@ -106,6 +109,10 @@ class VanillaModel:
     def gaussians(self, camera: Camera | None = None) -> Gaussians:
         """All splats, activated: exp, sigmoid, unit quaternions. `camera` is ignored."""
         return self._activated(joined(self._parameters["sh0"], self._parameters["shN"]))
+
+    def _activates_as_3dgs(self) -> bool:
+        """Whether no class derived from this one changes it."""
+        return all(getattr(type(self), name) is getattr(VanillaModel, name) for name in ("gaussians", "_activated", "parameters"))
 
     def _activated(self, sh: Tensor) -> Gaussians:
         """All splats with the coefficients `sh` [N, K, 3]."""

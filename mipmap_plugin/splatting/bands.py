@@ -19,7 +19,8 @@ def joined(sh0: Tensor, shN: Tensor) -> Tensor:
     is used again, and so do their gradients: above a million splats, joining and splitting them in fresh memory takes a third of an
     optimization step.
     """
-    if _are_neighbors(sh0, shN) and not (sh0.requires_grad or shN.requires_grad):
+    differentiated = torch.is_grad_enabled() and (sh0.requires_grad or shN.requires_grad)
+    if _are_neighbors(sh0, shN) and not differentiated:
         return _whole(sh0, shN)
     large = sh0.device.type == "cpu" and sh0.dtype == torch.float32 and 4 * shN.numel() >= LARGE
     return _Joined.apply(sh0, shN) if large else torch.cat([sh0, shN], dim=1)  # type: ignore[no-untyped-call]  # torch's
@@ -34,6 +35,16 @@ def neighbors(parameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return dict(parameters)
     whole = torch.cat([parameters["sh0"].detach(), parameters["shN"].detach()], dim=1)
     return {**parameters, "sh0": whole[:, :1], "shN": whole[:, 1:]}
+
+
+def lie_in_one_tensor(parameters: Mapping[str, Tensor]) -> bool:
+    """Whether sh0 and shN are there, and neighbors in memory."""
+    return {"sh0", "shN"} <= parameters.keys() and _are_neighbors(parameters["sh0"], parameters["shN"])
+
+
+def one_tensor(sh0: Tensor, shN: Tensor) -> Tensor | None:
+    """The contiguous tensor [N, K, 3] that both neighbors are parts of, without a gradient; None for others."""
+    return _whole(sh0, shN) if _are_neighbors(sh0, shN) else None
 
 
 def _whole(sh0: Tensor, shN: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ class Adam:
             moving = [tensor for tensor in group["params"] if tensor.grad is not None]
             if not moving:
                 continue
-            torch._foreach_add_([self._state_of(tensor)["step"] for tensor in moving], 1)
+            torch._foreach_add_([self.state_of(tensor)["step"] for tensor in moving], 1)
             whole = [tensor for tensor in moving if tensor.is_contiguous()]
             self._move(whole, [self._values_of(tensor) for tensor in whole], group["lr"])
             for tensor in (tensor for tensor in moving if not tensor.is_contiguous()):
@@ -37,7 +37,7 @@ class Adam:
 
     def _values_of(self, tensor: Tensor) -> tuple[Tensor, ...]:
         """The gradient of a tensor, the number of its steps and its moments."""
-        state = self._state_of(tensor)
+        state = self.state_of(tensor)
         assert tensor.grad is not None  # since it is to move
         return tensor.grad, state["step"], state["exp_avg"], state["exp_avg_sq"]
 
@@ -54,10 +54,11 @@ class Adam:
         """Move a tensor whose rows do not follow each other in memory, which torch's kernel requires: some rows at a time, as copies."""
         gradient, steps, *moments = self._values_of(tensor)
         size = ROWS if tensor.device.type == "cpu" else len(tensor)
-        for rows, grad, first, second in zip(*(each.split(size) for each in (tensor, gradient, *moments)), strict=True):
-            moved = rows.contiguous()
+        for grad, *rows in zip(*(each.split(size) for each in (gradient, tensor, *moments)), strict=True):
+            moved, first, second = (each.contiguous() for each in rows)
             self._move([moved], [(grad.contiguous(), steps, first, second)], rate)
-            rows.copy_(moved)
+            for each, after in zip(rows, (moved, first, second), strict=True):
+                each.copy_(after)
 
     def zero_grad(self) -> None:
         """Set all gradients to None."""
@@ -65,7 +66,8 @@ class Adam:
             for tensor in group["params"]:
                 tensor.grad = None
 
-    def _state_of(self, tensor: Tensor) -> dict[str, Any]:
+    def state_of(self, tensor: Tensor) -> dict[str, Any]:
+        """The number of a tensor's steps, `step`, and its moments, `exp_avg` and `exp_avg_sq`; made where there are none."""
         state = self.state.setdefault(tensor, {})
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32, device=tensor.device)

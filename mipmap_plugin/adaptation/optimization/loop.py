@@ -10,10 +10,12 @@ from torch import Tensor
 from mipmap_plugin.adaptation.curve import CurvePoint, decibel, reason_to_stop
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
+from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.estimate import BAR, Bar, Forecast
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
+from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, views_at_once
 from mipmap_plugin.adaptation.target.resize import difference_from
@@ -42,11 +44,14 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     checks = [step for step in range(1, config.steps + 1) if is_checked(step, config)]
     forecast, began = Forecast(order, config, checks, run.step), run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
+    quickest = QuickestThreads()
     with bar, interruptible() as interrupted:
         reason = STOPPED if observe(run) is True else reason_to_stop(run.curve, run.watch.seconds, config)
         while reason is None and run.step < config.steps:
             with run.watch:
-                _step(run, task, config, order(run.step, run.progress(config)), cameras)
+                views = order(run.step, run.progress(config))
+                with quickest.step(len(views), run.costs):
+                    _step(run, task, config, views, cameras)
                 if is_checked(run.step, config):
                     _check(run, task, config)
             bar.seconds_left = min(forecast.left(run.step, run.watch.seconds - began, run.costs), _budget_left(run, config))
@@ -83,32 +88,53 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         density.reset_opacities(run.optimizer)
     progress = run.progress(config)
     set_rates(run.optimizer, config, progress, run.steering.rate_factor(progress, config), frozen=frozen_parameters(run))
-    splats = Activation(run.student, share=len(views) > 1)
-    with large_for_torch(run.student.parameters()["means"]):
-        splats.activate(cameras[views[0]])
-    at_once = views_at_once(cameras[views[0]]) if splats.shares and task.render_views and run.gradients is None else 1
-    for number in range(0, len(views), at_once):
-        some = views[number : number + at_once]
-        targets = _truths(run, task, some, cameras)  # r(x̂): the frozen base, resized
-        gaussians = splats(cameras[some[0]])
-        images = task.images(gaussians, [cameras[view] for view in some], run.step * config.views_per_step + number)  # x: the student
-        losses, square_errors = zip(*(_compare(task, config, *each) for each in zip(some, images, targets, strict=True)), strict=True)
-        sum(losses[1:], losses[0]).backward()
-        run.square_error = run.square_error + sum(square_errors) / len(views)
-        if run.gradients is not None:
-            run.gradients.add(*splats.means_gradient(gaussians), cameras[some[0]])
-        splats.accumulate(gaussians)
-        del gaussians, images, losses  # what the gradients need has the memory of these
-    with large_for_torch(run.student.parameters()["means"]):
-        splats.backward()
-        run.optimizer.step()
-    run.optimizer.zero_grad()
+    at_once = views_at_once(cameras[views[0]]) if run.gradients is None else 1
+    run.by_rows = ByRows.of(run.student, task.render_to_step, run.by_rows) if len(views) <= at_once else None
+    if run.by_rows is not None:
+        images = run.by_rows.images([cameras[view] for view in views], run.step * config.views_per_step)  # x: the student
+        targets = _truths(run, task, views, cameras)  # r(x̂): the frozen base, resized
+        run.square_error = run.square_error + _backward(task, config, views, images, targets) / len(views)
+        run.by_rows.step(run.optimizer)
+    else:
+        _step_by_autograd(run, task, config, views, cameras, at_once)
     run.step += 1
     if run.step % config.prune_every == 0 and run.step < config.steps:
         control_density(run, task, config)
 
 
 # --8<-- [end:step]
+
+
+def _step_by_autograd(
+    run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera], at_once: int
+) -> None:
+    """A step from the gradients of all splats, which are summed over calls of `at_once` views each if the backend draws several in a call."""
+    splats = Activation(run.student, share=len(views) > 1)
+    with large_for_torch(run.student.parameters()["means"]):
+        splats.activate(cameras[views[0]])
+    at_once = at_once if splats.shares and task.render_views else 1
+    for number in range(0, len(views), at_once):
+        some = views[number : number + at_once]
+        targets = _truths(run, task, some, cameras)
+        gaussians = splats(cameras[some[0]])
+        images = task.images(gaussians, [cameras[view] for view in some], run.step * config.views_per_step + number)
+        run.square_error = run.square_error + _backward(task, config, some, images, targets) / len(views)
+        if run.gradients is not None:
+            run.gradients.add(*splats.means_gradient(gaussians), cameras[some[0]])
+        splats.accumulate(gaussians)
+        del gaussians, images  # what the gradients need has the memory of these
+    with large_for_torch(run.student.parameters()["means"]):
+        splats.backward()
+        run.optimizer.step()
+    run.optimizer.zero_grad()
+
+
+def _backward(task: Task, config: AdaptConfig, views: Sequence[Camera], images: Sequence[Tensor], targets: Sequence[Tensor]) -> Tensor:
+    """Differentiate the loss of some views; return the sum of their mean square errors."""
+    losses, square_errors = zip(*(_compare(task, config, *each) for each in zip(views, images, targets, strict=True)), strict=True)
+    sum(losses[1:], losses[0]).backward()
+    total: Tensor = sum(square_errors[1:], square_errors[0])
+    return total
 
 
 def _truths(run: Run, task: Task, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> list[Tensor]:

@@ -13,7 +13,7 @@ from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import CARRIED, SplatModel
-from mipmap_plugin.splatting.bands import neighbors
+from mipmap_plugin.splatting.bands import lie_in_one_tensor, neighbors
 
 # INRIA's value: gradients of single splats are so small that Adam's usual 1e-8 would damp them.
 ADAM_EPS = 1e-15
@@ -62,12 +62,14 @@ def change_rows(
 ) -> None:
     """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in the model and in the optimizer.
 
-    Both functions return new tensors.
+    Both functions return new tensors, or parts of the old ones.
     """
     pool.release()  # what a step needs, which is of no use for this
     groups = {group["name"]: group for group in optimizer.param_groups if group["name"] in model.parameters()}
     before = {name: group["params"][0] for name, group in groups.items()}
-    fresh = neighbors({name: parameter(name, old.detach()) for name, old in before.items()})
+    fresh = {name: parameter(name, old.detach()) for name, old in before.items()}
+    if not lie_in_one_tensor(fresh):
+        fresh = neighbors(fresh)
     for name, old in before.items():
         state = optimizer.state.pop(old, {})
         for key, value in state.items():

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
 from mipmap_plugin.adaptation.optimization.adam import Adam
+from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
+from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.camera import Camera, evenly
@@ -24,10 +26,6 @@ from mipmap_plugin.models.base import SplatModel
 
 # Number of views on which a student is compared with the base to assess a growth.
 AGREEMENT_VIEWS = 8
-
-
-# Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
-ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
 
 
 @dataclass(frozen=True)
@@ -44,6 +42,7 @@ class Task:
     max_splats: int = sys.maxsize  # growing stops at this number
     further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
+    render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
 
     def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
@@ -102,6 +101,7 @@ class Run:
     square_error: Tensor | float = 0.0  # summed since the last point of the curve, on the device of the images, so that no step waits for it
     rows_changed: bool = False  # splats were added or removed
     costs: Costs = field(default_factory=Costs)  # in this process
+    by_rows: ByRows | None = None  # the student, while the backend moves it
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:

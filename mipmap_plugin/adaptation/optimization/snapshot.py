@@ -27,13 +27,15 @@ class Snapshot:
 
     @torch.no_grad()
     def renewed(self, model: SplatModel, rows_changed: bool = False) -> Snapshot:
-        """A snapshot of the model as it is now, in this one's memory where it has as many rows; this one is not to be used any more."""
-        if len(model.parameters()["means"]) != len(self.rows["means"]):
+        """A snapshot of the model as it is now, in this one's memory unless it has more rows; this one is not to be used any more."""
+        count = len(model.parameters()["means"])
+        if count > len(self.rows["means"]):
             return Snapshot.of(model, rows_changed)
-        for held, group in ((self.rows, model.parameters()), (self.shared, model.shared_parameters())):
+        renewed = Snapshot({name: tensor[:count] for name, tensor in self.rows.items()}, self.shared, rows_changed)
+        for held, group in ((renewed.rows, model.parameters()), (renewed.shared, model.shared_parameters())):
             for name, tensor in group.items():
                 held[name].copy_(tensor)
-        return Snapshot(self.rows, self.shared, rows_changed)
+        return renewed
 
     def over(self, initial: SplatModel) -> SplatModel:
         """A model with the snapshot's parameters; `initial`: the model at the start of the run.

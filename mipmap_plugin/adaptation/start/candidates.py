@@ -25,7 +25,7 @@ from mipmap_plugin.models.base import Rebuilt, SplatModel
 # Views from which blend weights are computed.
 WEIGHT_VIEWS = 12
 
-# The powers of `merge_to` that are tried, until merging loses little enough.
+# The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)
 
 # Before them, what starts from a finer level is merged even where too few of its splats share a pixel: else chair would keep half of them at x0.57.
@@ -100,19 +100,34 @@ class StartSearch:
             return formed, "the closed form"
         base_db, formed_db = problem.steer(base), problem.steer(formed)
         least_coarse_db = math.inf if problem.coarse_base is None else self._least_coarse_db(base_db, problem.coarse_base())
-        for power, coarsely in self._merges():
-            merged = self._candidate(weights, config.merge_to**power, coarsely)
-            merged_db = problem.steer(merged)
-            if merged_db >= max(formed_db - config.merging_costs, least_coarse_db if coarsely else -math.inf):
-                return (merged, "the closed form of merged splats") if merged_db >= base_db - problem.may_lose else (base, problem.name)
+        merged = self._merged(weights, formed_db - config.merging_costs, least_coarse_db) if config.merge_to < 1 else None
+        if merged is not None:
+            model, merged_db = merged
+            return (model, "the closed form of merged splats") if merged_db >= base_db - problem.may_lose else (base, problem.name)
         return (formed, "the closed form") if formed_db >= base_db else (base, problem.name)
 
-    def _merges(self) -> list[tuple[float, bool]]:
-        """The power of `merge_to` of each candidate, and whether it is merged coarsely."""
-        if self._problem.config.merge_to == 1:
-            return []
-        coarse = COARSE_POWERS if self._problem.coarse_base else ()
-        return [*((power, True) for power in coarse), *((power, False) for power in POWERS)]
+    def _merged(self, weights: Tensor | None, least_db: float, least_coarse_db: float) -> tuple[SplatModel, float] | None:
+        """What is merged furthest and shows at least so many dB, and its PSNR; None if merging costs too much.
+
+        Splats that can hardly be merged lose too much by the mildest merging already, as those of captures do: then no other is tried.
+        """
+        for power in COARSE_POWERS if self._problem.coarse_base else ():
+            coarse, coarse_db = self._tried(weights, power, coarsely=True)
+            if coarse_db >= max(least_db, least_coarse_db):
+                return coarse, coarse_db
+        mildest, mildest_db = self._tried(weights, POWERS[-1])
+        if mildest_db < least_db:
+            return None
+        for power in POWERS[:-1]:
+            merged, merged_db = self._tried(weights, power)
+            if merged_db >= least_db:
+                return merged, merged_db
+        return mildest, mildest_db
+
+    def _tried(self, weights: Tensor | None, power: float, coarsely: bool = False) -> tuple[SplatModel, float]:
+        """A candidate and its PSNR."""
+        candidate = self._candidate(weights, self._problem.config.merge_to**power, coarsely)
+        return candidate, self._problem.steer(candidate)
 
     def _least_coarse_db(self, finer_db: float, base: SplatModel) -> float:
         """The PSNR that a coarsely merged candidate has to show. `finer_db`: that of the finer level."""

@@ -32,12 +32,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant, widened_to_filter
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.filters import INTEGRALS, SQUARE_VARIANCE, compensates, footprint, widening
 from mipmap_plugin.splatting.projection import Projected, axes_of, project
+from mipmap_plugin.threads import side_by_side
 
 # Target pixels: the minimum scale of an axis. At 1/50 of the classic dilation's width it is invisible, and its logarithm is finite.
 MIN_AXIS = 0.01
@@ -74,9 +76,14 @@ def closed_form(
     if filter_suffices(scale, base, target):
         return gaussians.scales, gaussians.opacities
     views, count = every_nth(views, MAX_VIEWS), len(gaussians)
-    size = CHUNK if gaussians.means.device.type == "cpu" else max(1, count)
-    chunks = (gaussians[start : start + size] for start in range(0, max(1, count), size))
-    scales, opacities = zip(*(_form(chunk, views, scale, (base, target), form) for chunk in chunks), strict=True)
+    on_cpu = gaussians.means.device.type == "cpu"
+    size = CHUNK if on_cpu else max(1, count)
+
+    def formed(start: int) -> tuple[Tensor, Tensor]:
+        return _form(gaussians[start : start + size], views, scale, (base, target), form)
+
+    starts = range(0, max(1, count), size)
+    scales, opacities = zip(*side_by_side(formed, starts, threads.for_views() if on_cpu else 1), strict=True)
     return torch.cat(scales), torch.cat(opacities)
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.merging import merge
-from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.backends.base import AdamStep, Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -17,8 +18,8 @@ from mipmap_plugin.gaussians import Gaussians
 CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 
-def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], *, gradients: bool, merging: bool) -> None:
-    """Let the backend compile what draws splats like these with all `effects`, and what their `gradients` and `merging` need."""
+def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], *, gradients: bool, merging: bool, by_rows: bool = False) -> None:
+    """Let the backend compile what draws splats like these with all `effects`, and what their `gradients`, `merging` and steps `by_rows` need."""
     few = gaussians[torch.arange(min(2, len(gaussians)))].detach()
     for number, setting in enumerate(effects):
         drawn = replace(few, means=few.means.clone().requires_grad_(gradients))
@@ -28,3 +29,16 @@ def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], 
             merge(few, torch.ones_like(weights), weights, fraction=0.5)
         if gradients and image.requires_grad:
             image.sum().backward()
+    if by_rows and gradients and hasattr(backend, "stepper"):
+        _step(backend, few, effects[0])
+
+
+def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:
+    """A step that moves nothing."""
+    raw = {name: getattr(splats, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
+    stepper = backend.stepper(raw)
+    unpacked = replace(effects, settings=replace(effects.settings, packing=None))
+    stepper.render([(CAMERA, unpacked)])[0].image.sum().backward()
+    moments = {name: torch.zeros_like(tensor) for name, tensor in raw.items()}
+    rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 0.0)
+    stepper.step(AdamStep(raw, moments, moments, rates, betas=(0.9, 0.999), correction=1.0, eps=1.0))

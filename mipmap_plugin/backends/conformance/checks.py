@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.base import Backend, Needs, Rendered
+from mipmap_plugin.backends.base import AdamStep, Backend, Needs, Rendered
 from mipmap_plugin.backends.conformance.cases import CASES, Builder, HardCase
 from mipmap_plugin.backends.conformance.tolerance import differing_gradients, differing_images, not_finite, tolerance_for
 from mipmap_plugin.backends.reference import ReferenceBackend, finite_rows
 from mipmap_plugin.errors import ShapeError
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.rotations import unit_quaternions
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,39 @@ def check_views(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.
         answers.append(Answer(_plain(images)[None], _plain(alphas)[None, :, None], dict(zip(leaves, map(_plain, grads), strict=True))))
     together, alone = answers
     return compare("views", together, alone, dtype)
+
+
+def check_steps(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Outcome:
+    """Check that a `stepper`, which few backends have, draws a case as `render` does, and hands the right gradients to Adam."""
+    case = build()
+    g = case.gaussians.to(device, dtype)
+    raw = {"means": g.means, "quats": 2 * g.quats, "scales": g.scales.log(), "opacities": g.opacities.logit(), "sh": g.sh}
+    actual, expected = _step_answer(backend, raw, case), _raw_answer(backend, raw, case)
+    return compare("steps", actual, expected, dtype)
+
+
+def _raw_answer(backend: Backend, raw: Mapping[str, Tensor], case: HardCase) -> Answer:
+    """The gradients of raw parameters by autograd."""
+    leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in raw.items()}
+    activated = {"quats": unit_quaternions(leaves["quats"]), "scales": leaves["scales"].exp(), "opacities": leaves["opacities"].sigmoid()}
+    rendered = backend.render(Gaussians(**{**leaves, **activated}), case.camera, case.effects)
+    grads = torch.autograd.grad(_squares(rendered), list(leaves.values()))
+    return Answer(_plain(rendered.image), _plain(rendered.alpha)[..., None], dict(zip(leaves, map(_plain, grads), strict=True)))
+
+
+def _step_answer(backend: Any, raw: Mapping[str, Tensor], case: HardCase, beta: float = 0.5) -> Answer:
+    """The gradients that a first step of rate 0 shows: the first moments over 1 - beta1."""
+    own, first, second = ({name: make(tensor) for name, tensor in raw.items()} for make in (torch.clone, torch.zeros_like, torch.zeros_like))
+    stepper = backend.stepper(own)
+    [rendered] = stepper.render([(case.camera, case.effects)])
+    _squares(rendered).backward()
+    rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 0.0)
+    stepper.step(AdamStep(own, first, second, rates, betas=(beta, beta), correction=1.0, eps=1.0))
+    return Answer(_plain(rendered.image), _plain(rendered.alpha)[..., None], {name: _plain(each) / (1 - beta) for name, each in first.items()})
+
+
+def _squares(rendered: Rendered) -> Tensor:
+    return rendered.image.square().sum() + rendered.alpha.square().sum()
 
 
 def draw(backend: Backend, case: HardCase, *, differentiate: bool = True) -> Answer:

@@ -7,7 +7,7 @@ import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend
 from mipmap_plugin.backends.conformance.cases import CASES
-from mipmap_plugin.backends.conformance.checks import check_case, check_views
+from mipmap_plugin.backends.conformance.checks import check_case, check_steps, check_views
 
 
 class BackendSuite:
@@ -36,4 +36,10 @@ class BackendSuite:
         if not hasattr(self.backend, "render_views"):
             pytest.skip("it draws one view at a time")
         outcome = check_views(self.backend, CASES["sh-degree-3"], dtype=self.dtype, device=self.device)
+        assert outcome.passed, outcome.message
+
+    def test_steps_follow_the_gradients(self) -> None:
+        if not hasattr(self.backend, "stepper"):
+            pytest.skip("it leaves steps to the optimizer")
+        outcome = check_steps(self.backend, CASES["sh-degree-3"], dtype=self.dtype, device=self.device)
         assert outcome.passed, outcome.message

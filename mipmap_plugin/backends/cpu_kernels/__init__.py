@@ -40,15 +40,10 @@ functions that it calls per splat (`memory`). Those are always inlined, because 
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-import numba
+from mipmap_plugin.backends.cpu_kernels.compiling import inner, kernel
 
-# For functions that Python calls: cached on disk, and without the GIL. Division by zero gives infinity, as in numpy.
-kernel: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
-
-# For functions that only kernels call. Without a Python wrapper they compile faster; a call from Python crashes.
-inner: Any = numba.njit(error_model="numpy", forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)  # type: ignore[call-overload]
+__all__ = ["inner", "kernel"]
 
 
 def _forget_stale() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from mipmap_plugin import threads
-from mipmap_plugin.backends.cpu_kernels import compositing_back, drawing, layout, projection_back
+from mipmap_plugin.backends.cpu_kernels import compositing_back, descending, drawing, layout, projection_back
 from mipmap_plugin.backends.cpu_kernels.records import Frame, Limits, Lists
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -61,3 +61,4 @@ def compile_back(has_covariances: bool, effects: Effects) -> None:
     table, slots, frame = np.zeros((1, layout.SPLAT_FIELDS), np.float32), np.zeros(2, np.int64), Frame(np.zeros(3, np.float32), pixel, pixel)
     drawn = drawing.Drawing(view, drawing.flags_of(view, splats), Limits(0.0, 0.0, 0.0), table, slots, lists, frame, picture, pixel)
     drawing.draw_back(splats, [drawn], [(picture, pixel)])
+    descending.compile_step()

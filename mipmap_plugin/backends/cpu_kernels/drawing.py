@@ -53,11 +53,12 @@ def draw(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = True) 
     threads = team(sum(count + shot.camera.width * shot.camera.height for shot in shots))
     views = [view_of(shot.camera, shot.effects, splats, gradients) for shot in shots]
     flags = [flags_of(view, splats) for view in views]
-    tables = [(empty(count, layout.SPLAT_FIELDS), empty(count), np.empty(count, np.int64)) for _ in shots]
+    tables = [(empty(count, layout.SPLAT_FIELDS), empty(count), empty(count, dtype=np.int64)) for _ in shots]
     threads.share_all(projection.project, [(count, (*drawn, splats, *table)) for *drawn, table in zip(flags, views, tables, strict=True)])
     projected = []
     for shot, (table, depths, counts) in zip(shots, tables, strict=True):
-        slots = np.zeros(count + 1, np.int64)
+        slots = empty(count + 1, dtype=np.int64)
+        slots[0] = 0
         np.cumsum(counts, out=slots[1:])
         projected.append(sorting.Projected(table, depths if shot.ranks is None else shot.ranks, slots, shot.camera.size))
     drawings = [
@@ -100,9 +101,28 @@ def draw_back(
     harmonics: whether to compute those of the coefficients, by far the largest array; else that array is empty.
     """
     threads = team(sum(len(splats.means) + drawn.alpha.size for drawn in drawings))
-    tile_grads = [empty(len(drawn.lists.members), layout.GRADS) for drawn in drawings]
+    tiles = tile_gradients(drawings, d_outputs, threads)
+    grads = SplatArrays(*(empty(*array.shape) for array in splats))
+    if not harmonics:
+        grads = grads._replace(sh=grads.sh[:0])
+
+    def add(start: int, stop: int) -> None:
+        for first in range(start, stop, ROWS):
+            last = min(first + ROWS, stop)
+            own = SplatArrays(*(array[first:last] for array in grads))
+            for array in own:
+                array[:] = 0
+            add_views(first, last, splats, drawings, tiles, own)
+
+    threads.share(add, len(splats.means))
+    return grads
+
+
+def tile_gradients(drawings: Sequence[Drawing], d_outputs: Sequence[tuple[np.ndarray, np.ndarray]], threads: Team) -> list[np.ndarray]:
+    """The gradient table [pairs, GRADS] of each view, from the gradients of its image [H, W, 3] and alpha [H, W]."""
+    tables = [empty(len(drawn.lists.members), layout.GRADS) for drawn in drawings]
     windows, points = [], []
-    for d, outputs, into in zip(drawings, d_outputs, tile_grads, strict=True):
+    for d, outputs, into in zip(drawings, d_outputs, tables, strict=True):
         tiles = len(d.lists.starts) - 1
         if d.view.sampling == OVER_WINDOW:
             windows.append((tiles, (d.table, d.lists, d.frame, outputs, into)))
@@ -110,21 +130,13 @@ def draw_back(
             points.append((tiles, (d.flags.integrated, d.flags.reshaped, d.flags.faded, d.limits, d.table, d.lists, d.frame, outputs, into)))
     threads.share_all(window_tiles.composite_back, windows)
     threads.share_all(compositing_back.composite_back, points)
-    grads = SplatArrays(*(empty(*array.shape) for array in splats))
-    if not harmonics:
-        grads = grads._replace(sh=grads.sh[:0])
+    return tables
 
-    def add_views(start: int, stop: int) -> None:
-        """The gradients of the splats start..stop: what no view shows has none, and costs nothing but its zeros."""
-        for first in range(start, stop, ROWS):
-            last = min(first + ROWS, stop)
-            for array in grads:
-                array[first:last] = 0
-            for d, rows in zip(drawings, tile_grads, strict=True):
-                projection_back.project_back(first, last, d.flags, d.view, splats, d.table, d.slots, rows, grads)
 
-    threads.share(add_views, len(splats.means))
-    return grads
+def add_views(start: int, stop: int, splats: SplatArrays, drawings: Sequence[Drawing], tiles: Sequence[np.ndarray], grads: SplatArrays) -> None:
+    """Add the gradients of the splats start..stop to the rows of `grads`: what no view shows has none, and costs nothing."""
+    for drawn, table in zip(drawings, tiles, strict=True):
+        projection_back.project_back(start, stop, drawn.flags, drawn.view, splats, drawn.table, drawn.slots, table, grads)
 
 
 def flags_of(view: View, splats: SplatArrays) -> Flags:

@@ -48,9 +48,11 @@ def scratch(count, number):
     @intrinsic
     def zeros(_context):
         def generate(context, builder, signature, values):
-            space = cgutils.alloca_once(builder, ir.ArrayType(context.get_data_type(number), count))
+            kind = ir.ArrayType(context.get_data_type(number), count)
+            with builder.goto_entry_block():  # `cgutils.alloca_once` would store an array of zeros, which LLVM takes 1 s to take apart
+                space = builder.alloca(kind)
             space.align = CACHE_LINE
-            builder.store(ir.Constant(space.type.pointee, None), space)
+            cgutils.memset(builder, space, ir.IntType(64)(context.get_abi_sizeof(kind)), 0)
             return builder.bitcast(space, space.type.pointee.element.as_pointer())
 
         return types.CPointer(number)(), generate

@@ -34,10 +34,13 @@ new_sums, new_rows = scratch(layout.GRADS * WIDTH, types.float64), scratch(WIDTH
 
 @kernel
 def project_back(start, stop, flags, view, splats, table, slots, tile_grads, grads):
-    """Add a view's gradients to those of the splats start..stop; splat i's tiles have the rows slots[i]..slots[i + 1] of tile_grads."""
+    """Add a view's gradients to those of the splats start..stop, the first of which has row 0 of `grads`.
+
+    Splat i's tiles have the rows slots[i]..slots[i + 1] of tile_grads.
+    """
     covariances, integrated, reshaped, _, fourth = flags
     stride = 3 * splats.sh.shape[1]
-    colors = pointer(splats.sh), pointer(grads.sh), pointer(table), stride, len(grads.sh) > 0
+    colors = pointer(splats.sh), pointer(grads.sh), pointer(table), stride, len(grads.sh) > 0, start
     arrays, targets, tile_rows = pointers(splats), pointers(grads), pointer(tile_grads)
     world, d_world, sums, bands, d_bands, rows, size = new_world(), new_world(), new_sums(), new_bands(), new_bands(), new_rows(), 0
     for i in range(start, stop):
@@ -50,7 +53,7 @@ def project_back(start, stop, flags, view, splats, table, slots, tile_grads, gra
             grad_splats(view, covariances, integrated, reshaped, world, sums, d_world)
             grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d_world)
             for lane in range(size):
-                store_grads(rows[lane], lane, d_world, targets, covariances)
+                store_grads(rows[lane] - start, lane, d_world, targets, covariances)
             size = 0
 
 
@@ -66,7 +69,7 @@ def sum_tiles(tile_rows, first, last, lane, sums):
 
 @inner
 def store_grads(i, lane, d_world, targets, has_covariances):
-    """Add a lane of the block `d_world` to the gradients of splat i."""
+    """Add a lane of the block `d_world` to row i of the gradients."""
     d_means, d_opacities, d_quats, d_scales, d_covariances = targets
     for k in range(3):
         d_means[3 * i + k] += d_world[(MEAN + k) * WIDTH + lane]
@@ -200,7 +203,7 @@ def grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d
 @inner
 def grad_color(i, lane, view, colors, sums, bands, d_bands):
     """The gradients of splat i's coefficients and, in its lane, of its spherical harmonics."""
-    sh, d_sh, table, stride, wanted = colors
+    sh, d_sh, table, stride, wanted, start = colors
     at, row, zero, largest = i * stride, i * layout.SPLAT_FIELDS, np.float32(0), np.float32(view.max_color)
     # A channel that was clamped to black or to the largest color has no gradient.
     d_red = np.float32(sums[layout.GRAD_RED * WIDTH + lane]) if 0 < table[row + layout.RED] < largest else zero
@@ -210,8 +213,9 @@ def grad_color(i, lane, view, colors, sums, bands, d_bands):
     for j in range(used):
         d_bands[j * WIDTH + lane] = d_red * sh[at + 3 * j] + d_green * sh[at + 3 * j + 1] + d_blue * sh[at + 3 * j + 2]
     if wanted:
+        into = at - start * stride
         for j in range(used):
             band = bands[j * WIDTH + lane]
-            d_sh[at + 3 * j] += d_red * band
-            d_sh[at + 3 * j + 1] += d_green * band
-            d_sh[at + 3 * j + 2] += d_blue * band
+            d_sh[into + 3 * j] += d_red * band
+            d_sh[into + 3 * j + 1] += d_green * band
+            d_sh[into + 3 * j + 2] += d_blue * band

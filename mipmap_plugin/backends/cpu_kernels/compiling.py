@@ -1,0 +1,113 @@
+"""How numba compiles the kernels: what it does to each of a hundred functions is most of the wait before the first image."""
+
+# numba has no types.
+# mypy: ignore-errors
+
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+
+import numba
+from numba.core import compiler, types
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.codegen import JITCodeLibrary
+from numba.core.registry import CPUDispatcher
+from numba.core.runtime import rtsys
+
+from mipmap_plugin.garbage import uncollected
+
+KERNEL = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+INNER = {"error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+# The last minor version of numba whose internals are known to work as used here; a later one compiles as it likes, which takes longer.
+KNOWN = (0, 68)
+IS_KNOWN = tuple(map(int, numba.__version__.split(".")[:2])) <= KNOWN
+
+# The folders and files whose constants and functions are compiled into kernels.
+ROOT = Path(__file__).parents[2]
+SOURCES = ("backends/cpu_kernels/*.py", "splatting/*.py", "effects.py")
+
+
+def kernel(function):
+    """For functions that Python calls: cached on disk, and without the GIL. Division by zero gives infinity, as in numpy; C calls none of them."""
+    if not IS_KNOWN:
+        return numba.njit(function, cache=True, **KERNEL)
+    dispatcher = _Kernel(function, targetoptions={"nopython": True, **KERNEL})
+    dispatcher.enable_caching()
+    return dispatcher
+
+
+def inner(function):
+    """For functions that only kernels call, always inlined. Without a Python wrapper they compile faster; a call from Python crashes."""
+    if not IS_KNOWN:
+        return numba.njit(function, **INNER)
+    return _Inner(function, targetoptions={"nopython": True, **INNER}, pipeline_class=_Compiler)
+
+
+class _Kernel(CPUDispatcher):
+    def enable_caching(self):
+        self._cache = _Cache(self.py_func)
+
+    def compile(self, signature):
+        with uncollected():
+            return super().compile(signature)
+
+
+class _Cache(FunctionCache):
+    """Machine code on disk, which goes stale with any source that is compiled into kernels: numba looks at a kernel's own file only."""
+
+    def __init__(self, function):
+        super().__init__(function)
+        self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, sources())
+
+    def load_overload(self, signature, context):
+        """As numba's, which first loads all that a compiler needs, scipy too: that takes three times as long as the code itself."""
+        rtsys.initialize(context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(signature, context)
+
+
+@cache
+def sources():
+    """A hash of all sources of the kernels: their names and bytes."""
+    digest = sha256()
+    for pattern in SOURCES:
+        for path in sorted(ROOT.glob(pattern)):
+            digest.update(str((path.name, path.read_bytes())).encode())
+    return digest.hexdigest()
+
+
+class _Inner(CPUDispatcher):
+    """Compiles a function once for `f(x, 1)` and `f(x, 2)`: numba would for each constant apart, and LLVM knows constants after inlining anyway."""
+
+    def get_call_template(self, args, kws):
+        return super().get_call_template(tuple(map(types.unliteral, args)), kws)
+
+
+class _Compiler(compiler.Compiler):
+    def compile_extra(self, function):
+        self.state.library = _Library(self.state.targetctx.codegen(), function.__qualname__)
+        return super().compile_extra(function)
+
+
+class _Library(JITCodeLibrary):
+    """LLVM code for callers to inline, which is optimized there. numba would optimize it here too, and make machine code that nobody calls."""
+
+    def _optimize_final_module(self):
+        pass
+
+    def _finalize_final_module(self):
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    @property
+    def codegen(self):
+        return _NoEnvironment
+
+
+class _NoEnvironment:
+    """Stands in for the execution engine, which lacks the function. An environment holds objects of Python, of which kernels use none."""
+
+    @staticmethod
+    def set_env(name, environment):
+        pass

@@ -1,0 +1,42 @@
+"""Large scenes take fewer steps."""
+
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.optimization.amount import LEAST_FRACTION, OVERSAMPLING, affordable, splats_in_view
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.recipes import MOST_DRAWS, recipe
+
+
+def test_splats_in_view_are_those_whose_centers_are_on_the_image():
+    means = torch.tensor([[0.0, 0.0, 2.0], [0.5, 0.0, 2.0], [9.0, 0.0, 2.0], [0.0, 0.0, -2.0], [0.0, 0.0, 0.05]])
+    parameters = tiny.model(len(means)).parameters() | {"means": means}
+    view = replace(tiny.cameras(1)[0], viewmat=torch.eye(4))
+    assert splats_in_view(VanillaModel(parameters), [view], near=0.2) == pytest.approx(2, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("in_view", "steps", "views"), [(10.0, 600, 150), (MOST_DRAWS / 1800, 600, 150), (MOST_DRAWS / 900, 300, 106), (1e9, 600 * LEAST_FRACTION, 75)]
+)
+def test_steps_and_views_fall_with_what_views_show_but_not_to_none(in_view, steps, views):
+    settings = affordable(recipe("default", 1 / 4), in_view)
+    assert (settings.steps, settings.extra_views) == (pytest.approx(steps, abs=1), pytest.approx(views, abs=1))
+    assert settings.truth_oversampling == (4 if steps == 600 else OVERSAMPLING)
+
+
+def test_steps_that_somebody_asks_for_are_taken():
+    for wish in (dict(steps=600), dict(time_budget_s=60.0), dict(target_db=30.0)):
+        assert recipe("default", 1 / 4, **wish).most_draws is None
+    assert recipe("thorough", 1 / 4).most_draws is None
+    assert recipe("default", 1 / 4, steps=600, most_draws=7.0).most_draws == 7.0
+
+
+def test_the_report_says_that_a_large_scene_took_fewer_steps(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.recipes.DEFAULT_OUT", dict(steps=8, most_draws=200.0, check_every=2))
+    report = wrap_model(tiny.model(60), cameras=tiny.cameras(4)).adapt(1 / 2, extra_views=0).report
+    assert report.curve[-1].step == 3 == report.settings.steps
+    assert report.ended_by.startswith("3 steps (of 8, because the scene is large")

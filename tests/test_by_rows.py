@@ -1,0 +1,170 @@
+"""Steps that the CPU backend takes itself, against autograd's gradients and the dense optimizer."""
+
+import importlib.util
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.optimization.by_rows import ByRows
+from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
+from mipmap_plugin.adaptation.renderers import SteppingRenderer
+from mipmap_plugin.backends.base import AdamStep
+from mipmap_plugin.backends.cpu import CpuBackend
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.models.surfels import SurfelModel
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.recipes import recipe
+from mipmap_plugin.splatting.bands import neighbors
+from mipmap_plugin.splatting.viewers import BUILT_IN
+
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
+BACKEND, VIEWS = CpuBackend(), tiny.cameras(3)
+SHOTS = [(view, Effects(1)) for view in VIEWS]
+
+
+known: dict[VanillaModel, ByRows] = {}
+
+
+def student(count: int = 77, degree: int = 1) -> VanillaModel:
+    """A count that is no multiple of 16, quaternions that are not of unit length, and one that is zero."""
+    parameters = tiny.model(count, degree=degree).parameters()
+    parameters["quats"] = parameters["quats"] * torch.linspace(0.1, 9.0, count)[:, None]
+    parameters["quats"][3] = 0
+    return VanillaModel(parameters).copy()
+
+
+def loss(drawn) -> torch.Tensor:
+    return sum((rendered.image - 0.4).square().mean() for rendered in drawn)
+
+
+def dense_step(model, optimizer, shots=SHOTS):
+    loss(BACKEND.render_views(model.gaussians(), shots)).backward()
+    optimizer.step()
+    optimizer.zero_grad()
+
+
+def step_by_rows(model, optimizer, shots=SHOTS):
+    draw = SteppingRenderer(BACKEND.stepper, [Effects(1)])
+    rows = ByRows.of(model, draw, known.get(model))
+    known[model] = rows
+    loss(rows.stepper.render(shots)).backward()
+    assert all(tensor.grad is None for tensor in model.parameters().values())
+    rows.step(optimizer)
+
+
+def after(steps, **options) -> dict[str, torch.Tensor]:
+    """The parameters and moments after some steps."""
+    model = student(**options)
+    optimizer = make_optimizer(model, recipe("default", 1 / 4), pixel=0.1)
+    for step in steps:
+        step(model, optimizer)
+    parameters = model.parameters()
+    moments = {f"{name} {key}": value for name, tensor in parameters.items() for key, value in optimizer.state_of(tensor).items()}
+    return {name: tensor.detach() for name, tensor in parameters.items()} | moments
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_steps_by_rows_are_those_of_dense_gradients(degree):
+    rows, dense = (after([step] * 3, degree=degree) for step in (step_by_rows, dense_step))
+    for name in dense:
+        torch.testing.assert_close(rows[name], dense[name], atol=2e-5, rtol=2e-3, msg=lambda text, name=name: f"{name}: {text}")
+
+
+def test_both_kinds_of_steps_go_on_from_one_another():
+    mixed = after([dense_step, step_by_rows, dense_step, step_by_rows])
+    for name, tensor in after([dense_step] * 4).items():
+        torch.testing.assert_close(mixed[name], tensor, atol=2e-5, rtol=2e-3, msg=lambda text, name=name: f"{name}: {text}")
+
+
+def test_a_step_has_the_same_bytes_on_any_number_of_threads(monkeypatch):
+    from mipmap_plugin.backends.cpu_kernels import descending, threads
+
+    monkeypatch.setattr(threads, "MIN_WORK", 0)
+    monkeypatch.setattr(descending, "ROWS", 32)
+    results, before = [], torch.get_num_threads()
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            results.append(after([step_by_rows] * 2))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(result[name], tensor) for result in results[1:] for name, tensor in results[0].items())
+
+
+def test_the_kernel_of_a_step_against_float64():
+    """One splat parameter, several steps: the formulas of Kingma and Ba."""
+    model = student(16)
+    optimizer = make_optimizer(model, recipe("default", 1 / 4), pixel=0.1)
+    opacity, mean, square = model.parameters()["opacities"].detach().double(), torch.zeros(16).double(), torch.zeros(16).double()
+    (beta1, beta2), rate = optimizer.betas, recipe("default", 1 / 4).rates.opacities
+    for count in (1, 2, 3):
+        raw = student(16)
+        raw.replace_parameters({name: tensor.detach().clone() for name, tensor in model.parameters().items()})
+        loss(ReferenceBackend().render(raw.gaussians(), *shot) for shot in SHOTS).backward()
+        gradient = raw.parameters()["opacities"].grad.double()
+        mean, square = beta1 * mean + (1 - beta1) * gradient, beta2 * square + (1 - beta2) * gradient**2
+        opacity = opacity - rate * mean / (1 - beta1**count) / ((square / (1 - beta2**count)).sqrt() + 1e-15)
+        step_by_rows(model, optimizer)
+    torch.testing.assert_close(model.parameters()["opacities"].detach().double(), opacity, atol=2e-4, rtol=1e-3)
+
+
+def of(model, previous=None) -> ByRows | None:
+    return ByRows.of(model, SteppingRenderer(BACKEND.stepper, [Effects(1)]), previous)
+
+
+def test_what_is_drawn_after_a_step_are_the_moved_parameters():
+    model = student()
+    rows = of(model)
+    loss(rows.stepper.render(SHOTS)).backward()
+    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    assert of(model, rows) is rows
+    with torch.no_grad():
+        for drawn, expected in zip(rows.stepper.render(SHOTS), BACKEND.render_views(model.gaussians(), SHOTS), strict=True):
+            torch.testing.assert_close(drawn.image, expected.image, atol=1e-5, rtol=1e-4)
+
+
+def test_changed_parameters_are_activated_anew_to_the_same_bytes():
+    model = student()
+    rows = of(model)
+    loss(rows.stepper.render(SHOTS)).backward()
+    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    with torch.no_grad():
+        model.parameters()["scales"].add_(0)
+        again = of(model, rows)
+        assert again is not rows
+        assert torch.equal(again.stepper.render(SHOTS)[0].image, rows.stepper.render(SHOTS)[0].image)  # so a run can be resumed
+    model.replace_parameters(neighbors({name: tensor.detach().clone() for name, tensor in model.parameters().items()}))
+    assert of(model, again) not in (None, again)
+
+
+def test_only_plain_splats_that_all_move_go_by_rows():
+    model, surfels = student(), SurfelModel(tiny.model().parameters()).copy()
+    assert of(model) is not None and of(surfels) is None and ByRows.of(model, None, None) is None
+    model.parameters()["shN"].requires_grad_(False)
+    assert of(model) is None
+    apart = student()
+    apart.replace_parameters({name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in apart.parameters().items()})
+    assert of(apart) is None
+
+
+def test_packed_effects_do_not_go_by_rows():
+    packed = next(viewer for viewer in BUILT_IN if viewer.settings.packing).effects(Effects(1))
+    assert SteppingRenderer.of(BACKEND, [Effects(1), packed]) is None
+    assert SteppingRenderer.of(ReferenceBackend(), [Effects(1)]) is None
+
+
+def test_a_family_that_activates_otherwise_is_not_plain():
+    class Doubled(VanillaModel):
+        def _activated(self, sh):
+            return super()._activated(2 * sh)
+
+    assert student().traits.plain and not Doubled(tiny.model().parameters()).traits.plain
+
+
+def test_a_step_before_the_gradients_are_known_is_refused():
+    rows = of(student())
+    rows.stepper.render(SHOTS)
+    with pytest.raises(RuntimeError, match="backward"):
+        rows.stepper.step(AdamStep({}, {}, {}, {}, (0.9, 0.999), 1.0, 0.0))

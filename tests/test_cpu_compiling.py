@@ -1,0 +1,119 @@
+"""What numba is kept from doing to kernels, because it takes seconds at the first run and gains nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("numba", reason="numba, the extra `cpu`, is not installed")
+
+import numba
+from numba.core.codegen import CPUCodeLibrary
+
+from mipmap_plugin.backends.cpu_kernels import binning, compiling
+from mipmap_plugin.backends.cpu_kernels.memory import scratch
+
+
+@pytest.fixture
+def emitted(monkeypatch):
+    """The text of all LLVM modules, before LLVM sees them."""
+    texts = []
+    add = CPUCodeLibrary.add_ir_module
+    monkeypatch.setattr(CPUCodeLibrary, "add_ir_module", lambda library, module: (texts.append(str(module)), add(library, module)))
+    return texts
+
+
+def test_scratch_memory_is_not_zeroed_number_by_number(emitted):
+    new = scratch(6144, numba.types.float32)
+
+    @numba.njit
+    def use():
+        memory = new()
+        memory[5] = 3
+        return memory[5] + memory[6143]
+
+    assert use() == 3
+    assert not [line for text in emitted for line in text.splitlines() if "store [6144 x float]" in line]
+
+
+def called_with_constants():
+    """A kernel, and the function that it calls."""
+
+    @compiling.inner
+    def plus(x, k):
+        return x + k
+
+    @numba.njit
+    def use(x):
+        return plus(x, 1) + plus(x, 2) + plus(x, len((x, x)))
+
+    return use, plus
+
+
+def test_a_function_is_compiled_once_for_all_constants():
+    use, plus = called_with_constants()
+    assert use(10) == 35
+    assert [str(kind) for kinds in plus.overloads for kind in kinds] == ["int64", "int64"]
+
+
+def test_no_machine_code_is_made_of_what_is_inlined():
+    use, plus = called_with_constants()
+    use(10)
+    assert not is_defined(*plus.overloads.values())
+    assert is_defined(*use.overloads.values())
+
+
+def is_defined(result) -> bool:
+    """Whether the process holds machine code of a function."""
+    return result.target_context.codegen()._engine.is_symbol_defined(result.fndesc.mangled_name)
+
+
+@pytest.fixture
+def cached(monkeypatch, tmp_path):
+    """A function that makes a kernel anew, as another process would, with a cache of its own on disk, and calls it."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+    def called():
+        kernel = compiling.kernel(binning.tile_grid.py_func)
+        assert kernel(65, 16) == (2, 1)
+        return kernel.stats
+
+    return called
+
+
+def test_a_kernel_is_compiled_once_for_all_processes(cached):
+    assert [sum(cached().cache_hits.values()) for _ in range(2)] == [0, 1]
+
+
+def test_a_kernel_is_compiled_anew_when_any_source_has_changed(cached, monkeypatch):
+    cached()
+    monkeypatch.setattr(compiling, "sources", lambda: "others")
+    assert [sum(cached().cache_hits.values()) for _ in range(2)] == [0, 1]
+
+
+def test_the_sources_are_all_that_kernels_are_made_of():
+    folder = compiling.ROOT / "backends" / "cpu_kernels"
+    texts = [text for text in map(Path.read_text, folder.glob("*.py")) if "@inner" in text or "@kernel" in text]
+    used = {name for text in texts for name in re.findall(r"^from mipmap_plugin\.(\S+) import", text, re.M)}
+    read = {path.relative_to(compiling.ROOT) for pattern in compiling.SOURCES for path in compiling.ROOT.glob(pattern)}
+    for_python = {"backends.cpu_kernels", "camera", "pool"}
+    assert {name for name in used if Path(*name.split(".")).with_suffix(".py") not in read} == for_python
+
+
+def test_a_kernel_from_the_cache_loads_no_compiler(tmp_path):
+    code = "import sys; from mipmap_plugin.backends.cpu_kernels import binning; binning.tile_grid(65, 16); print('numba.np.arraymath' in sys.modules)"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True).stdout for _ in range(2)]
+    assert [run.strip() for run in runs] == ["True", "False"]
+
+
+def test_with_a_later_numba_kernels_compile_as_it_likes(monkeypatch):
+    monkeypatch.setattr(compiling, "IS_KNOWN", False)
+    use, plus = called_with_constants()
+    assert use(10) == 35
+    assert type(plus) is type(numba.njit(lambda: None))

@@ -1,0 +1,40 @@
+"""Garbage collection is off where it only costs time, and nowhere else."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+
+import pytest
+
+from mipmap_plugin.garbage import uncollected
+
+
+def test_it_is_off_in_the_block_and_on_afterwards():
+    with pytest.raises(ValueError), uncollected():
+        assert not gc.isenabled()
+        raise ValueError
+    assert gc.isenabled()
+
+
+def test_it_stays_off_where_it_was():
+    gc.disable()
+    try:
+        with uncollected():
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_a_command_leaves_its_objects_at_exit_to_the_system():
+    code = """
+import atexit, contextlib, gc
+atexit.register(lambda: print(gc.get_freeze_count() > 0))  # the last to be called
+from mipmap_plugin.cli import main
+main(["--version"])
+main(["backends", "--check", "no-such"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == "True"
