@@ -18,8 +18,8 @@ import numpy as np
 
 RESULTS = Path(__file__).parent / "results" / "scheduler.md"
 
-# CPU seconds of a job at x1/4 for each million splats, and of whatever their number: `size.py`, 1 M, by docs/scale.md.
-PER_MILLION, FIXED = 1450.0, 10.0
+# CPU seconds of a job at x1/4 for each million splats, and of whatever their number: `size.py`, whole runs of 300,000, by docs/scale.md.
+PER_MILLION, FIXED = 440.0, 10.0
 
 REPEATS = 20
 
