@@ -1,7 +1,8 @@
 """The whole scene at the checks of a sweep: what did harm is undone in all tiles, which go on with lower rates (as `optimization.validation`).
 
-A tile by itself cannot tell: what it shows of a view is a part of its error, and tiles that found rates of their own left flowers' 300,000
-splats 0.8 dB below the result without tiles, of which 0.1 dB are left with the same rates for all.
+A tile by itself cannot tell: what it shows of a view is a part of its error. On flowers' 300,000 splats (8 tiles, 60 steps, one seed), tiles
+that found rates of their own ended 0.8 dB below the result without tiles, steered as a whole 0.2, and with the limit of rates that the run
+without tiles had found 0.1. At a million splats, steered as a whole, 1.9 dB are missing.
 """
 
 from __future__ import annotations
