@@ -82,6 +82,7 @@ def test_a_step_has_the_same_bytes_on_any_number_of_threads(monkeypatch):
     from mipmap_plugin.backends.cpu_kernels import descending, threads
 
     monkeypatch.setattr(threads, "MIN_WORK", 0)
+    monkeypatch.setattr(threads, "LEAST_ROWS", 16)
     monkeypatch.setattr(descending, "ROWS", 32)
     results, before = [], torch.get_num_threads()
     try:

@@ -46,6 +46,7 @@ def threads_for_any_work(monkeypatch):
     from mipmap_plugin.backends.cpu_kernels import threads
 
     monkeypatch.setattr(threads, "MIN_WORK", 0)
+    monkeypatch.setattr(threads, "LEAST_ROWS", 16)
 
 
 def leaf(g: Gaussians) -> Gaussians:
@@ -285,6 +286,17 @@ def test_a_team_does_all_work_exactly_once():
     for threads in (1, 2, 3):
         Team(threads).share(work, len(done), 0)
     assert (done == 3).all()
+
+
+@needs_numba
+def test_chunks_of_several_jobs_shrink_and_few_rows_are_not_cut():
+    from mipmap_plugin.backends.cpu_kernels.threads import LEAST_ROWS, Team
+
+    lengths = [stop - start for _, start, stop in Team(2)._ranges(0, [640, 640], least=1)]
+    assert lengths == [320, 160, 80, 40, 40]
+    calls = []
+    Team(2).share(lambda start, stop: calls.append((start, stop)), 2 * LEAST_ROWS, of_rows=True)
+    assert sorted(calls) == [(0, LEAST_ROWS), (LEAST_ROWS, 2 * LEAST_ROWS)]
 
 
 @needs_numba

@@ -15,7 +15,6 @@ from mipmap_plugin.adaptation.optimization.estimate import BAR, Bar, Forecast
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
-from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, views_at_once
 from mipmap_plugin.adaptation.target.resize import difference_from
@@ -44,13 +43,12 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     checks = [step for step in range(1, config.steps + 1) if is_checked(step, config)]
     forecast, began = Forecast(order, config, checks, run.step), run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
-    quickest = QuickestThreads()
     with bar, interruptible() as interrupted:
         reason = STOPPED if observe(run) is True else reason_to_stop(run.curve, run.watch.seconds, config)
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
-                with quickest.step(len(views), run.costs):
+                with run.threads.step(len(views), run.costs):
                     _step(run, task, config, views, cameras)
                 if is_checked(run.step, config):
                     _check(run, task, config)
@@ -138,10 +136,11 @@ def _backward(task: Task, config: AdaptConfig, views: Sequence[Camera], images: 
 
 
 def _truths(run: Run, task: Task, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> list[Tensor]:
-    """The truths of some views; those that no step used yet are made side by side."""
+    """The truths of some views; those that no step used yet are made side by side, with all threads."""
     new = [view for view in views if view not in run.costs.truths]
-    threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if len(new) > 1 else 1
-    return list(side_by_side(lambda view: run.costs.truth(view, task.truth), views, threads))
+    with run.threads.paused():
+        threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if len(new) > 1 else 1
+        return list(side_by_side(lambda view: run.costs.truth(view, task.truth), views, threads))
 
 
 def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
+from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
 from mipmap_plugin.adaptation.optimization.validation import Steering, Validation
 from mipmap_plugin.adaptation.renderers import SteppingRenderer, ViewsRenderer
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
@@ -102,6 +103,7 @@ class Run:
     rows_changed: bool = False  # splats were added or removed
     costs: Costs = field(default_factory=Costs)  # in this process
     by_rows: ByRows | None = None  # the student, while the backend moves it
+    threads: QuickestThreads = field(default_factory=QuickestThreads)
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:

@@ -39,7 +39,7 @@ def descend(splats: SplatArrays, drawings: Sequence[Drawing], d_outputs: Sequenc
             add_views(first, last, splats, drawings, tiles, grads)
             adam.step(first, last, splats, grads, raw, firsts, seconds, rates, settings)
 
-    threads.share(move, count)
+    threads.share(move, count, of_rows=True)
 
 
 def activated(raw: Mapping[str, Tensor]) -> dict[str, np.ndarray]:

@@ -54,7 +54,8 @@ def draw(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = True) 
     views = [view_of(shot.camera, shot.effects, splats, gradients) for shot in shots]
     flags = [flags_of(view, splats) for view in views]
     tables = [(empty(count, layout.SPLAT_FIELDS), empty(count), empty(count, dtype=np.int64)) for _ in shots]
-    threads.share_all(projection.project, [(count, (*drawn, splats, *table)) for *drawn, table in zip(flags, views, tables, strict=True)])
+    jobs = [(count, (*drawn, splats, *table)) for *drawn, table in zip(flags, views, tables, strict=True)]
+    threads.share_all(projection.project, jobs, of_rows=True)
     projected = []
     for shot, (table, depths, counts) in zip(shots, tables, strict=True):
         slots = empty(count + 1, dtype=np.int64)
@@ -114,7 +115,7 @@ def draw_back(
                 array[:] = 0
             add_views(first, last, splats, drawings, tiles, own)
 
-    threads.share(add, len(splats.means))
+    threads.share(add, len(splats.means), of_rows=True)
     return grads
 
 

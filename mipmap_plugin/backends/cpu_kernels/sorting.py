@@ -13,14 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel, layout
+from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel, layout, threads
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.records import Lists
 from mipmap_plugin.backends.cpu_kernels.threads import Team
 from mipmap_plugin.pool import empty
 
-# Several per thread, so that no thread waits long for the last run; but each run needs a counter for every tile.
+# Of many splats several runs per thread, so that no thread waits long for the last one; but each run needs a counter for every tile.
 RUNS_PER_THREAD = 8
 
 # Bits of a depth per pass of the radix sort: most lists hold a few hundred splats, so more counters would dominate the time.
@@ -48,7 +48,8 @@ class Projected(NamedTuple):
 
 def tile_lists(views: Sequence[Projected], team: Team) -> list[Lists]:
     """Each tile's splats and their slots, of each view, not yet sorted by depth."""
-    runs = 1 if team.threads == 1 else RUNS_PER_THREAD * team.threads
+    splats = len(views[0].order)
+    runs = 1 if team.threads == 1 else max(team.threads, min(RUNS_PER_THREAD * team.threads, splats // threads.LEAST_ROWS))
     written = []
     for _, _, slots, (height, width) in views:
         tiles_x, tiles_y = binning.tile_grid(width, height)

@@ -15,11 +15,14 @@ import torch
 from mipmap_plugin import threads
 
 # Crowded tiles take longer than others, so idle threads take chunks from the end of other threads' queues. Each chunk is CHUNK_SHARE of
-# what is left of a queue, but at least MIN_CHUNK_SHARE of all work, because taking a chunk costs time.
-CHUNK_SHARE, MIN_CHUNK_SHARE = 1 / 2, 1 / 128
+# what is left of a queue, but at least MIN_CHUNK_SHARE of all work: a call takes up to 30 us, in which no other thread can begin one.
+CHUNK_SHARE, MIN_CHUNK_SHARE = 1 / 2, 1 / 32
 
-# Splats plus pixels from which on a second thread pays off: this many take some 3 ms.
-MIN_WORK = 1 << 14
+# Rows of splats that are worth a call of their own.
+LEAST_ROWS = 1 << 11
+
+# Splats plus pixels from which on a second thread pays off: this many take some 0.8 ms, and to begin a share of them 60 us.
+MIN_WORK = 1 << 12
 
 
 @dataclass(frozen=True)
@@ -28,17 +31,18 @@ class Team:
 
     threads: int
 
-    def share(self, kernel: Callable[..., None], count: int, *arguments: Any) -> None:
-        """Call `kernel(start, stop, *arguments)` on ranges that cover 0..count, in all threads."""
-        self.share_all(kernel, [(count, arguments)])
+    def share(self, kernel: Callable[..., None], count: int, *arguments: Any, of_rows: bool = False) -> None:
+        """Call `kernel(start, stop, *arguments)` on ranges that cover 0..count, in all threads. of_rows: each item is a splat, which takes little."""
+        self.share_all(kernel, [(count, arguments)], of_rows=of_rows)
 
-    def share_all(self, kernel: Callable[..., None], jobs: Sequence[tuple[int, tuple[Any, ...]]]) -> None:
+    def share_all(self, kernel: Callable[..., None], jobs: Sequence[tuple[int, tuple[Any, ...]]], *, of_rows: bool = False) -> None:
         """`share` for several jobs at once: the count and the arguments of each."""
         if self.threads == 1 or not jobs:
             for count, arguments in jobs:
                 kernel(0, count, *arguments)
             return
-        queues = [deque(self._ranges(thread, [count for count, _ in jobs])) for thread in range(self.threads)]
+        least = LEAST_ROWS if of_rows else 1
+        queues = [deque(self._ranges(thread, [count for count, _ in jobs], least)) for thread in range(self.threads)]
 
         def work(thread: int) -> None:
             # First the thread's own queue, whose data is still in its cache; then the ends of the other queues.
@@ -52,20 +56,17 @@ class Team:
 
         threads.team(work, self.threads)
 
-    def _ranges(self, thread: int, counts: Sequence[int]) -> Iterator[tuple[int, int, int]]:
-        """What a thread begins with: the job, the start and the stop of each of its chunks."""
-        for job, count in enumerate(counts):
-            first, last = count * thread // self.threads, count * (thread + 1) // self.threads
-            for start, stop in chunks(first, last, max(1, int(sum(counts) * MIN_CHUNK_SHARE))):
+    def _ranges(self, thread: int, counts: Sequence[int], least: int) -> Iterator[tuple[int, int, int]]:
+        """What a thread begins with: the job, the start and the stop of each of its chunks, the smallest last."""
+        parts = [(count * thread // self.threads, count * (thread + 1) // self.threads) for count in counts]
+        left = sum(last - first for first, last in parts)
+        min_chunk = max(least, int(sum(counts) * MIN_CHUNK_SHARE))
+        for job, (start, last) in enumerate(parts):
+            while start < last:
+                stop = min(last, start + max(min_chunk, int(left * CHUNK_SHARE)))
                 yield job, start, stop
-
-
-def chunks(first: int, last: int, min_chunk: int) -> Iterator[tuple[int, int]]:
-    """Ranges that cover first..last, each smaller than the one before."""
-    while first < last:
-        stop = min(last, first + max(min_chunk, int((last - first) * CHUNK_SHARE)))
-        yield first, stop
-        first = stop
+                left -= stop - start
+                start = stop
 
 
 def team(work: int) -> Team:
