@@ -27,12 +27,13 @@ from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
-from mipmap_plugin.tiles import run, slabs, steering, tile
+from mipmap_plugin.tiles import plan, run, slabs, steering, tile, truth
 from mipmap_plugin.tiles.cut import cut, front_to_back
+from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.halo import draw_halos
 from mipmap_plugin.tiles.layers import draw_layers
 from mipmap_plugin.tiles.pictures import Album, write_pictures
-from mipmap_plugin.tiles.run import adapt_in_tiles, work_folder
+from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.scene import make_cut, opened
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
@@ -496,6 +497,57 @@ def test_an_output_is_not_replaced_unasked(job):
     assert job.target.read_text() == "here" and not work_folder(job.target).exists()
 
 
+# Several scales
+
+
+def base_pictures(monkeypatch):
+    """The sizes of the pictures of the base that are drawn from now on."""
+    sizes = []
+
+    def draw_base(scene, view):
+        image = real_draw_base(scene, view)
+        sizes.append(tuple(image.shape[:2]))
+        return image
+
+    real_draw_base = truth.draw_base
+    monkeypatch.setattr(truth, "draw_base", draw_base)
+    return sizes
+
+
+def test_scales_share_the_cut_and_the_pictures_of_the_base(job, monkeypatch):
+    jobs = [replace(job, scale=scale, target=job.target.with_name(f"x{scale}.ply")) for scale in (0.5, 0.25)]
+    alone = adapt_in_tiles(replace(jobs[1], target=job.target.with_name("alone.ply")), 2).file
+    cuts, sizes = [], base_pictures(monkeypatch)
+    monkeypatch.setattr(plan, "make_cut", lambda *asked: (cuts.append(asked), make_cut(*asked)))
+    files = [joined.file for joined in adapt_all_in_tiles(jobs, 2)]
+    assert len(cuts) == 1 and sizes == [(16, 20)] * 5  # three views, and two of validation
+    assert read_ply(files[1]).columns["x"].tobytes() == read_ply(alone).columns["x"].tobytes()
+
+
+def test_scales_of_other_views_draw_their_own(job, monkeypatch):
+    """At x1/8 four samples a pixel are drawn from half of the base's pixels."""
+    jobs = [replace(job, scale=scale, target=job.target.with_name(f"x{scale}.ply")) for scale in (0.5, 0.125)]
+    sizes = base_pictures(monkeypatch)
+    assert all(joined.file.exists() for joined in adapt_all_in_tiles(jobs, 2))
+    assert sizes == [(16, 20)] * 5 + [(8, 10)] * 5
+
+
+def test_a_scale_that_is_interrupted_leaves_the_others_what_they_share(job, monkeypatch):
+    jobs = [replace(job, scale=scale, target=job.target.with_name(f"x{scale}.ply")) for scale in (0.5, 0.25)]
+    first = next(adapt_all_in_tiles(jobs, 2))
+    sizes = base_pictures(monkeypatch)
+    assert first.file.exists() and adapt_in_tiles(jobs[1], 2).file.exists() and not sizes
+
+
+def test_no_folder_is_claimed_if_one_cannot_be(job):
+    jobs = [replace(job, target=job.target.with_name(name)) for name in ("a.ply", "b.ply")]
+    (work_folder(jobs[1].target)).mkdir()
+    (work_folder(jobs[1].target) / "something").write_text("")
+    with pytest.raises(SettingsError, match="holds other things"):
+        next(adapt_all_in_tiles(jobs, 2))
+    assert not work_folder(jobs[0].target).exists()
+
+
 # The command
 
 
@@ -508,6 +560,15 @@ def test_the_command(job, capsys):
     assert "finished before" in capsys.readouterr().out
     assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2", "--skip-existing", "--json"]) == 0
     assert [report["file"] for report in json.loads(capsys.readouterr().out)] == [str(job.target)]
+
+
+def test_the_command_for_several_scales_skips_what_is_finished(job, capsys):
+    options = ["--steps", "0", "--views", "given", "--backend", "reference", "--tiles", "2", "--scale", "1/2"]
+    assert main(["adapt", str(job.base.checkpoint), *options, "--json"]) == 0
+    capsys.readouterr()
+    assert main(["adapt", str(job.base.checkpoint), *options, "--scale", "1/4", "--json"]) == 0
+    reports = json.loads(capsys.readouterr().out)
+    assert [report["scale"] for report in reports] == [0.5, 0.25]
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.many import Many, Request, engine, of_scene
@@ -14,44 +15,57 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
 
+if TYPE_CHECKING:
+    from mipmap_plugin.tiles.run import Joined
+
 
 def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base, threads: int | None, json: bool) -> None:
     """Adapt one checkpoint to each scale and viewer in tiles. Raises SettingsError before any work, JobsFailed."""
     from mipmap_plugin.jobs.finished import finished
-    from mipmap_plugin.tiles.run import adapt_in_tiles
+    from mipmap_plugin.tiles.run import adapt_all_in_tiles
 
     if many.tiles is None or many.is_list(given) or many.shard is not None:
         raise SettingsError("--tiles cuts one checkpoint; give that one, without --list and --shard")
     if many.send_files:
         raise SettingsError("--tiles needs a folder that all workers see, so that files are not sent; leave --send-files out")
-    settings = dict(request.settings)
-    recipe, several = settings.pop("recipe"), len(request.targets) > 1
-
     def run(jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
         return engine(many, jobs, threads)
 
-    reports = []
-    for scale, viewer in request.targets:
-        target = adapted_path(given[0], request.output, scale, viewer, several=several).absolute()
-        job = Job(_absolute(base, given[0]), target, scale, viewer, recipe, settings, of_scene(request.images, given[0]), request.overwrite)
-        if many.skip_existing and (before := finished(job)):
-            file, facts = before
-            reports.append({"file": str(file), **facts})
-            if not json:
-                say(f"{file}: finished before")
-            continue
-        joined = adapt_in_tiles(job, many.tiles, run, threads)
-        report = joined.report
-        before_db, after_db = report.psnr_before(), report.psnr_after()
-        gain = f"{before_db:.2f} -> {after_db:.2f} dB on views that nothing was adapted to" if before_db and after_db else f"holds {report.returned}"
-        splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats"
+    jobs, reports = _jobs(given[0], request, base), {}
+    skip = many.skip_existing or (len(jobs) > 1 and not request.overwrite)  # as in a list
+    before = {str(job.target): found for job in jobs if skip and (found := finished(job))}
+    for target, (file, facts) in before.items():
+        reports[target] = {"file": str(file), **facts}
         if not json:
-            say(f"x{scale:g}{f' in {viewer}' if viewer else ''}, {many.tiles} tiles: {gain}, {splats}, {report.seconds['total']:.1f} s")
-            say(str(joined.file))
-            detail(f"  holds {report.returned}; {report.views}; {report.filters}; backend {report.backend}")
-        reports.append({"file": str(joined.file), **joined.facts()})
+            say(f"{file}: finished before")
+    left = [job for job in jobs if str(job.target) not in before]
+    for job, joined in zip(left, adapt_all_in_tiles(left, many.tiles, run, threads), strict=True):
+        reports[str(job.target)] = {"file": str(joined.file), **joined.facts()}
+        if not json:
+            _say(job, many.tiles, joined)
     if json:
-        print_facts(reports, json)
+        print_facts([reports[str(job.target)] for job in jobs], json)
+
+
+def _jobs(checkpoint: Path, request: Request, base: Base) -> list[Job]:
+    """The job of each scale and viewer."""
+    settings, several = dict(request.settings), len(request.targets) > 1
+    recipe, images, jobs = settings.pop("recipe"), of_scene(request.images, checkpoint), []
+    for scale, viewer in request.targets:
+        target = adapted_path(checkpoint, request.output, scale, viewer, several=several).absolute()
+        jobs.append(Job(_absolute(base, checkpoint), target, scale, viewer, recipe, settings, images, request.overwrite))
+    return jobs
+
+
+def _say(job: Job, tiles: int, joined: Joined) -> None:
+    report = joined.report
+    before_db, after_db = report.psnr_before(), report.psnr_after()
+    gain = f"{before_db:.2f} -> {after_db:.2f} dB on views that nothing was adapted to" if before_db and after_db else f"holds {report.returned}"
+    splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats"
+    viewer = f" in {job.viewer}" if job.viewer else ""
+    say(f"x{job.scale:g}{viewer}, {tiles} tiles: {gain}, {splats}, {report.seconds['total']:.1f} s")
+    say(str(joined.file))
+    detail(f"  holds {report.returned}; {report.views}; {report.filters}; backend {report.backend}")
 
 
 def _absolute(base: Base, checkpoint: Path) -> Base:

@@ -12,6 +12,7 @@ from mipmap_plugin.formats.atomic import together, write_json
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.tiles.folder import work_folder
 
 Work = Literal["truth", "start", "layer", "halo", "tile", "steering"]
 
@@ -23,6 +24,7 @@ class TileJob(Job):
     work: Work = "tile"
     number: int = 0
     sweep: int = 0
+    others: tuple[Job, ...] = ()  # of the same base, whose truths are made from the same pictures
 
     def __str__(self) -> str:
         number = "" if self.work in ("start", "steering") else f" {self.number + 1}"
@@ -46,7 +48,8 @@ class TileJob(Job):
         if self.work == "truth":
             from mipmap_plugin.tiles.truth import draw_truths
 
-            draw_truths(scene, self.number, folder)
+            others = [(scene.at(job.scale, job.config()), work_folder(job.target)) for job in self.others]
+            draw_truths(scene, self.number, folder, others)
         elif self.work == "start":
             from mipmap_plugin.tiles.start import StartSearch
 

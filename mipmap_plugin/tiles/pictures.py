@@ -20,6 +20,8 @@ KINDS = {"half": torch.float16, "int16": torch.int16, "uint8": torch.uint8}
 
 Box = tuple[int, int, int, int]  # left, top, right, bottom, px of the view
 
+Picture = tuple[str, Tensor, Box | None]  # its name, and what it shows of its view; None: all
+
 
 class Entry(NamedTuple):
     """One picture of a file."""
@@ -54,7 +56,7 @@ class Pictures:
         return picture
 
 
-def write_pictures(path: Path, pictures: Iterable[tuple[str, Tensor, Box | None]]) -> None:
+def write_pictures(path: Path, pictures: Iterable[Picture]) -> None:
     """Write pictures of the types of `KINDS` as they come, atomically; an old file is replaced. Raises OutputError."""
     names = {kind: name for name, kind in KINDS.items()}
     table = {}

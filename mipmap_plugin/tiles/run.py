@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,34 +13,28 @@ import torch
 
 from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
-from mipmap_plugin.errors import CheckpointError, JobsFailed, SettingsError
-from mipmap_plugin.formats.atomic import named, new_file, refuse_output, sha256, together, write_json
-from mipmap_plugin.formats.json_file import read_json
+from mipmap_plugin.errors import JobsFailed
+from mipmap_plugin.formats.atomic import new_file, together, write_json
 from mipmap_plugin.formats.ply_rows import concatenate
-from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.formats.tags import with_tags
 from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
-from mipmap_plugin.models.outputs import REPORT, parts_of
+from mipmap_plugin.models.outputs import REPORT
 from mipmap_plugin.progress import announced, counted
-from mipmap_plugin.splatting.viewers import viewers_for
-from mipmap_plugin.tiles.folder import CUT, START, halo_file, layer_file, part_file, run_file, steered_file, tile_file, truth_file
+from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, tile_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work
 from mipmap_plugin.tiles.judge import JOINED, judged
+from mipmap_plugin.tiles.plan import claim, cut_for, refuse
 from mipmap_plugin.tiles.report import make_report
-from mipmap_plugin.tiles.scene import TiledScene, find_splats, make_cut, opened
+from mipmap_plugin.tiles.scene import TiledScene, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import parts
 
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
 Engine = Callable[[Sequence[Job]], Generator[Outcome, None, None]]
-
-# What the folder's tiles belong to.
-PLAN = "plan.json"
-
 
 @dataclass(frozen=True)
 class Joined:
@@ -56,33 +49,41 @@ class Joined:
         return {**self.report.model_dump(), "tiles": self.tiles}
 
 
-def work_folder(target: Path) -> Path:
-    """Where the parts of a scene lie until it is whole, beside its file."""
-    target = named(target)
-    return target.with_name(target.name + ".tiles")
-
-
 def adapt_in_tiles(job: Job, tiles: int, engine: Engine = in_this_process, threads: int | None = None) -> Joined:
     """Adapt a checkpoint in `tiles` tiles, each a job that `engine` runs, and write it to `job.target`, a .ply or a model folder.
 
     What is done stays in a folder beside the target until all is: the same call goes on from there. `threads`: for what is done between
     the jobs. Raises SettingsError and OutputExists before any work, JobsFailed if a job failed, and what loading raises.
     """
+    return next(adapt_all_in_tiles([job], tiles, engine, threads))
+
+
+def adapt_all_in_tiles(jobs: Sequence[Job], tiles: int, engine: Engine = in_this_process, threads: int | None = None) -> Iterator[Joined]:
+    """`adapt_in_tiles` of one base for several scales or viewers: it is cut once, and each picture of it is drawn once for all that need it."""
     began = time.perf_counter()
-    folder = work_folder(job.target)
-    _refuse(job, tiles)
-    _claim(folder, job, tiles)
-    if not (folder / CUT).exists():
-        with announced("cutting"):
-            try:
-                make_cut(job.base.checkpoint, tiles, folder)
-            except CheckpointError:
-                shutil.rmtree(folder)  # nothing was done yet
-                raise
-        return_freed_memory()
-    scene = opened(job.base, job.scale, job.viewer, job.config(), folder)
-    scene.wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
-    stages = _Stages(job, engine, {"cutting": time.perf_counter() - began})
+    if not jobs:
+        return
+    for job in jobs:
+        refuse(job, tiles)
+    claim(jobs, tiles)
+    with announced("cutting"):
+        cut_for(jobs, tiles)
+    return_freed_memory()
+    for job in jobs:
+        _opened(job).wrapped.refuse_output(job.target, overwrite=job.overwrite, networks_move=False, viewer=job.viewer)
+    for number, job in enumerate(jobs):
+        stages = _Stages(job, tuple(jobs[number + 1 :]), engine, {"cutting": time.perf_counter() - began})
+        yield _adapted_and_saved(_opened(job), stages, began, threads)
+        began = time.perf_counter()
+
+
+def _opened(job: Job) -> TiledScene:
+    return opened(job.base, job.scale, job.viewer, job.config(), work_folder(job.target))
+
+
+def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads: int | None) -> Joined:
+    """Adapt a scene that is cut, and write it. `began`: when its time began to count."""
+    job, folder = stages.job, work_folder(stages.job.target)
     facts = _adapted(scene, folder, stages)
     last = time.perf_counter()
     with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
@@ -101,14 +102,16 @@ class _Stages:
     """Does the jobs of one stage after the other."""
 
     job: Job  # of the whole
+    others: tuple[Job, ...]  # of the same base, which are adapted after it
     engine: Engine
     seconds: dict[str, float]  # by what they were spent on
 
     def __call__(self, work: Work, targets: list[Path], sweep: int = 0) -> list[dict[str, Any]]:
         """Do one job for each target, and return what there is to say of each. Raises JobsFailed, KeyboardInterrupt."""
         began, job = time.perf_counter(), self.job
+        others = self.others if work == "truth" else ()
         jobs = [
-            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number, sweep=sweep)
+            TileJob(job.base, target, job.scale, job.viewer, job.recipe, job.settings, work=work, number=number, sweep=sweep, others=others)
             for number, target in enumerate(targets)
         ]
         outcomes = _done(jobs, self.engine, work)
@@ -157,44 +160,6 @@ def _write_parts(scene: TiledScene, folder: Path, returned: str) -> list[Path]:
     for file, core in zip(files, cores, strict=True):
         scene.for_target(splats.parameters(core)).save(file, provenance={}, overwrite=True)
     return files
-
-
-def _refuse(job: Job, tiles: int) -> None:
-    """Raise SettingsError for what cannot be done in tiles."""
-    find_splats(job.base.checkpoint)
-    config = job.config()
-    if tiles < 2:
-        raise SettingsError(f"tiles: give at least 2, got {tiles}; a scene that is not cut needs no tiles")
-    if job.images is not None or job.scale > 1:
-        raise SettingsError(f"x{job.scale:g}: a scene is cut into tiles for a zoom-out, without photographs; adapt it without tiles")
-    if config.most_splats is not None or config.band != (1, 1):
-        raise SettingsError("tiles are adapted to one scale, and to no number of splats; leave most_splats (--splats) and band out")
-    if job.viewer is not None and len(viewers_for(job.viewer)) > 1:
-        raise SettingsError(f"tiles are adapted for one viewer at a time, and {job.viewer} stands for several; give one of them")
-    if is_written(job.target):
-        raise SettingsError(f"{job.target}: tiles are joined to a .ply or a model folder; give one of these, and convert it afterwards")
-    refuse_output(job.target, job.overwrite, parts_of(find_splats(job.base.checkpoint)[0].path, None))
-
-
-def _claim(folder: Path, job: Job, tiles: int) -> None:
-    """Make the folder for this scene, these settings and this number of tiles.
-
-    Raises SettingsError if it holds those of others, CheckpointError, SceneError.
-    """
-    base = job.base
-    plan = {
-        "base": sha256(find_splats(base.checkpoint)[0].path), "tiles": tiles, "scale": job.scale, "viewer": job.viewer,
-        "settings": job.config().model_dump(mode="json"), "inputs": base.asked(), "backend": base.backend,
-    }  # fmt: skip
-    file = folder / PLAN
-    if file.exists():
-        if read_json(file) != json.loads(json.dumps(plan)):
-            raise SettingsError(f"{folder} holds tiles of another base, settings or number of tiles; repeat those, or delete it to start anew")
-        return
-    if folder.exists() and any(folder.iterdir()):
-        raise SettingsError(f"{folder} is needed for the tiles, but holds other things; move it, or choose another output")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(file, plan, overwrite=False)
 
 
 def _done(jobs: Sequence[Job], engine: Engine, what: str) -> list[Outcome]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -187,6 +188,14 @@ class TiledScene:
     def used_views(self) -> list[Camera]:
         """The views of all sweeps, and those of validation."""
         return [*views_of(self.views.adapted, self.config, 0, self.config.steps), *self.views.steering, *self.views.choosing]
+
+    def at(self, scale: float, config: AdaptConfig) -> TiledScene:
+        """The same scene at another scale: its views, and the base that they show. It shares this one's memory."""
+        other = copy(self)
+        other.scale, other.config = scale, config
+        for name in ("views", "sweeps", "used_views"):
+            other.__dict__.pop(name, None)
+        return other
 
     def for_target(self, parameters: dict[str, Tensor]) -> VanillaModel:
         """A model of some splats, as it is saved for the target; its parameters are leaves that require gradients."""

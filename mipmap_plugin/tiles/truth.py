@@ -1,4 +1,4 @@
-"""The pseudo ground truth of a scene on the disk: the base's picture of each whole view, drawn once and resized, for all tiles that show in it."""
+"""The pseudo ground truth of a scene on the disk: the base's picture of each whole view, drawn once and resized, for all tiles and scales."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.target.base_images import facts
 from mipmap_plugin.adaptation.target.image_store import MOST, STEPS
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.tiles.folder import truth_file
-from mipmap_plugin.tiles.pictures import Album, write_pictures
+from mipmap_plugin.tiles.pictures import Album, Picture, write_pictures
 from mipmap_plugin.tiles.scene import TiledScene
 
 # Views of a file, which one job draws.
@@ -30,21 +31,45 @@ def part_of(views: Sequence[Camera], number: int) -> Sequence[Camera]:
     return views[number * VIEWS : (number + 1) * VIEWS]
 
 
-def draw_truths(scene: TiledScene, part: int, folder: Path) -> None:
-    """Draw the `part`-th views, and write them to their file in `folder`, in 16 bits."""
+def draw_truths(scene: TiledScene, part: int, folder: Path, others: Sequence[tuple[TiledScene, Path]] = ()) -> None:
+    """Draw the `part`-th views, and write them to their file in `folder`, in 16 bits.
+
+    `others`: the same scene at further scales, each with its own folder. The part is written for them too if it has the same views there.
+    """
     views = part_of(scene.used_views, part)
-    write_pictures(truth_file(folder, part), ((view.name, in_16_bits(draw_truth(scene, view)), None) for view in views))
+    sharing = [(scene, folder), *(other for other in others if _shares(scene, other[0], part))]
+    truths: list[list[Picture]] = [[] for _ in sharing]
+    for view in views:
+        image = draw_base(scene, view)
+        for (each, _), pictures in zip(sharing, truths, strict=True):
+            pictures.append((view.name, in_16_bits(resized(each, view, image)), None))
+    for (_, each_folder), pictures in reversed([*zip(sharing, truths, strict=True)]):  # its own last, which says that all are there
+        write_pictures(truth_file(each_folder, part), pictures)
 
 
-def draw_truth(scene: TiledScene, view: Camera) -> Tensor:
-    """The pseudo ground truth [h, w, 3] of a view at the new scale (as `target.pseudo_truth`, for splats on the disk)."""
-    config = scene.config
-    fraction = 1.0 if config.truth_oversampling is None else min(1.0, config.truth_oversampling * scene.scale)
-    camera = view.resized(max(1, round(view.width * fraction)), max(1, round(view.height * fraction)))
-    effects = replace(scene.base_effects, eps2d=scene.base_effects.eps2d * fraction**2)
-    image = scene.painter(effects).image(scene.base, camera).clamp(0, 1)
-    target = resize(image, view.zoomed(scene.scale).size, config.resize)
-    return target.clamp(0, 1).mul(255).round().div(255) if config.quantize_truth else target
+def _shares(scene: TiledScene, other: TiledScene, part: int) -> bool:
+    """Whether the truths of a part follow from the same pictures of the base."""
+    names_and_facts = [[(view.name, facts(view)) for view in part_of(each.used_views, part)] for each in (scene, other)]
+    return fraction(scene) == fraction(other) and names_and_facts[0] == names_and_facts[1]
+
+
+def fraction(scene: TiledScene) -> float:
+    """The fraction of the base scale at which the base is drawn (as `target.pseudo_truth`)."""
+    oversampling = scene.config.truth_oversampling
+    return 1.0 if oversampling is None else min(1.0, oversampling * scene.scale)
+
+
+def draw_base(scene: TiledScene, view: Camera) -> Tensor:
+    """The base's picture of a view, from splats on the disk, with the pixels that its truth is made from."""
+    size = (max(1, round(pixels * fraction(scene))) for pixels in (view.width, view.height))
+    effects = replace(scene.base_effects, eps2d=scene.base_effects.eps2d * fraction(scene) ** 2)
+    return scene.painter(effects).image(scene.base, view.resized(*size)).clamp(0, 1)
+
+
+def resized(scene: TiledScene, view: Camera, image: Tensor) -> Tensor:
+    """The pseudo ground truth [h, w, 3] of a view at the new scale, from the base's picture of it."""
+    target = resize(image, view.zoomed(scene.scale).size, scene.config.resize)
+    return target.clamp(0, 1).mul(255).round().div(255) if scene.config.quantize_truth else target
 
 
 def in_16_bits(image: Tensor) -> Tensor:

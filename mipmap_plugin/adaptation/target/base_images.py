@@ -34,7 +34,7 @@ class BaseImages:
 
         It is clamped, as a display does, before anybody resizes it: unclamped highlights would bleed into their neighbors (-3 dB at x1/8).
         """
-        return self._store((_facts(view), fraction), lambda: self._render(view, fraction))
+        return self._store((facts(view), fraction), lambda: self._render(view, fraction))
 
     def are_of(self, model: SplatModel, backend: Backend, effects: Effects) -> bool:
         """Whether these are the images of this model by such a backend."""
@@ -42,8 +42,8 @@ class BaseImages:
 
     def keep_only(self, views: Iterable[Camera]) -> None:
         """Forget the images of all other views, so that those of `views` find room."""
-        facts = {_facts(view) for view in views}
-        self._store.keep_only(lambda key: key[0] in facts)
+        kept = {facts(view) for view in views}
+        self._store.keep_only(lambda key: key[0] in kept)
 
     @torch.no_grad()
     def _render(self, view: Camera, fraction: float) -> Tensor:
@@ -63,7 +63,7 @@ class BaseImages:
         return self._activated
 
 
-def _facts(view: Camera) -> Hashable:
+def facts(view: Camera) -> Hashable:
     """Everything that an image depends on. Cameras are compared by identity, but each call generates its random views anew."""
     pose = view.viewmat.numpy().tobytes()
     return view.width, view.height, view.fx, view.fy, view.cx, view.cy, pose, view.time, view.zoom, view.index

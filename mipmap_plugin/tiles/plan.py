@@ -1,0 +1,92 @@
+"""What is asked of tiles: requests that no tiles serve are refused, and the folder of a request is claimed for it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.formats.atomic import new_file, refuse_output, sha256, write_json
+from mipmap_plugin.formats.json_file import read_json
+from mipmap_plugin.formats.splat_transform import is_written
+from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.models.outputs import parts_of
+from mipmap_plugin.splatting.viewers import viewers_for
+from mipmap_plugin.tiles.folder import BASE, CUT, work_folder
+from mipmap_plugin.tiles.scene import find_splats, make_cut
+
+# What the folder's tiles belong to.
+PLAN = "plan.json"
+
+
+def refuse(job: Job, tiles: int) -> None:
+    """Raise SettingsError for what cannot be done in tiles."""
+    find_splats(job.base.checkpoint)
+    config = job.config()
+    if tiles < 2:
+        raise SettingsError(f"tiles: give at least 2, got {tiles}; a scene that is not cut needs no tiles")
+    if job.images is not None or job.scale > 1:
+        raise SettingsError(f"x{job.scale:g}: a scene is cut into tiles for a zoom-out, without photographs; adapt it without tiles")
+    if config.most_splats is not None or config.band != (1, 1):
+        raise SettingsError("tiles are adapted to one scale, and to no number of splats; leave most_splats (--splats) and band out")
+    if job.viewer is not None and len(viewers_for(job.viewer)) > 1:
+        raise SettingsError(f"tiles are adapted for one viewer at a time, and {job.viewer} stands for several; give one of them")
+    if is_written(job.target):
+        raise SettingsError(f"{job.target}: tiles are joined to a .ply or a model folder; give one of these, and convert it afterwards")
+    refuse_output(job.target, job.overwrite, parts_of(find_splats(job.base.checkpoint)[0].path, None))
+
+
+def claim(jobs: Sequence[Job], tiles: int) -> None:
+    """Make the work folder of each job, for this base, its settings and this number of tiles.
+
+    Raises SettingsError, before any is made, if one holds those of others; CheckpointError, SceneError.
+    """
+    digest = sha256(find_splats(jobs[0].base.checkpoint)[0].path)
+    plans = {work_folder(job.target): _plan(job, tiles, digest) for job in jobs}
+    for folder, plan in plans.items():
+        if (folder / PLAN).exists():
+            if read_json(folder / PLAN) != json.loads(json.dumps(plan)):
+                raise SettingsError(f"{folder} holds tiles of another base, settings or number of tiles; repeat those, or delete it to start anew")
+        elif folder.exists() and any(folder.iterdir()):
+            raise SettingsError(f"{folder} is needed for the tiles, but holds other things; move it, or choose another output")
+    for folder, plan in plans.items():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / PLAN, plan, overwrite=True)
+
+
+def _plan(job: Job, tiles: int, digest: str) -> dict[str, Any]:
+    """Everything that the tiles of a job depend on."""
+    return {
+        "base": digest, "tiles": tiles, "scale": job.scale, "viewer": job.viewer, "settings": job.config().model_dump(mode="json"),
+        "inputs": job.base.asked(), "backend": job.base.backend,
+    }  # fmt: skip
+
+
+def cut_for(jobs: Sequence[Job], tiles: int) -> None:
+    """Cut the base of some jobs into tiles, once, and leave what all their folders lack of it there. Raises CheckpointError."""
+    folders = [work_folder(job.target) for job in jobs]
+    if not (done := [folder for folder in folders if (folder / CUT).exists()]):
+        try:
+            make_cut(jobs[0].base.checkpoint, tiles, folders[0])
+        except CheckpointError:
+            for folder in folders:
+                shutil.rmtree(folder)  # nothing was done yet
+            raise
+        done = folders[:1]
+    for folder in folders:
+        for name in () if (folder / CUT).exists() else (BASE, CUT):  # the cut last, which says that both are there
+            _link(done[0] / name, folder / name)
+
+
+def _link(file: Path, new: Path) -> None:
+    """Give a file a second name; a copy, where the disk knows no such names."""
+    with new_file(new, overwrite=True) as temporary:
+        with suppress(OSError):
+            os.link(file, temporary)
+            return
+        shutil.copyfile(file, temporary)
