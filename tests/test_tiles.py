@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import anchor_checkpoints
+import numpy as np
 import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.loop import adapt as real_adapt
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.views import ViewSchedule
+from mipmap_plugin.backends.base import AdamStep
+from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
@@ -43,6 +48,8 @@ from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.surroundings import Surroundings, nothing
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
 from mipmap_plugin.tiles.truth import Truths, draw_truths, parts
+
+needs_numba = pytest.mark.skipif(not importlib.util.find_spec("numba"), reason="numba is not installed")
 
 EFFECTS = Effects(1, background=(0.2, 0.4, 0.6))
 
@@ -289,6 +296,43 @@ def test_a_view_without_the_core_shows_nothing(halved):
     [image] = around[0].render_views(core, [away])
     (image - around[0].wanted(away)).square().mean().backward()
     assert image.shape == (1, 1, 3) and not image.any() and not core.means.grad.any()
+
+
+@needs_numba
+def test_tiles_step_by_rows_where_the_backend_can(job, monkeypatch):
+    """And the result is that of autograd, but for rounding, of which Adam's first steps make more."""
+    job, steps = replace(job, base=replace(job.base, backend="cpu")), []
+    real_step = ByRows.step
+    monkeypatch.setattr(ByRows, "step", lambda self, optimizer: (steps.append(self), real_step(self, optimizer)))
+    by_rows = read_ply(adapt_in_tiles(job, 3).file).columns
+    assert len(steps) == 3 * 4  # 4 steps of 3 tiles, whatever a view shows of them
+    monkeypatch.setattr(Surroundings, "to_step", None)
+    by_autograd = read_ply(adapt_in_tiles(replace(job, target=job.target.with_name("other.ply")), 3).file).columns
+    assert len(steps) == 3 * 4 and not np.array_equal(by_rows["x"], by_autograd["x"])
+    for name, column in by_autograd.items():
+        np.testing.assert_allclose(by_rows[name], column, atol=2e-3, err_msg=name)
+
+
+@needs_numba
+def test_a_step_whose_views_show_nothing_moves_nothing(halved):
+    _, view, _, around = whole_and_tiles(halved)
+    around[0]._scene.backend = CpuBackend()
+    raw = {name: tensor.contiguous() for name, tensor in splats_of(halved, 0).items()}
+    before = {name: tensor.clone() for name, tensor in raw.items()}
+    stepper = around[0].to_step.stepper(raw)
+    [image] = around[0].to_step.images(stepper, [nothing(view)], 0)
+    image.square().mean().backward()
+    zeros = {name: torch.zeros_like(tensor) for name, tensor in raw.items()}
+    rates = dict.fromkeys(["means", "quats", "scales", "opacities", "sh0", "shN"], 0.1)
+    stepper.step(AdamStep(raw, zeros, {name: zero.clone() for name, zero in zeros.items()}, rates, (0.9, 0.99), 1.0, 1e-8))
+    assert not image.any() and all(torch.equal(raw[name], before[name]) for name in raw)
+
+
+def splats_of(halved, number):
+    """The raw parameters of a tile as they begin, with sh in one."""
+    folder = halved[1]
+    raw = Store(Steered.before(folder, 0).file(folder, number)).parameters()
+    return {"sh": torch.cat([raw.pop("sh0"), raw.pop("shN")], dim=1), **raw}
 
 
 # Sweeps

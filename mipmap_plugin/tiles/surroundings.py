@@ -7,7 +7,7 @@ picture and the change of T (c + t B) since then.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
@@ -16,8 +16,10 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
-from mipmap_plugin.backends.base import Rendered
+from mipmap_plugin.adaptation.renderers import SteppingRenderer
+from mipmap_plugin.backends.base import Rendered, Stepper
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.tiles.folder import halo_file, layer_file
 from mipmap_plugin.tiles.halo import FINE
@@ -32,6 +34,8 @@ KEPT = 2 * VIEWS_AT_ONCE
 
 # The name of a view that does not show the core.
 NOTHING = "nothing"
+
+Shot = tuple[Camera, Effects]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,18 +99,31 @@ class Surroundings:
 
     def render_views(self, core: Gaussians, cameras: Sequence[Camera], _: int = 0) -> list[Tensor]:
         """The same of several cameras, in one call if the backend can."""
-        shown = [camera for camera in cameras if camera.name != NOTHING]
         together = getattr(self._scene.backend, "render_views", None)
-        if together is None or len(shown) < 2:
-            images = [self.render(core, camera) for camera in shown]
-        else:
-            rendered = together(core, [(camera, self._effects) for camera in shown])
-            images = [self._whole(camera, each) for camera, each in zip(shown, rendered, strict=True)]
-        following = iter(images)
-        black = 0 * core.means[:1, None]  # a step whose views all show nothing has a gradient too, of 0
-        return [next(following) if camera.name != NOTHING else black for camera in cameras]
+
+        def draw(shots: Sequence[Shot]) -> list[Rendered]:
+            if together is None or len(shots) < 2:
+                return [self._scene.backend.render(core, *shot) for shot in shots]
+            return list(together(core, shots))
+
+        return self.images(cameras, draw)
+
+    def images(self, cameras: Sequence[Camera], draw: Callable[[Sequence[Shot]], list[Rendered]]) -> list[Tensor]:
+        """The images [h, w, 3] of cameras, from the pictures of the core that `draw` draws."""
+        shown = [camera for camera in cameras if camera.name != NOTHING] or cameras[:1]  # one at least, so that every step has gradients
+        drawn = iter(draw([(camera, self._effects) for camera in shown]))
+        wholes = {camera: self._whole(camera, next(drawn)) for camera in shown}
+        return [wholes[camera] if camera in wholes else torch.zeros(1, 1, 3) for camera in cameras]
+
+    @property
+    def to_step(self) -> SteppingRenderer | None:
+        """What draws the steps of the core, if the backend moves splats itself."""
+        usual = SteppingRenderer.of(self._scene.backend, [self._effects])
+        return None if usual is None else _InHalo(usual.stepper, usual.targets, self)
 
     def _whole(self, camera: Camera, core: Rendered) -> Tensor:
+        if camera.name == NOTHING:
+            return 0 * core.image
         around = self._surrounding(camera.name)
         return around.rest + around.through * core.image + (1 - core.alpha)[..., None] * around.behind
 
@@ -117,6 +134,17 @@ class Surroundings:
         of the error that it has of the pixel's blend weights. All tiles together then mend all of it, to first order.
         """
         return self._surrounding(camera.name).wanted if camera.name != NOTHING else torch.zeros(1, 1, 3)
+
+
+@dataclass(frozen=True)
+class _InHalo(SteppingRenderer):
+    """Draws a core with its surroundings by what moves it afterwards."""
+
+    around: Surroundings
+
+    def images(self, stepper: Stepper, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
+        """See `SteppingRenderer`."""
+        return self.around.images(cameras, stepper.render)
 
 
 def nothing(view: Camera) -> Camera:

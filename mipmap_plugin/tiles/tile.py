@@ -87,7 +87,7 @@ class Tile:
         views = [crop or nothing(view) for view, crop in zip(self.scene.views.adapted, self.crops, strict=True)]
         white = self.scene.target.background == (1.0, 1.0, 1.0)
         validation = no_validation(around.wanted, around.render)
-        return Task(views, 1.0, around.wanted, around.render, white, validation, render_views=around.render_views)
+        return Task(views, 1.0, around.wanted, around.render, white, validation, render_views=around.render_views, render_to_step=around.to_step)
 
     def _fingerprint(self) -> str:
         """A hash of everything that the run depends on."""
