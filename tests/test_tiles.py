@@ -43,7 +43,7 @@ from mipmap_plugin.tiles.scene import make_cut, opened
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.start import StartSearch
-from mipmap_plugin.tiles.steering import Steered, open_state
+from mipmap_plugin.tiles.steering import Steered, open_state, sweep_of
 from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.surroundings import Surroundings, nothing
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
@@ -363,7 +363,7 @@ def test_only_views_that_steps_use_are_drawn():
 
 @pytest.mark.parametrize(
     ("psnrs", "kept", "ceiling"),
-    [((31.0, 32.0), 2, 1.0), ((31.0, 30.0), 2, 1.0), ((31.0, 29.0), 1, 0.5), ((29.0,), 0, 0.5)],
+    [((31.0, 32.0), 2, 1.0), ((31.0, 30.95), 2, 1.0), ((31.0, 30.0), 1, 0.5), ((29.0,), 0, 0.5)],
 )
 def test_what_does_harm_to_the_whole_is_undone(halved, monkeypatch, psnrs, kept, ceiling):
     scene, folder = halved
@@ -375,6 +375,42 @@ def test_what_does_harm_to_the_whole_is_undone(halved, monkeypatch, psnrs, kept,
     steering.steer(scene, Sweep(0, 0, (1, 2)), folder)
     after = Steered.before(folder, 1)
     assert (max(after.step, 0), after.ceiling, tuple(after.psnrs)) == (kept, ceiling, psnrs)
+
+
+def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, monkeypatch):
+    scene, folder = halved
+    torch.save({"name": "the start", "psnr": 30.0}, folder / "start.pt")
+    measured = iter([32.0, 31.0, 29.0])
+    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+    monkeypatch.setattr(scene, "config", scene.config.model_copy(update={"warm_up": 1.0}))
+    steering.steer(scene, Sweep(0, 0, (1, 2, 3)), folder)
+    after = Steered.before(folder, 1)
+    assert (after.step, after.ceiling < 1) == (1, True)
+    assert after.following is None or not after.following.repeats
+
+
+def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever(halved, monkeypatch):
+    scene, folder = halved
+    torch.save({"name": "the start", "psnr": 30.0}, folder / "start.pt")
+    measured = iter([31.0, 29.0, 29.0, 29.0, 32.0, 29.0, 33.0])
+    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+    monkeypatch.setattr(steering, "rate_factor", lambda scene, step, ceiling: ceiling)
+    monkeypatch.setitem(scene.__dict__, "sweeps", [Sweep(0, 0, (1, 2, 3)), Sweep(1, 3, (4,), 1, 1)])
+    made, sweep = [], sweep_of(scene, folder, 0)
+    while sweep is not None:
+        steering.steer(scene, sweep, folder)
+        after = Steered.before(folder, sweep.number + 1)
+        made.append((sweep.first, sweep.checks, sweep.halos, sweep.repeats, after.step, after.ceiling))
+        sweep = sweep_of(scene, folder, sweep.number + 1)
+    assert made == [
+        (0, (1, 2, 3), 0, 0, 1, 0.5),
+        (1, (2, 3), 0, 1, 1, 0.25),
+        (1, (2, 3), 0, 2, 1, 0.125),
+        (1, (2, 3), 0, 3, 2, 0.0625),
+        (3, (4,), 4, 0, 4, 0.0625),
+    ]
 
 
 # The whole

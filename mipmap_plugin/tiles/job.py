@@ -57,23 +57,28 @@ class TileJob(Job):
         elif self.work == "layer":
             from mipmap_plugin.tiles.layers import draw_layers
 
-            draw_layers(scene, self.number, scene.sweeps[self.sweep], folder)
+            draw_layers(scene, self.number, self._sweep(scene, folder), folder)
         elif self.work == "halo":
             from mipmap_plugin.tiles.halo import draw_halos
 
-            draw_halos(scene, self.number, scene.sweeps[self.sweep], folder)
+            draw_halos(scene, self.number, self._sweep(scene, folder), folder)
         elif self.work == "steering":
             from mipmap_plugin.tiles.steering import steer
 
-            steer(scene, scene.sweeps[self.sweep], folder)
+            steer(scene, self._sweep(scene, folder), folder)
         else:
             self._adapt(scene, folder)
+
+    def _sweep(self, scene: Any, folder: Path) -> Any:
+        from mipmap_plugin.tiles.steering import sweep_of
+
+        return sweep_of(scene, folder, self.sweep)
 
     def _adapt(self, scene: Any, folder: Path) -> None:
         from mipmap_plugin.tiles.tile import Tile
         from mipmap_plugin.wrapped import state_path
 
-        saved, facts, keeper = Tile(scene, self.number, scene.sweeps[self.sweep], folder).adapt(state_path(self.target))
+        saved, facts, keeper = Tile(scene, self.number, self._sweep(scene, folder), folder).adapt(state_path(self.target))
         with together(self.target):
             save_torch(self.target, saved, overwrite=True)
             write_json(facts_file(self.target), facts, overwrite=True)

@@ -19,7 +19,7 @@ def judged(scene: TiledScene, folder: Path) -> tuple[dict[str, float], str]:
     """The PSNR (dB) of each on whole views, and the name of what is returned: the best, or the last where the settings say so."""
     if not scene.views.choosing:
         return {}, JOINED
-    truths, last = Truths(scene, folder), result(scene, folder)
+    truths, last = Truths(scene, folder), result(folder)
     start = f"the start, {load_torch(folder / START)['name']}"
     states = {AS_IT_IS: scene.base, start: open_state(scene, folder, Steered.before(folder, 0)), JOINED: open_state(scene, folder, last)}
     psnrs = {name: psnr(scene, splats, truths, scene.views.choosing) for name, splats in states.items()}

@@ -37,7 +37,7 @@ def draw_layers(scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> N
                 layer = torch.cat([rendered.image, (1 - rendered.alpha)[..., None]], dim=2)
                 yield view.name, within(layer, box).half(), box
 
-    write_pictures(layer_file(folder, number, sweep.number), pictures())
+    write_pictures(layer_file(folder, number, sweep.halos), pictures())
 
 
 def box_of(shown: Tensor, pad: int = 0) -> Box | None:

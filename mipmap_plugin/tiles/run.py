@@ -23,13 +23,13 @@ from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
 from mipmap_plugin.models.outputs import REPORT
 from mipmap_plugin.progress import announced, counted
-from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, tile_file, truth_file, work_folder
+from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work
 from mipmap_plugin.tiles.judge import JOINED, judged
 from mipmap_plugin.tiles.plan import claim, cut_for, refuse
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.scene import TiledScene, opened
-from mipmap_plugin.tiles.steering import Steered, open_state, result
+from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import parts
 
@@ -126,35 +126,40 @@ def _adapted(scene: TiledScene, folder: Path, do: _Stages) -> list[dict[str, Any
     do("truth", [truth_file(folder, part) for part in range(parts(scene.used_views))])
     do("start", [folder / START])
     facts: list[dict[str, Any]] = []
-    for sweep in scene.sweeps:
-        runs = [run_file(folder, number, sweep.number) for number in tiles]
-        layers = [layer_file(folder, number, sweep.number) for number in tiles]
-        halos = [halo_file(folder, part, sweep.number) for part in range(parts(scene.sweep_views(sweep)))]
-        if not all(file.exists() for file in runs):
-            do("layer", layers, sweep.number)
-            do("halo", halos, sweep.number)
-        facts += do("tile", runs, sweep.number)
-        do("steering", [steered_file(folder, sweep.number)], sweep.number)
-        _forget(scene, folder, sweep, [*layers, *halos])
-        if scene.config.target_db is not None and Steered.before(folder, sweep.number + 1).psnrs[-1] >= scene.config.target_db:
+    sweep, number = sweep_of(scene, folder, 0), 0
+    while sweep is not None:
+        runs = [run_file(folder, tile, number) for tile in tiles]
+        if not sweep.repeats and not all(file.exists() for file in runs):
+            do("layer", [layer_file(folder, tile, number) for tile in tiles], number)
+            do("halo", [halo_file(folder, part, number) for part in range(parts(scene.sweep_views(sweep)))], number)
+        facts += do("tile", runs, number)
+        do("steering", [steered_file(folder, number)], number)
+        number += 1
+        sweep, state = sweep_of(scene, folder, number), Steered.before(folder, number)
+        _forget(scene, folder, sweep, state, number)
+        if scene.config.target_db is not None and state.best_db >= scene.config.target_db:
             break
     return facts
 
 
-def _forget(scene: TiledScene, folder: Path, sweep: Sweep, pictures: list[Path]) -> None:
-    """Make room on the disk: of what a sweep left, only the splats that are gone on with and their moments are needed."""
-    state = Steered.before(folder, sweep.number + 1)
-    kept = {state.file(folder, number) for number in range(len(scene.cores))}
-    made = [(each.number, step) for each in scene.sweeps[: sweep.number + 1] for step in each.checks]
-    done = [tile_file(folder, number, *each) for number in range(len(scene.cores)) for each in made]
-    for file in (*pictures, *(file for file in done if file not in kept)):
-        file.unlink(missing_ok=True)
+def _forget(scene: TiledScene, folder: Path, sweep: Sweep | None, state: Steered, made: int) -> None:
+    """Make room on the disk: of what `made` sweeps left, only what the next one, `sweep`, goes on with is needed."""
+    kept = {state.file(folder, tile) for tile in range(len(scene.cores))}
+    for file in folder.glob("tile_*.splats"):
+        if file not in kept:
+            file.unlink()
+    for number in set(range(made - 1)) - {state.sweep}:
+        for tile in range(len(scene.cores)):
+            run_file(folder, tile, number).write_bytes(b"")  # which still says that the tile was done
+    if sweep is None or not sweep.repeats:
+        for file in (*folder.glob("layer_*.pictures"), *folder.glob("halo_*.pictures")):
+            file.unlink()
 
 
 def _write_parts(scene: TiledScene, folder: Path, returned: str) -> list[Path]:
     """Write the splats of each tile to a PLY of its own."""
     files = [part_file(folder, number) for number in range(len(scene.cores))]
-    state = result(scene, folder) if returned == JOINED else Steered.before(folder, 0)
+    state = result(folder) if returned == JOINED else Steered.before(folder, 0)
     splats = scene.base if returned == AS_IT_IS else open_state(scene, folder, state)
     cores = scene.cores if returned == AS_IT_IS else torch.arange(len(splats)).split([*map(len, splats.parts)])
     for file, core in zip(files, cores, strict=True):

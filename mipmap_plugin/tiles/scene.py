@@ -177,12 +177,13 @@ class TiledScene:
 
     @cached_property
     def sweeps(self) -> list[Sweep]:
-        """The parts of the run."""
+        """The parts of the run, as planned."""
         return sweeps(self.config)
 
     def sweep_views(self, sweep: Sweep) -> list[Camera]:
-        """The views that a sweep adapts to."""
-        return views_of(self.views.adapted, self.config, sweep.first, sweep.end)
+        """The views of a sweep's halos, which are all that it adapts to."""
+        planned = self.sweeps[sweep.planned]
+        return views_of(self.views.adapted, self.config, planned.first, planned.end)
 
     @cached_property
     def used_views(self) -> list[Camera]:

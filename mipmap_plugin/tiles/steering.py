@@ -7,7 +7,9 @@ without tiles had found 0.1. At a million splats, steered as a whole, 1.9 dB are
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import math
+from dataclasses import asdict, dataclass, replace
+from itertools import count
 from pathlib import Path
 
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
@@ -23,6 +25,9 @@ from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import Truths
 
+# What did harm is tried again this often, with half of the rates each time, before the run goes on without those steps.
+MOST_REPEATS = 3
+
 
 @dataclass(frozen=True)
 class Steered:
@@ -32,15 +37,26 @@ class Steered:
     step: int
     ceiling: float = 1.0  # of the rates
     psnrs: tuple[float, ...] = ()  # dB of the whole on the steering views at each check, up to the first that did harm
+    best_db: float = -math.inf  # of all checks so far
+    following: Sweep | None = None  # None: the run is over
 
     @classmethod
     def before(cls, folder: Path, sweep: int) -> Steered:
         """What a sweep goes on with; after the last sweep: the result."""
-        return cls(**read_json(steered_file(folder, sweep - 1))) if sweep else cls(-1, 0)
+        if not sweep:
+            return cls(-1, 0)
+        facts = read_json(steered_file(folder, sweep - 1))
+        following = facts.pop("following")
+        return cls(**facts, following=None if following is None else Sweep(**{**following, "checks": tuple(following["checks"])}))
 
     def file(self, folder: Path, number: int) -> Path:
         """The splats of a tile in this state."""
         return start_file(folder, number) if self.sweep < 0 else tile_file(folder, number, self.sweep, self.step)
+
+
+def sweep_of(scene: TiledScene, folder: Path, number: int) -> Sweep | None:
+    """The `number`-th sweep that is made, once the one before it was steered; None if there is none."""
+    return Steered.before(folder, number).following if number else next(iter(scene.sweeps), None)
 
 
 def open_state(scene: TiledScene, folder: Path, state: Steered) -> Splats:
@@ -48,28 +64,44 @@ def open_state(scene: TiledScene, folder: Path, state: Steered) -> Splats:
     return Splats.of(scene.kind, [Store(state.file(folder, number)) for number in range(len(scene.cores))])
 
 
-def result(scene: TiledScene, folder: Path) -> Steered:
+def result(folder: Path) -> Steered:
     """What the last sweep that was made ended with; the start without steps."""
-    return Steered.before(folder, sum(steered_file(folder, sweep.number).exists() for sweep in scene.sweeps))
+    return Steered.before(folder, next(number for number in count() if not steered_file(folder, number).exists()))
 
 
 def steer(scene: TiledScene, sweep: Sweep, folder: Path) -> None:
     """Measure the whole at each check of a sweep, and write what the next sweep begins with."""
-    before, start_db = Steered.before(folder, sweep.number), load_torch(folder / START)["psnr"]
-    truths, psnrs = Truths(scene, folder), []
-    best, best_db, ceiling = before, -float("inf"), before.ceiling
+    before = Steered.before(folder, sweep.number)
+    truths, psnrs, harmful, start_db = Truths(scene, folder), [], False, load_torch(folder / START)["psnr"]
+    best, best_db, ceiling = before, max(before.best_db, start_db), before.ceiling
+    warms_up = sweep.end <= scene.config.warm_up_steps  # rates that lose a little in a few steps may gain in many
     for step in sweep.checks:
         state = Steered(sweep.number, step)
         psnrs.append(psnr(scene, open_state(scene, folder, state), truths, scene.views.steering))
-        if psnrs[-1] < start_db - HARM_DB and scene.config.returns == "best":
-            ceiling = RATE_REDUCTION * rate_factor(scene, step, ceiling)
+        if psnrs[-1] < (start_db if warms_up else best_db) - HARM_DB and scene.config.returns == "best":
+            ceiling, harmful = RATE_REDUCTION * rate_factor(scene, step, ceiling), True
             break
         if psnrs[-1] >= best_db - TIE_DB:
             best, best_db = state, max(best_db, psnrs[-1])
     else:
         best = state  # what has learned most
-    after = Steered(best.sweep, best.step, ceiling, tuple(psnrs))
+    again = harmful and not warms_up and sweep.repeats < MOST_REPEATS
+    following = repeated(sweep, best) if again else next_planned(scene, sweep)
+    after = Steered(best.sweep, best.step, ceiling, tuple(psnrs), best_db, following)
     write_json(steered_file(folder, sweep.number), asdict(after), overwrite=True)
+
+
+def repeated(sweep: Sweep, best: Steered) -> Sweep:
+    """The rest of a sweep after its best state, or all of it, in front of the same halos."""
+    first = best.step if best.sweep == sweep.number else sweep.first
+    checks = tuple(step for step in sweep.checks if step > first)
+    return replace(sweep, number=sweep.number + 1, first=first, checks=checks, repeats=sweep.repeats + 1)
+
+
+def next_planned(scene: TiledScene, sweep: Sweep) -> Sweep | None:
+    """The sweep that comes after one and its repetitions."""
+    planned = scene.sweeps[sweep.planned + 1 : sweep.planned + 2]
+    return replace(planned[0], number=sweep.number + 1, halos=sweep.number + 1) if planned else None
 
 
 def rate_factor(scene: TiledScene, step: int, ceiling: float) -> float:

@@ -55,8 +55,8 @@ class Surroundings:
         self._scene, self._number = scene, number
         self._effects = unrounded(scene.target)
         self._truths = Truths(scene, folder)
-        self._layers = Album([layer_file(folder, number, sweep.number)])
-        self._halos = Album(halo_file(folder, part, sweep.number) for part in range(parts(scene.sweep_views(sweep))))
+        self._layers = Album([layer_file(folder, number, sweep.halos)])
+        self._halos = Album(halo_file(folder, part, sweep.halos) for part in range(parts(scene.sweep_views(sweep))))
         self._kept: dict[str, _Surrounding] = {}
         self._lock = Lock()  # views are asked for side by side
 

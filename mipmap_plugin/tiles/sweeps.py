@@ -22,9 +22,12 @@ CHECKS_IN_WARM_UP, CHECKS = 6, 2
 class Sweep:
     """Some steps of a run."""
 
-    number: int
+    number: int  # of all that are made
     first: int  # steps before it
     checks: tuple[int, ...]  # the steps after which the scene is checked; with the last of them, the sweep ends
+    planned: int = 0  # which of a run's sweeps it is
+    halos: int = 0  # the number of the sweep whose pictures it is drawn with: its own, unless it repeats a part of another
+    repeats: int = 0  # how often that one was repeated, this time included
 
     @property
     def end(self) -> int:
@@ -33,7 +36,7 @@ class Sweep:
 
 
 def sweeps(config: AdaptConfig) -> list[Sweep]:
-    """The sweeps of a run; none without steps."""
+    """The sweeps of a run, if nothing does harm; none without steps."""
     warm_up, ends = min(config.warm_up_steps, config.steps), [0]
     if warm_up:
         ends.append(warm_up)
@@ -42,7 +45,7 @@ def sweeps(config: AdaptConfig) -> list[Sweep]:
     found = []
     for number, (first, end) in enumerate(pairwise(ends)):
         checks = min(end - first, CHECKS_IN_WARM_UP if end <= warm_up else CHECKS)
-        found.append(Sweep(number, first, tuple(first + (end - first) * (check + 1) // checks for check in range(checks))))
+        found.append(Sweep(number, first, tuple(first + (end - first) * (check + 1) // checks for check in range(checks)), number, number))
     return found
 
 

@@ -64,21 +64,21 @@ class Tile:
         ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
         self._write(run.student.parameters(), [step for step in self.sweep.checks if step > run.step])
         facts |= {"splats_after": len(run.student.parameters()["means"]), "ended_by": ended_by, "seconds": time.perf_counter() - began}
-        return {"optimizer": run.optimizer.state_dict(), "seconds": run.watch.seconds}, facts, keeper
+        return {"optimizer": run.optimizer.state_dict(), "step": run.step, "seconds": run.watch.seconds}, facts, keeper
 
     def _write(self, parameters: dict[str, Any], steps: Any) -> None:
         for step in steps:
             write_store(tile_file(self.folder, self.number, self.sweep.number, step), parameters)
 
     def _continue(self, run: Run) -> None:
-        """Let a run go on where the sweep before ended, with its moments unless what they led to was undone."""
+        """Let a run go on in the state that it was steered to, with Adam's moments if that state ended a sweep."""
         run.step, run.steering = self.sweep.first, Steering(0.0, math.inf, Snapshot({}, {}), ceiling=self.before.ceiling)  # no best state is kept
         run.curve[0] = run.curve[0].model_copy(update={"step": run.step})
         if not self.sweep.number:
             return
-        saved = load_torch(run_file(self.folder, self.number, self.sweep.number - 1))
-        run.watch.seconds += saved.get("seconds", 0.0)
-        if saved and self.before.step == self.sweep.first:
+        run.watch.seconds += load_torch(run_file(self.folder, self.number, self.sweep.number - 1)).get("seconds", 0.0)
+        saved = load_torch(run_file(self.folder, self.number, self.before.sweep)) if self.before.sweep >= 0 else {}
+        if saved.get("step") == self.before.step:
             run.optimizer.load_state_dict(saved["optimizer"])
 
     def _task(self) -> Task:
