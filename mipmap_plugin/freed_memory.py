@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import platform
 
-# Numbers of glibc's mallopt (malloc.h), and what a process keeps: blocks up to 32 MiB, the largest that it allows, and 1 GiB in all.
+# Numbers of glibc's mallopt (malloc.h), and what a process keeps: blocks up to 32 MiB, the largest that it allows, and 192 MiB in all.
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 KEPT_BLOCK, KEPT_IN_ALL = 32 << 20, 3 << 26
 

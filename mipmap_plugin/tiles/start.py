@@ -108,6 +108,7 @@ class StartSearch:
             return painter.blend_weights(splats, views)
 
         opacities = torch.cat([part.shapes[:, -1] for part in splats.parts]).sigmoid()
+        splats.release()
         opacities = matched_opacities(opacities, wanted, weights_of)
         for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
             model = self.scene.for_target(part.parameters())

@@ -53,7 +53,9 @@ class Store:
 
     def parameters(self) -> dict[str, Tensor]:
         """Copies of the raw parameters of all rows."""
-        return as_parameters(self.shapes.clone(), self.sh.clone())
+        shapes, sh = self.shapes.clone(), self.sh.clone()
+        self.release()
+        return as_parameters(shapes, sh)
 
     def release(self) -> None:
         """Give the memory of what was read back to the system; later reads find it in the system's cache, or on the disk."""
