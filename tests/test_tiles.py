@@ -372,7 +372,7 @@ def test_what_does_harm_to_the_whole_is_undone(halved, monkeypatch, psnrs, kept,
     monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
     monkeypatch.setattr(steering, "open_state", lambda *_: None)
     monkeypatch.setattr(steering, "rate_factor", lambda *_: 1.0)
-    steering.steer(scene, Sweep(0, 0, (1, 2)), folder)
+    steering.steer(scene, Sweep(0, 0, (1, 2), 0, 0), folder)
     after = Steered.before(folder, 1)
     assert (max(after.step, 0), after.ceiling, tuple(after.psnrs)) == (kept, ceiling, psnrs)
 
@@ -384,7 +384,7 @@ def test_a_little_loss_in_the_warm_up_is_no_harm_and_it_is_not_repeated(halved, 
     monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
     monkeypatch.setattr(steering, "open_state", lambda *_: None)
     monkeypatch.setattr(scene, "config", scene.config.model_copy(update={"warm_up": 1.0}))
-    steering.steer(scene, Sweep(0, 0, (1, 2, 3)), folder)
+    steering.steer(scene, Sweep(0, 0, (1, 2, 3), 0, 0), folder)
     after = Steered.before(folder, 1)
     assert (after.step, after.ceiling < 1) == (1, True)
     assert after.following is None or not after.following.repeats
@@ -397,7 +397,7 @@ def test_what_did_harm_is_done_again_in_front_of_the_same_halos_but_not_for_ever
     monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
     monkeypatch.setattr(steering, "open_state", lambda *_: None)
     monkeypatch.setattr(steering, "rate_factor", lambda scene, step, ceiling: ceiling)
-    monkeypatch.setitem(scene.__dict__, "sweeps", [Sweep(0, 0, (1, 2, 3)), Sweep(1, 3, (4,), 1, 1)])
+    monkeypatch.setitem(scene.__dict__, "sweeps", [Sweep(0, 0, (1, 2, 3), 0, 0), Sweep(1, 3, (4,), 1, 1)])
     made, sweep = [], sweep_of(scene, folder, 0)
     while sweep is not None:
         steering.steer(scene, sweep, folder)
@@ -577,6 +577,66 @@ def test_an_output_is_not_replaced_unasked(job):
     assert job.target.read_text() == "here" and not work_folder(job.target).exists()
 
 
+def interrupted_at(work, sweep, number):
+    """An engine that is interrupted before one job."""
+
+    def engine(jobs):
+        for each in jobs:
+            if (each.work, each.sweep, each.number) == (work, sweep, number):
+                raise KeyboardInterrupt
+            yield from in_this_process([each])
+
+    return engine
+
+
+def columns_of(file):
+    return {name: column.tobytes() for name, column in read_ply(file).columns.items()}
+
+
+@pytest.mark.parametrize(
+    ("work", "sweep", "number"), [("tile", 1, 1), ("steering", 1, 0), ("tile", 2, 1), ("steering", 2, 0), ("halo", 3, 0), ("tile", 3, 2)]
+)
+def test_a_run_that_is_interrupted_anywhere_goes_on_to_the_same_bytes(job, monkeypatch, work, sweep, number):
+    """Its second sweep does harm at the last check, and is repeated from the first one in a third."""
+    gains, real_steer = {0: [1.0] * 6, 1: [1.5, -9.0], 2: [2.0], 3: [3.0] * 2}, steering.steer
+
+    def steer(scene, made, folder):
+        start_db, own = torch.load(folder / "start.pt")["psnr"], iter(gains[made.number])
+        with monkeypatch.context() as patched:
+            patched.setattr(steering, "psnr", lambda *_: start_db + next(own))
+            real_steer(scene, made, folder)
+
+    monkeypatch.setattr(steering, "steer", steer)
+    plan = [Sweep(0, 0, (1,), 0, 0), Sweep(1, 1, (2, 4), 1, 1), Sweep(2, 4, (5, 6), 2, 2)]
+    monkeypatch.setattr("mipmap_plugin.tiles.scene.sweeps", lambda config: plan)
+    job = replace(job, settings=job.settings | {"steps": 6, "warm_up": 0.0})
+    undisturbed = adapt_in_tiles(replace(job, target=job.target.with_name("other.ply")), 3)
+    assert [tile["sweep"] for tile in undisturbed.tiles] == [0] * 3 + [1] * 3 + [2] * 3 + [3] * 3
+    with pytest.raises(KeyboardInterrupt):
+        adapt_in_tiles(job, 3, interrupted_at(work, sweep, number))
+    assert columns_of(adapt_in_tiles(job, 3).file) == columns_of(undisturbed.file)
+
+
+def test_what_a_sweep_is_measured_by_is_what_it_began_with(halved, monkeypatch):
+    """A warm-up may lose a little, and what comes after it need not be better than the best of it."""
+    scene, folder = halved
+    torch.save({"name": "the start", "psnr": 30.0}, folder / "start.pt")
+    monkeypatch.setattr(steering, "open_state", lambda *_: None)
+    measured = iter([32.0, 31.0, 31.5, 31.45])
+    monkeypatch.setattr(steering, "psnr", lambda *_: next(measured))
+    scene.config = scene.config.model_copy(update={"warm_up": 0.5})
+    steering.steer(scene, Sweep(0, 0, (1, 2), 0, 0), folder)
+    assert Steered.before(folder, 1).psnr == 31.0
+    steering.steer(scene, Sweep(1, 2, (3, 4), 1, 1), folder)
+    after = Steered.before(folder, 2)
+    assert (after.sweep, after.step, after.ceiling, after.psnr) == (1, 4, 1.0, 31.45)
+
+
+def test_a_run_ends_with_the_sweep_that_reaches_the_target(job):
+    joined = adapt_in_tiles(replace(job, settings=job.settings | {"target_db": 5.0}), 2)
+    assert {tile["sweep"] for tile in joined.tiles} == {0}
+
+
 # Several scales
 
 
@@ -619,6 +679,13 @@ def test_a_scale_that_is_interrupted_leaves_the_others_what_they_share(job, monk
     assert first.file.exists() and adapt_in_tiles(jobs[1], 2).file.exists() and not sizes
 
 
+def test_jobs_of_several_bases_or_of_one_output_are_refused(job, tmp_path):
+    other = replace(job, target=job.target.with_name("other.ply"), base=replace(job.base, background="white"))
+    for jobs in ([job, other], [job, replace(job, scale=0.25)]):
+        with pytest.raises(SettingsError, match="those of one base, each with an output of its own"):
+            next(adapt_all_in_tiles(jobs, 2))
+
+
 def test_no_folder_is_claimed_if_one_cannot_be(job):
     jobs = [replace(job, target=job.target.with_name(name)) for name in ("a.ply", "b.ply")]
     (work_folder(jobs[1].target)).mkdir()
@@ -649,6 +716,19 @@ def test_the_command_for_several_scales_skips_what_is_finished(job, capsys):
     assert main(["adapt", str(job.base.checkpoint), *options, "--scale", "1/4", "--json"]) == 0
     reports = json.loads(capsys.readouterr().out)
     assert [report["scale"] for report in reports] == [0.5, 0.25]
+
+
+def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt("interrupted")
+        yield
+
+    monkeypatch.setattr(run, "adapt_all_in_tiles", interrupted)
+    options = ["adapt", str(job.base.checkpoint), "--steps", "0", "--backend", "reference", "--tiles", "2", "--scale", "1/2"]
+    two = ["--scale", "1/4"]
+    for further, again in (([], "again to go on"), (two, "again to go on"), ([*two, "--overwrite"], "with --skip-existing")):
+        assert main([*options, *further]) == 130
+        assert again in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

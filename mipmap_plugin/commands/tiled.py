@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.many import Many, Request, engine, of_scene
@@ -21,30 +21,40 @@ if TYPE_CHECKING:
 
 def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base, threads: int | None, json: bool) -> None:
     """Adapt one checkpoint to each scale and viewer in tiles. Raises SettingsError before any work, JobsFailed."""
-    from mipmap_plugin.jobs.finished import finished
     from mipmap_plugin.tiles.run import adapt_all_in_tiles
 
     if many.tiles is None or many.is_list(given) or many.shard is not None:
         raise SettingsError("--tiles cuts one checkpoint; give that one, without --list and --shard")
     if many.send_files:
         raise SettingsError("--tiles needs a folder that all workers see, so that files are not sent; leave --send-files out")
+
     def run(jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
         return engine(many, jobs, threads)
 
-    jobs, reports = _jobs(given[0], request, base), {}
+    jobs = _jobs(given[0], request, base)
     skip = many.skip_existing or (len(jobs) > 1 and not request.overwrite)  # as in a list
-    before = {str(job.target): found for job in jobs if skip and (found := finished(job))}
-    for target, (file, facts) in before.items():
-        reports[target] = {"file": str(file), **facts}
-        if not json:
-            say(f"{file}: finished before")
-    left = [job for job in jobs if str(job.target) not in before]
-    for job, joined in zip(left, adapt_all_in_tiles(left, many.tiles, run, threads), strict=True):
-        reports[str(job.target)] = {"file": str(joined.file), **joined.facts()}
-        if not json:
-            _say(job, many.tiles, joined)
+    reports = _finished(jobs, json) if skip else {}
+    left = [job for job in jobs if job.target not in reports]
+    try:
+        for job, joined in zip(left, adapt_all_in_tiles(left, many.tiles, run, threads), strict=True):
+            reports[job.target] = {"file": str(joined.file), **joined.facts()}
+            if not json:
+                _say(job, many.tiles, joined)
+    except KeyboardInterrupt as interrupt:
+        again = " with --skip-existing" if len(jobs) > 1 and not skip else ""
+        raise KeyboardInterrupt(f"interrupted; run the same command again{again} to go on where it stopped") from interrupt
     if json:
-        print_facts([reports[str(job.target)] for job in jobs], json)
+        print_facts([reports[job.target] for job in jobs], json)
+
+
+def _finished(jobs: Sequence[Job], json: bool) -> dict[Path, dict[str, Any]]:
+    """The reports of what is finished already, by the target, from the hash of the base's file alone: the base may not fit into memory."""
+    from mipmap_plugin.jobs.finished import finished
+
+    found = {job.target: before for job in jobs if (before := finished(job, may_load=False))}
+    for file, _ in found.values() if not json else ():
+        say(f"{file}: finished before")
+    return {target: {"file": str(file), **facts} for target, (file, facts) in found.items()}
 
 
 def _jobs(checkpoint: Path, request: Request, base: Base) -> list[Job]:

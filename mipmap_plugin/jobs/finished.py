@@ -24,12 +24,12 @@ from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.splatting.viewers import viewers_for
 
 
-def finished(job: Job) -> tuple[Path, dict[str, Any]] | None:
-    """The checkpoint that the job would make, and its report, if they are there already; None if not."""
+def finished(job: Job, *, may_load: bool = True) -> tuple[Path, dict[str, Any]] | None:
+    """The checkpoint that the job would make, and its report, if they are there already; None if not. may_load: see `_digest`."""
     for file, report in _outputs(job.target):
         provenance = _in_header(file) or report
         same = _is_requested(provenance, job) and provenance.get("inputs") == _inputs(job)
-        if same and provenance.get("base") == _digest(job, provenance.get("base")):
+        if same and provenance.get("base") == _digest(job, provenance.get("base"), may_load):
             return file, report
     return None
 
@@ -77,7 +77,7 @@ def _inputs(job: Job) -> dict[str, str]:
     return job.base.asked() | ({} if job.images is None else {"photographs": load_scene(job.images).digest()})
 
 
-def _digest(job: Job, wanted: Any) -> str:
-    """The hash of the base checkpoint: of its file where that is `wanted`, otherwise as its family computes it, which loads all of it."""
+def _digest(job: Job, wanted: Any, may_load: bool) -> str:
+    """The hash of the base checkpoint: of its file where that is `wanted`, otherwise, if it may be loaded, as its family computes it."""
     digest = sha256(detect(job.base.checkpoint).path)
-    return digest if digest == wanted else job.base.load().model.digest
+    return digest if digest == wanted or not may_load else job.base.load().model.digest

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,12 +59,23 @@ class Pictures:
 
 def write_pictures(path: Path, pictures: Iterable[Picture]) -> None:
     """Write pictures of the types of `KINDS` as they come, atomically; an old file is replaced. Raises OutputError."""
+    with new_pictures(path) as write:
+        for picture in pictures:
+            write(*picture)
+
+
+@contextmanager
+def new_pictures(path: Path) -> Iterator[Callable[[str, Tensor, Box | None], None]]:
+    """What writes pictures, as `write_pictures`; the file is there when the block succeeds."""
     names = {kind: name for name, kind in KINDS.items()}
     table = {}
     with new_file(path, overwrite=True) as temporary, temporary.open("wb") as file:
-        for name, picture, box in pictures:
+
+        def write(name: str, picture: Tensor, box: Box | None) -> None:
             table[name] = (file.tell(), list(picture.shape), names[picture.dtype], box)
             file.write(picture.contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+
+        yield write
         start = file.tell()
         file.write(json.dumps(table).encode())
         file.write(END.pack(start))

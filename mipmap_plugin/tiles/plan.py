@@ -23,6 +23,9 @@ from mipmap_plugin.tiles.scene import find_splats, make_cut
 # What the folder's tiles belong to.
 PLAN = "plan.json"
 
+# Of the folder's files: those of another format are not gone on with.
+FORMAT = 2
+
 
 def refuse(job: Job, tiles: int) -> None:
     """Raise SettingsError for what cannot be done in tiles."""
@@ -46,12 +49,15 @@ def claim(jobs: Sequence[Job], tiles: int) -> None:
 
     Raises SettingsError, before any is made, if one holds those of others; CheckpointError, SceneError.
     """
+    if any(job.base != jobs[0].base for job in jobs) or len({job.target for job in jobs}) < len(jobs):
+        raise SettingsError("tiles of several jobs are those of one base, each with an output of its own; adapt other bases one after the other")
     digest = sha256(find_splats(jobs[0].base.checkpoint)[0].path)
     plans = {work_folder(job.target): _plan(job, tiles, digest) for job in jobs}
     for folder, plan in plans.items():
         if (folder / PLAN).exists():
             if read_json(folder / PLAN) != json.loads(json.dumps(plan)):
-                raise SettingsError(f"{folder} holds tiles of another base, settings or number of tiles; repeat those, or delete it to start anew")
+                others = "tiles of another base, settings or number of tiles, or of another version"
+                raise SettingsError(f"{folder} holds {others}; repeat those, or delete it to start anew")
         elif folder.exists() and any(folder.iterdir()):
             raise SettingsError(f"{folder} is needed for the tiles, but holds other things; move it, or choose another output")
     for folder, plan in plans.items():
@@ -62,7 +68,7 @@ def claim(jobs: Sequence[Job], tiles: int) -> None:
 def _plan(job: Job, tiles: int, digest: str) -> dict[str, Any]:
     """Everything that the tiles of a job depend on."""
     return {
-        "base": digest, "tiles": tiles, "scale": job.scale, "viewer": job.viewer, "settings": job.config().model_dump(mode="json"),
+        "format": FORMAT, "base": digest, "tiles": tiles, "scale": job.scale, "viewer": job.viewer, "settings": job.config().model_dump(mode="json"),
         "inputs": job.base.asked(), "backend": job.base.backend,
     }  # fmt: skip
 

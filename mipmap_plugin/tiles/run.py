@@ -36,6 +36,7 @@ from mipmap_plugin.tiles.truth import parts
 # Does jobs, and yields the outcome of each: an engine of `mipmap_plugin.jobs`.
 Engine = Callable[[Sequence[Job]], Generator[Outcome, None, None]]
 
+
 @dataclass(frozen=True)
 class Joined:
     """A scene that was adapted in tiles."""
@@ -137,7 +138,7 @@ def _adapted(scene: TiledScene, folder: Path, do: _Stages) -> list[dict[str, Any
         number += 1
         sweep, state = sweep_of(scene, folder, number), Steered.before(folder, number)
         _forget(scene, folder, sweep, state, number)
-        if scene.config.target_db is not None and state.best_db >= scene.config.target_db:
+        if scene.config.target_db is not None and state.psnr >= scene.config.target_db:
             break
     return facts
 
@@ -145,15 +146,15 @@ def _adapted(scene: TiledScene, folder: Path, do: _Stages) -> list[dict[str, Any
 def _forget(scene: TiledScene, folder: Path, sweep: Sweep | None, state: Steered, made: int) -> None:
     """Make room on the disk: of what `made` sweeps left, only what the next one, `sweep`, goes on with is needed."""
     kept = {state.file(folder, tile) for tile in range(len(scene.cores))}
-    for file in folder.glob("tile_*.splats"):
-        if file not in kept:
+    for number in range(made):  # and nothing of later sweeps, which an interrupted run has begun
+        unneeded = {*folder.glob(f"tile_{number}_*.splats")} - kept
+        if sweep is None or number < sweep.halos:
+            unneeded |= {*folder.glob(f"layer_{number}_*.pictures"), *folder.glob(f"halo_{number}_*.pictures")}
+        for file in unneeded:
             file.unlink()
     for number in set(range(made - 1)) - {state.sweep}:
         for tile in range(len(scene.cores)):
             run_file(folder, tile, number).write_bytes(b"")  # which still says that the tile was done
-    if sweep is None or not sweep.repeats:
-        for file in (*folder.glob("layer_*.pictures"), *folder.glob("halo_*.pictures")):
-            file.unlink()
 
 
 def _write_parts(scene: TiledScene, folder: Path, returned: str) -> list[Path]:

@@ -191,7 +191,7 @@ class TiledScene:
         return [*views_of(self.views.adapted, self.config, 0, self.config.steps), *self.views.steering, *self.views.choosing]
 
     def at(self, scale: float, config: AdaptConfig) -> TiledScene:
-        """The same scene at another scale: its views, and the base that they show. It shares this one's memory."""
+        """The same scene at another scale, for its truths only: its views, and the base that they show. It shares this one's memory."""
         other = copy(self)
         other.scale, other.config = scale, config
         for name in ("views", "sweeps", "used_views"):

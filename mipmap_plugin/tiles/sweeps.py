@@ -25,8 +25,8 @@ class Sweep:
     number: int  # of all that are made
     first: int  # steps before it
     checks: tuple[int, ...]  # the steps after which the scene is checked; with the last of them, the sweep ends
-    planned: int = 0  # which of a run's sweeps it is
-    halos: int = 0  # the number of the sweep whose pictures it is drawn with: its own, unless it repeats a part of another
+    planned: int  # which of a run's sweeps it is
+    halos: int  # the number of the sweep whose pictures it is drawn with: its own, unless it repeats a part of another
     repeats: int = 0  # how often that one was repeated, this time included
 
     @property

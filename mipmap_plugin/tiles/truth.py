@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from mipmap_plugin.adaptation.target.image_store import MOST, STEPS
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.tiles.folder import truth_file
-from mipmap_plugin.tiles.pictures import Album, Picture, write_pictures
+from mipmap_plugin.tiles.pictures import Album, new_pictures
 from mipmap_plugin.tiles.scene import TiledScene
 
 # Views of a file, which one job draws.
@@ -38,13 +39,12 @@ def draw_truths(scene: TiledScene, part: int, folder: Path, others: Sequence[tup
     """
     views = part_of(scene.used_views, part)
     sharing = [(scene, folder), *(other for other in others if _shares(scene, other[0], part))]
-    truths: list[list[Picture]] = [[] for _ in sharing]
-    for view in views:
-        image = draw_base(scene, view)
-        for (each, _), pictures in zip(sharing, truths, strict=True):
-            pictures.append((view.name, in_16_bits(resized(each, view, image)), None))
-    for (_, each_folder), pictures in reversed([*zip(sharing, truths, strict=True)]):  # its own last, which says that all are there
-        write_pictures(truth_file(each_folder, part), pictures)
+    with ExitStack() as files:  # the first file, its own, is closed last: it says that all are there
+        writers = [(each, files.enter_context(new_pictures(truth_file(of, part)))) for each, of in sharing]
+        for view in views:
+            image = draw_base(scene, view)
+            for each, write in writers:
+                write(view.name, in_16_bits(resized(each, view, image)), None)
 
 
 def _shares(scene: TiledScene, other: TiledScene, part: int) -> bool:

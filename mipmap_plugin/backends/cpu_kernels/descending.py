@@ -46,7 +46,7 @@ def activated(raw: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
     """The activated splats of raw parameters, by the names of `Gaussians`. They share means and coefficients with these."""
     given = _arrays(raw)
     splats = given._replace(quats=np.empty_like(given.quats), scales=np.empty_like(given.scales), opacities=np.empty_like(given.opacities))
-    team(len(given.means)).share(adam.activate_rows, len(given.means), given, splats)
+    team(len(given.means)).share(adam.activate_rows, len(given.means), given, splats, of_rows=True)
     return {name: array for name, array in splats._asdict().items() if name != "covariances"}
 
 

@@ -48,8 +48,8 @@ class Projected(NamedTuple):
 
 def tile_lists(views: Sequence[Projected], team: Team) -> list[Lists]:
     """Each tile's splats and their slots, of each view, not yet sorted by depth."""
-    splats = len(views[0].order)
-    runs = 1 if team.threads == 1 else max(team.threads, min(RUNS_PER_THREAD * team.threads, splats // threads.LEAST_ROWS))
+    count = len(views[0].order)
+    runs = 1 if team.threads == 1 else max(team.threads, min(RUNS_PER_THREAD * team.threads, count // threads.LEAST_ROWS))
     written = []
     for _, _, slots, (height, width) in views:
         tiles_x, tiles_y = binning.tile_grid(width, height)

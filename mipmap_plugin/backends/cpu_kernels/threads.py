@@ -57,7 +57,7 @@ class Team:
         threads.team(work, self.threads)
 
     def _ranges(self, thread: int, counts: Sequence[int], least: int) -> Iterator[tuple[int, int, int]]:
-        """What a thread begins with: the job, the start and the stop of each of its chunks, the smallest last."""
+        """What a thread begins with: the job, the start and the stop of each of its chunks, each at most half of what is left."""
         parts = [(count * thread // self.threads, count * (thread + 1) // self.threads) for count in counts]
         left = sum(last - first for first, last in parts)
         min_chunk = max(least, int(sum(counts) * MIN_CHUNK_SHARE))

@@ -27,12 +27,12 @@ def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarr
     count, (height, width) = len(splats.means), camera.size
     table, depths, counts, slots = empty(count, layout.SPLAT_FIELDS), empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
     threads, flags = team(count + width * height), flags_of(view, splats)
-    threads.share(projection.project, count, flags, view, splats, table, depths, counts)
+    threads.share(projection.project, count, flags, view, splats, table, depths, counts, of_rows=True)
     np.cumsum(counts, out=slots[1:])
     [lists] = sorting.tile_lists([sorting.Projected(table, depths if ranks is None else ranks, slots, camera.size)], threads)
     by_pair, by_splat = empty(len(lists.members)), empty(count)
     threads.share(weigh_tiles, len(lists.starts) - 1, flags.integrated, limits, table, lists, (width, height), by_pair)
-    threads.share(sum_pairs, count, slots, by_pair, by_splat)
+    threads.share(sum_pairs, count, slots, by_pair, by_splat, of_rows=True)
     return by_splat
 
 
