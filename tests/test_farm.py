@@ -25,9 +25,9 @@ def farm(tmp_path, monkeypatch):
     environment = saving_often(tmp_path / "site")
     file, started = tmp_path / "scheduler.json", []
 
-    def start(kind, *words):
+    def start(kind, *words, **variables):
         command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--scheduler-file", str(file), *words]
-        started.append(subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+        started.append(subprocess.Popen(command, env=environment | variables, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
         return started[-1]
 
     start.file = file
@@ -43,7 +43,7 @@ def test_a_killed_worker_loses_one_job_which_is_resumed(farm, tmp_path):
 
     farm("scheduler", "--port", "0", "--no-dashboard")
     address = json.loads(wait_until(lambda: farm.file.exists() and farm.file.read_text()))["address"]
-    settings = {"steps": 300, "seed": 0, "views": "given", "check_every": 5}
+    settings = {"steps": 1500, "seed": 0, "views": "given", "check_every": 5}
     bases = [tiny.folder(tmp_path / f"base_{seed}", tiny.cameras(3), seed=seed) for seed in range(3)]
     jobs = [Job(Base(base, backend="reference"), tmp_path / f"{base.name}.ply", 0.5, recipe="paper", settings=settings) for base in bases]
     with ThreadPoolExecutor(1) as pool:
@@ -62,6 +62,25 @@ def test_a_killed_worker_loses_one_job_which_is_resumed(farm, tmp_path):
     assert resumed.report["curve"][: len(saved["curve"])] == saved["curve"]  # its seconds too: these steps were not done again
     again = run(replace(jobs[0], target=tmp_path / "again.ply"), 1)
     assert again.file.read_bytes() == jobs[0].target.read_bytes()
+
+
+@pytest.mark.slow
+def test_a_job_that_dask_gives_up_is_handed_out_again(farm, tmp_path):
+    from mipmap_plugin.jobs.farm import on_dask
+
+    farm("scheduler", "--port", "0", "--no-dashboard", DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
+    address = json.loads(wait_until(lambda: farm.file.exists() and farm.file.read_text()))["address"]
+    settings = {"steps": 300, "seed": 0, "views": "given", "check_every": 5}
+    base = Base(tiny.folder(tmp_path / "base", tiny.cameras(3)), backend="reference")
+    job = Job(base, tmp_path / "out.ply", 0.5, recipe="paper", settings=settings)
+    with ThreadPoolExecutor(1) as pool:
+        outcomes = pool.submit(lambda: list(on_dask([job], address, threads=1)))
+        victim = farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        wait_until(lambda: next(iter(tmp_path.glob("*.resume")), None))
+        victim.kill()
+        farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+        [outcome] = outcomes.result(timeout=300)
+    assert outcome.status == "done" and job.target.exists()
 
 
 @pytest.mark.slow

@@ -12,12 +12,12 @@ import re
 import signal
 import threading
 import uuid
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-from distributed import Client, Event, Future, LocalCluster, as_completed
+from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
 
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.jobs.engines import usable_threads, with_interrupted
@@ -31,6 +31,10 @@ PERIOD_S, CONNECT_S = 1.0, 20.0
 
 # Jobs whose files are sent at a time.
 SENT_PER_WORKER = 2
+
+# How often a job is handed out that dask gives up, as it does when four workers died while they did it. It goes on from its state, and what
+# takes too much memory ends our worker, not dask's: so these are workers that others ended, as clouds and batch systems do.
+HANDED_OUT = 5
 
 _mine = threading.local()
 
@@ -58,11 +62,21 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
             for first in range(0, len(jobs), together):  # files that are sent wait in the workers' memory, so that not all are sent at once
                 done, todo = _sent(jobs[first : first + together], client) if send_files else ([], [(job, job) for job in jobs])
                 yield from done
-                futures = {submit(sent): job for job, sent in todo}
-                for future in with_interrupted(list(futures), as_completed, stop.set):
-                    yield _outcome(future, futures[future])
+                yield from _outcomes(todo, submit, stop.set)
         finally:
             stop.set()
+
+
+def _outcomes(todo: Sequence[tuple[Job, Any]], submit: Callable[[Any], Future[Any]], stop: Callable[[], None]) -> Generator[Outcome, None, None]:
+    """The outcomes of jobs, each with what is sent of it. Those that dask gives up are handed out again, once the others are done."""
+    for left in reversed(range(HANDED_OUT)):
+        futures, lost = {submit(sent): (job, sent) for job, sent in todo}, []
+        for future in with_interrupted(list(futures), as_completed, stop):
+            if left and future.status == "error" and isinstance(future.exception(), KilledWorker):
+                lost.append(futures[future])
+            else:
+                yield _outcome(future, futures[future][0])
+        todo = lost
 
 
 def _sent(jobs: Sequence[Job], client: Client) -> tuple[list[Outcome], list[tuple[Job, Any]]]:
