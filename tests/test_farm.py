@@ -1,6 +1,8 @@
 """Jobs on dask.distributed: a real scheduler and real worker processes, one of which is killed in the middle of a job."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -92,6 +94,29 @@ def test_workers_of_this_machine(tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_a_worker_that_dies_while_it_starts_is_replaced(monkeypatch):
+    from distributed import Nanny
+
+    from mipmap_plugin.jobs import farm
+
+    monkeypatch.setattr(farm, "LOOK_S", 0.2)
+    monkeypatch.setitem(farm.LOCAL, "distributed.deploy.lost-worker-timeout", "1 s")
+    instantiate = Nanny.instantiate
+    with farm._connected("local:2") as client, farm._kept_workers(client, "local:2"):
+
+        async def dies(nanny):
+            monkeypatch.setattr(Nanny, "instantiate", instantiate)  # the next one lives
+            await nanny.close()
+            raise RuntimeError
+
+        first = next(iter(client.cluster.workers.values()))
+        monkeypatch.setattr(Nanny, "instantiate", dies)
+        os.kill(first.pid, signal.SIGKILL)
+        wait_until(lambda: Nanny.instantiate is instantiate and first not in client.cluster.workers.values())
+        wait_until(lambda: len(client.scheduler_info(n_workers=-1)["workers"]) == 2)
+
+
+@pytest.mark.slow
 def test_files_that_are_sent_come_back_adapted(tmp_path):
     from mipmap_plugin.jobs.farm import on_dask
 
@@ -116,6 +141,17 @@ def test_a_checkpoint_that_cannot_be_sent_fails_alone(tmp_path):
     assert [job for job, _ in sent] == [jobs[1]]
     assert [outcome.status for outcome in outcomes] == ["failed"] * 2
     assert "nowhere does not exist" in outcomes[0].reason and "exists already" in outcomes[1].reason
+
+
+def test_that_no_worker_is_there_is_said_once(monkeypatch, capsys):
+    from mipmap_plugin.jobs import farm
+
+    looks = []
+    client = SimpleNamespace(cluster=None, scheduler_info=lambda n_workers: looks.append(n_workers) or {"workers": {}})
+    monkeypatch.setattr(farm, "LOOK_S", 0.001)
+    with farm._kept_workers(client, "tcp://somewhere:8786"):
+        wait_until(lambda: len(looks) > 4)
+    assert capsys.readouterr().err.count("there are no workers") == 1
 
 
 @pytest.mark.parametrize("place", ["tcp://127.0.0.1:1", "local:0", "nonsense"])

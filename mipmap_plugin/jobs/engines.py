@@ -6,10 +6,13 @@ import os
 import queue
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.worker import Worker, do
+from mipmap_plugin.models import detect
 
 Futures = Iterable[Any]  # of the standard library or of dask
 
@@ -28,6 +31,7 @@ def in_workers(jobs: Sequence[Job], count: int, threads: int | None = None) -> G
     Ctrl-C lets every running job save its state, and begins no other; a second one ends them at once. What was registered in this
     process at run time is unknown in others; register it by an entry point.
     """
+    jobs = longest_first(jobs)
     workers = [Worker(max(1, (threads or usable_threads()) // count)) for _ in range(min(count, len(jobs)))]
     free: queue.SimpleQueue[Worker] = queue.SimpleQueue()
     for worker in workers:
@@ -68,6 +72,22 @@ def with_interrupted(futures: Futures, as_completed: Callable[[Futures], Futures
         stop()
         yield from as_completed([future for future in pending if not future.cancelled()])
         raise
+
+
+def longest_first(jobs: Sequence[Job]) -> list[Job]:
+    """The jobs in the order in which several workers do them: behind a long one that comes last, all but one have nothing to do.
+
+    What a job takes is guessed by the bytes of its checkpoint and its scale, which it grows with.
+    """
+    return sorted(jobs, key=lambda job: -size_of(job.base.checkpoint) * job.scale)
+
+
+def size_of(checkpoint: Path) -> int:
+    """The bytes of the file with a checkpoint's splats; 0 where there is none, which its job then says."""
+    try:
+        return detect(checkpoint).path.stat().st_size
+    except (MipmapPluginError, OSError):
+        return 0
 
 
 def usable_threads() -> int:

@@ -13,21 +13,31 @@ import signal
 import threading
 import uuid
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
+import dask
 from distributed import Client, Event, Future, KilledWorker, LocalCluster, as_completed
 
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
-from mipmap_plugin.jobs.engines import usable_threads, with_interrupted
+from mipmap_plugin.jobs.engines import longest_first, usable_threads, with_interrupted
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.parcel import Delivery, Parcel, do_parcel, pack, unpack
 from mipmap_plugin.jobs.worker import Worker, do
+from mipmap_plugin.progress import note
 
-# Seconds between two looks at whether jobs are to stop; to reach a scheduler.
-PERIOD_S, CONNECT_S = 1.0, 20.0
+# Seconds between two looks at whether jobs are to stop; to reach a scheduler; between two looks at whether there are workers.
+PERIOD_S, CONNECT_S, LOOK_S = 1.0, 20.0, 10.0
+
+# Of workers on this machine, whose cores have to do the work: dask takes no samples of what its workers wait for, looks at its clock twice and not
+# fifty times a second, and gives no worker a second job before the first has ended.
+LOCAL: dict[str, Any] = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500 ms",
+    "distributed.scheduler.worker-saturation": 1.0,
+}
 
 # Jobs whose files are sent at a time.
 SENT_PER_WORKER = 2
@@ -47,7 +57,8 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
     takes one.
     Ctrl-C lets every running job save its state, and begins no other. Raises SettingsError for a place where there is no scheduler.
     """
-    with _connected(place) as client:
+    jobs = longest_first(jobs)
+    with _connected(place) as client, _kept_workers(client, place):
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         needs = {"GPU": 1} if any("GPU" in worker.get("resources", {}) for worker in workers) else None
         share = max(1, (threads or usable_threads()) // len(workers)) if place.startswith("local:") else threads
@@ -128,7 +139,7 @@ def _outcome(future: Future[Outcome | Delivery], job: Job) -> Outcome:
 def _connected(place: str) -> Iterator[Client]:
     """A client of the scheduler at `place`, or of a new one on this machine."""
     if match := re.fullmatch(r"local:([1-9]\d*)", place):
-        with _without_interrupts():
+        with _without_interrupts(), dask.config.set(LOCAL):
             cluster = LocalCluster(
                 n_workers=int(match[1]), threads_per_worker=1, memory_limit=0, dashboard_address=":0", silence_logs=logging.CRITICAL
             )
@@ -141,6 +152,33 @@ def _connected(place: str) -> Iterator[Client]:
         raise SettingsError(f"--dask {place}: no scheduler answers there ({error}); give tcp://HOST:8786, or local:4 for four workers here") from None
     with client:
         yield client
+
+
+@contextmanager
+def _kept_workers(client: Client, place: str) -> Iterator[None]:
+    """Inside, a line says when there are no workers, at two looks in a row; those of this machine are replaced, also where dask does not.
+
+    It does not where one dies while it starts, as in place of one that died.
+    """
+    ended = threading.Event()
+
+    def watch() -> None:
+        looks = 0
+        while not ended.wait(LOOK_S):
+            if client.cluster is not None:
+                client.cluster.scale(len(client.cluster.worker_spec))
+            with suppress(OSError):  # a scheduler that cannot be reached now is found again, or ends the jobs
+                looks = 0 if client.scheduler_info(n_workers=1)["workers"] else looks + 1
+                if looks == 2:
+                    note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this command, and loses nothing")
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
 
 
 @contextmanager

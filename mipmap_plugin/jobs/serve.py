@@ -18,6 +18,7 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import replace
 from typing import IO
 
+from mipmap_plugin.freed_memory import keep_freed_memory
 from mipmap_plugin.jobs.job import Job, Outcome
 
 Request = tuple[Job, "int | None"]
@@ -25,6 +26,7 @@ Request = tuple[Job, "int | None"]
 
 def main() -> None:
     signal.signal(signal.SIGINT, _leave)
+    keep_freed_memory()  # also in workers of dask, whose environment asks for the opposite
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints must not mix with the answers
     requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
