@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TypeVar
 
 from tqdm import tqdm
@@ -41,11 +41,27 @@ def note(line: str) -> None:
 @contextmanager
 def announced(what: str) -> Iterator[None]:
     """Show `what` and its seconds on standard error while the block runs, once it has taken a second; nothing where that is no terminal."""
-    if not sys.stderr.isatty():
+    with _meanwhile(lambda ended: _show(what, ended)) if sys.stderr.isatty() else nullcontext():
         yield
-        return
+
+
+@contextmanager
+def ticking(bar: tqdm) -> Iterator[None]:
+    """Let the clock of a bar go on while the block runs, also where a step takes long."""
+
+    def refresh(ended: threading.Event) -> None:
+        while not ended.wait(PATIENCE):
+            bar.refresh()
+
+    with nullcontext() if bar.disable else _meanwhile(refresh):
+        yield
+
+
+@contextmanager
+def _meanwhile(show: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Call `show` in a thread of its own, which is to return when the event is set: at the end of the block."""
     ended = threading.Event()
-    clock = threading.Thread(target=_show, args=(what, ended), daemon=True)
+    clock = threading.Thread(target=show, args=(ended,), daemon=True)
     clock.start()
     try:
         yield

@@ -36,6 +36,7 @@ STOREYS = [
 # Where each outside library may be imported; torch and the standard library may be anywhere.
 CONFINED = {
     "PIL": ["formats/images.py"],
+    "dask": ["jobs/farm.py"],
     "distributed": ["jobs/farm.py"],
     "gsplat": ["backends/gsplat"],
     "llvmlite": ["backends/cpu_kernels/"],
@@ -156,7 +157,7 @@ def test_outside_libraries_stay_in_their_modules(path):
 
 def test_importing_the_package_loads_nothing_optional():
     optional = ["numba", "llvmlite", "gsplat", "triton", "matplotlib", "pycolmap", "pytest", "skimage", "tyro"]
-    optional += ["distributed", "spandrel", "safetensors", "lpips", "torchvision", "viser"]
+    optional += ["dask", "distributed", "spandrel", "safetensors", "lpips", "torchvision", "viser"]
     code = f"import sys, mipmap_plugin; print([name for name in {optional} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"

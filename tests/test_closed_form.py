@@ -231,7 +231,7 @@ def test_a_splat_that_a_viewer_would_cull_is_seen():
 def test_parts_that_threads_share_make_the_same_whole(monkeypatch):
     g, views = samples.gaussians(70), [samples.camera()]
     whole = closed_form(g, views, 1 / 4, Effects(1), Effects(1))
-    monkeypatch.setattr("mipmap_plugin.adaptation.start.closed_form.CHUNK", 16)
+    monkeypatch.setattr("mipmap_plugin.adaptation.parallel.CHUNK", 16)
     with threads.limited(3, shared=True):
         parts = closed_form(g, views, 1 / 4, Effects(1), Effects(1))
     assert all(torch.equal(part, each) for part, each in zip(parts, whole, strict=True))

@@ -9,6 +9,7 @@ import torch
 from tiny import cameras
 from tiny import model as tiny_model
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.start.merging import MAX_DISTANCE, merge
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
@@ -51,6 +52,19 @@ def test_optical_depth_times_surface_stays():
     pair = cloud(2)
     pair = replace(pair, means=torch.full((2, 3), 0.1), scales=torch.full((2, 3), 0.01), opacities=torch.tensor([0.3, 0.6]))
     torch.testing.assert_close(merged(pair, 0.5).opacities, torch.tensor([1 - 0.7 * 0.4]))  # one behind the other, of the same shape
+
+
+def test_merging_is_the_same_on_any_number_of_threads(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.adaptation.parallel.CHUNK", 16)
+    many = cloud(100)
+    many = replace(many, sh=0.3 + 0.01 * torch.rand(many.sh.shape, generator=torch.Generator().manual_seed(1)))
+
+    def on(count: int) -> Gaussians:
+        with threads.limited(count, shared=True):
+            return merged(many, 0.5, pixel=0.1)
+
+    one, three = on(1), on(3)
+    assert len(one) == 50 and all(torch.equal(getattr(one, name), getattr(three, name)) for name in ("means", "quats", "scales", "opacities", "sh"))
 
 
 def test_a_splat_that_is_alone_stays_what_it_is_bit_by_bit():

@@ -9,6 +9,8 @@ import pytest
 import tiny
 import torch
 from anchor_checkpoints import write
+from running import wait_until
+from tqdm import tqdm
 
 from mipmap_plugin import progress, threads
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -121,3 +123,15 @@ def test_long_work_is_announced_on_a_terminal_alone(terminal, patience, line, mo
     with progress.announced("merging x0.25"):
         time.sleep(0.2 if patience < 1 else 0)
     assert line in errors.getvalue() and bool(errors.getvalue()) == bool(line)
+
+
+def test_the_clock_of_a_bar_goes_on_while_nothing_is_counted(monkeypatch):
+    monkeypatch.setattr(progress, "PATIENCE", 0.01)
+    errors = Terminal()
+    with tqdm(total=2, file=errors) as bar, progress.ticking(bar):
+        shown = errors.getvalue()
+        wait_until(lambda: errors.getvalue() != shown)
+    silent = io.StringIO()
+    with tqdm(total=2, file=silent, disable=None) as bar, progress.ticking(bar):
+        time.sleep(0.05)
+    assert not silent.getvalue()

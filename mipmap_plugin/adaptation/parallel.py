@@ -1,13 +1,20 @@
-"""The choice between rendering views in parallel, in one call, and one after the other, and of threads for torch."""
+"""The choice between rendering views in parallel, in one call, and one after the other, and of threads for torch and for rows."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from typing import TypeVar
 
 from torch import Tensor
 
 from mipmap_plugin import threads
 from mipmap_plugin.camera import Camera
+
+Result = TypeVar("Result")
+
+# Rows that a processor computes together, in bounded memory.
+CHUNK = 1 << 16
 
 # Splats plus pixels of a view. Larger views are rendered one after the other: the kernels' own threads are as fast there, and only one view
 # needs memory at a time.
@@ -35,3 +42,11 @@ def views_at_once(camera: Camera) -> int:
 def large_for_torch(means: Tensor) -> AbstractContextManager[None]:
     """Inside, torch has all threads if the splats with these `means` [N, 3] are many."""
     return threads.lent_to_torch() if means.device.type == "cpu" and len(means) >= LARGE_FOR_TORCH else nullcontext()
+
+
+def in_chunks(function: Callable[[slice], Result], rows: Tensor) -> list[Result]:
+    """`function(chunk)` for all chunks of the `rows`, in their order: computed in parallel on a processor, all rows at once elsewhere."""
+    on_cpu, count = rows.device.type == "cpu", max(1, len(rows))
+    size = CHUNK if on_cpu else count
+    chunks = [slice(start, start + size) for start in range(0, count, size)]
+    return list(threads.side_by_side(function, chunks, threads.for_views() if on_cpu else 1))

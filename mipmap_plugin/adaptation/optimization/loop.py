@@ -21,6 +21,7 @@ from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.progress import ticking
 from mipmap_plugin.threads import side_by_side
 
 # The square of half a step of an 8-bit image: smaller mean square differences are invisible on a display, and hardly count.
@@ -43,7 +44,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     checks = [step for step in range(1, config.steps + 1) if is_checked(step, config)]
     forecast, began = Forecast(order, config, checks, run.step), run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
-    with bar, interruptible() as interrupted:
+    with bar, ticking(bar), interruptible() as interrupted:
         reason = STOPPED if observe(run) is True else reason_to_stop(run.curve, run.watch.seconds, config)
         while reason is None and run.step < config.steps:
             with run.watch:

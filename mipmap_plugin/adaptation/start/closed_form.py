@@ -32,14 +32,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin import threads
+from mipmap_plugin.adaptation.parallel import in_chunks
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant, widened_to_filter
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.filters import INTEGRALS, SQUARE_VARIANCE, compensates, footprint, widening
 from mipmap_plugin.splatting.projection import Projected, axes_of, project
-from mipmap_plugin.threads import side_by_side
 
 # Target pixels: the minimum scale of an axis. At 1/50 of the classic dilation's width it is invisible, and its logarithm is finite.
 MIN_AXIS = 0.01
@@ -53,9 +52,6 @@ CULL_MARGIN = 2.0
 
 # Number of views from which the distance and the area of a splat are computed; more views make no difference at this accuracy.
 MAX_VIEWS = 12
-
-# Splats that a processor computes together, in bounded memory.
-CHUNK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -75,15 +71,9 @@ def closed_form(
     """
     if filter_suffices(scale, base, target):
         return gaussians.scales, gaussians.opacities
-    views, count = every_nth(views, MAX_VIEWS), len(gaussians)
-    on_cpu = gaussians.means.device.type == "cpu"
-    size = CHUNK if on_cpu else max(1, count)
-
-    def formed(start: int) -> tuple[Tensor, Tensor]:
-        return _form(gaussians[start : start + size], views, scale, (base, target), form)
-
-    starts = range(0, max(1, count), size)
-    scales, opacities = zip(*side_by_side(formed, starts, threads.for_views() if on_cpu else 1), strict=True)
+    views = every_nth(views, MAX_VIEWS)
+    formed = in_chunks(lambda chunk: _form(gaussians[chunk], views, scale, (base, target), form), gaussians.means)
+    scales, opacities = zip(*formed, strict=True)
     return torch.cat(scales), torch.cat(opacities)
 
 
@@ -156,6 +146,11 @@ def pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
     Of many views only `MAX_VIEWS` are used, evenly spread.
     """
     views = every_nth(views, MAX_VIEWS)
+    return torch.cat(in_chunks(lambda chunk: _pixel_size(means[chunk], views), means))
+
+
+def _pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
+    """`pixel_size` of some of the means, in all views."""
     finest, anywhere = (torch.full_like(means[:, 0], torch.inf) for _ in range(2))
     for view in views:
         x, y, z = view.to_camera(means).unbind(-1)

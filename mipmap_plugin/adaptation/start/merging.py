@@ -16,6 +16,8 @@ from itertools import count as count_from
 import torch
 from torch import Tensor
 
+from mipmap_plugin import threads
+from mipmap_plugin.adaptation.parallel import CHUNK, in_chunks
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.eigen import eigh3
@@ -52,9 +54,6 @@ CELL_RANGE = 2**19
 
 # (shift, mask): each step moves bits apart, until two zeros follow every bit.
 SPREADS = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249))
-
-# Rows whose harmonics are averaged together, so that no second copy of all of them is made.
-CHUNK = 1 << 16
 
 # Opacities stay below 1, whose logit is infinite.
 MAX_OPACITY = 0.999
@@ -131,12 +130,19 @@ class _Moments:
     @classmethod
     def of(cls, gaussians: Gaussians, pixel: Tensor, weights: Tensor) -> _Moments:
         """The moments of `gaussians`, whose blend weights are `weights` [N]."""
+        parts = in_chunks(lambda chunk: cls._of_chunk(gaussians[chunk], pixel[chunk], weights[chunk]), gaussians.means)
+        covariances, depth, color, weights = map(torch.cat, zip(*parts, strict=True))
+        return cls(gaussians.means, covariances, depth, color, weights, pixel)
+
+    @staticmethod
+    def _of_chunk(gaussians: Gaussians, pixel: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Covariances, depth, color and weights."""
         axes = (rotations(gaussians.quats) * gaussians.scales[:, None, :]).double()
         covariances = axes @ axes.mT
         depth = -torch.log1p(-gaussians.opacities.clamp_max(MAX_OPACITY)) * _surface(covariances)
         color = CONTRAST * (0.5 + C0 * gaussians.sh[:, 0]).clamp(0, 1)
         unseen = (UNSEEN_WEIGHT * depth / pixel**2).to(weights).clamp_min(torch.finfo(weights.dtype).tiny)
-        return cls(gaussians.means, covariances, depth, color, weights + unseen, pixel)
+        return covariances, depth, color, weights + unseen
 
     def pairs(self, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Return pairs of rows that are each other's nearest neighbors, by rising cost. `shift` [3], 0..1, moves the space-filling curve."""
@@ -183,18 +189,33 @@ class _Moments:
         def replaced(old: Tensor, values: Tensor) -> Tensor:
             return old[origin].index_copy_(0, merged, values.to(old))
 
-        variances, directions = eigh3(self.covariances[merged])
-        directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
-        opacities = -torch.expm1(-self.depth[merged] / _surface(self.covariances[merged]))
-        sh = torch.zeros_like(before.sh[:count])
-        for part in torch.arange(len(rows), device=rows.device).split(CHUNK):  # the harmonics are most of the memory
-            fraction = old_weights[part] / self.weights[rows[part]]  # 1 for a splat that was not merged
-            sh.index_add_(0, rows[part], fraction[:, None, None] * before.sh[part])
+        quats, scales, opacities = map(torch.cat, zip(*in_chunks(lambda chunk: self._shapes(merged[chunk]), merged), strict=True))
         return replace(
-            before, means=replaced(before.means, self.means[merged]), quats=replaced(before.quats, quaternions(directions)),
-            scales=replaced(before.scales, variances.clamp_min(0).sqrt()), sh=sh,
-            opacities=replaced(before.opacities, opacities.clamp_max(MAX_OPACITY)),
+            before, means=replaced(before.means, self.means[merged]), quats=replaced(before.quats, quats),
+            scales=replaced(before.scales, scales), opacities=replaced(before.opacities, opacities),
+            sh=self._mean_harmonics(before.sh, rows, old_weights),
         )  # fmt: skip
+
+    def _shapes(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Quaternions [n, 4], scales [n, 3] and opacities [n] of some rows."""
+        variances, directions = eigh3(self.covariances[rows])
+        directions = directions * torch.linalg.det(directions).sign()[:, None, None]  # rotations, not reflections
+        opacities = -torch.expm1(-self.depth[rows] / _surface(self.covariances[rows]))
+        return quaternions(directions), variances.clamp_min(0).sqrt(), opacities.clamp_max(MAX_OPACITY)
+
+    def _mean_harmonics(self, old: Tensor, rows: Tensor, old_weights: Tensor) -> Tensor:
+        """The harmonics [N, K, 3] of merged splats, from the `old` ones [N0, K, 3]: each thread sums some of the coefficients."""
+        sh, parts = torch.zeros_like(old[: len(self.weights)]), torch.arange(len(rows), device=rows.device).split(CHUNK)
+
+        def add(bands: slice) -> None:
+            for part in parts:  # the harmonics are most of the memory
+                fraction = old_weights[part] / self.weights[rows[part]]  # 1 for a splat that was not merged
+                sh[:, bands].index_add_(0, rows[part], fraction[:, None, None] * old[part, bands])
+
+        count = sh.shape[1]
+        share = math.ceil(count / threads.for_views())
+        list(threads.side_by_side(add, [slice(start, start + share) for start in range(0, count, share)], threads.for_views()))
+        return sh
 
 
 def _nearest_along(means: Tensor, shapes: Tensor, color: Tensor, weights: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
@@ -229,8 +250,13 @@ def _curve(means: Tensor, pixel: Tensor, shift: Tensor) -> Tensor:
 
     Its cells measure a quarter of `pixel`. `shift` [3], 0..1, moves them, because neighbors that one curve separates are close on another.
     """
-    cells = (4 * (means - means.median(dim=0).values) / pixel).clamp(-CELL_RANGE, CELL_RANGE - 1)
-    bits = (cells + CELL_RANGE * (1 + shift.to(cells))).long()
-    for step, mask in SPREADS:
-        bits = (bits | bits << step) & mask
-    return (bits[:, 0] | bits[:, 1] << 1 | bits[:, 2] << 2).argsort(stable=True)
+    center = means.median(dim=0).values
+
+    def place(chunk: slice) -> Tensor:
+        cells = (4 * (means[chunk] - center) / pixel).clamp(-CELL_RANGE, CELL_RANGE - 1)
+        bits = (cells + CELL_RANGE * (1 + shift.to(cells))).long()
+        for step, mask in SPREADS:
+            bits = (bits | bits << step) & mask
+        return bits[:, 0] | bits[:, 1] << 1 | bits[:, 2] << 2
+
+    return torch.cat(in_chunks(place, means)).argsort(stable=True)

@@ -50,9 +50,6 @@ BATCH = 32
 
 new_patches = scratch(BATCH, types.int64)
 
-# Splats between prefetching a row of the table and using it.
-PREFETCH_AHEAD = 4
-
 
 @inner
 def tile_box(tile, width, height):
@@ -99,6 +96,7 @@ def composite(start, stop, integrated, limits, table, lists, frame, outputs):
             if unfinished == 0:
                 break
             end = min(begin + BATCH, length)
+            prefetch_rows(table, members, first + end, first + min(end + BATCH, length))
             find_patches(table, members, first + begin, first + end, box, unfinished, patches)
             for n in range(begin, end):
                 splat = row_of(table, members[first + n])
@@ -110,10 +108,15 @@ def composite(start, stop, integrated, limits, table, lists, frame, outputs):
 
 
 @inner
+def prefetch_rows(array, rows, begin, end):
+    for at in range(begin, end):
+        prefetch(array, rows[at])
+
+
+@inner
 def find_patches(table, members, begin, end, box, wanted, patches):
     """Write the patches that each of the members begin..end touches, of those `wanted`."""
     for at in range(begin, end):
-        prefetch(table, members[min(at + PREFETCH_AHEAD, end - 1)])
         patches[at - begin] = touched_patches(row_of(table, members[at]), box) & wanted
 
 

@@ -5,7 +5,7 @@
 
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
-from mipmap_plugin.backends.cpu_kernels.compositing import BATCH, fill_range, find_patches, log_alpha, new_patches, tile_box
+from mipmap_plugin.backends.cpu_kernels.compositing import BATCH, fill_range, find_patches, log_alpha, new_patches, prefetch_rows, tile_box
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, broadcast, fma, lowest_bit, total, totals
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store_half
 from mipmap_plugin.backends.cpu_kernels.planes import (
@@ -45,6 +45,8 @@ def composite_back(start, stop, integrated, reshaped, faded, limits, table, list
                 tile_grads[slots[at], k] = 0
         for end in range(used, 0, -BATCH):
             begin = max(end - BATCH, 0)
+            prefetch_rows(table, members, first + max(begin - BATCH, 0), first + begin)
+            prefetch_rows(tile_grads, slots, first + max(begin - BATCH, 0), first + begin)
             find_patches(table, members, first + begin, first + end, box, begun_patches(begin, state), patches)
             for n in range(end - 1, begin - 1, -1):
                 splat, grads = row_of(table, members[first + n]), row_of(tile_grads, slots[first + n])
