@@ -98,7 +98,7 @@ def run(
         row |= compared(base, files, float(Fraction(scale)))
     file = RESULTS / "tiles.json"
     rows = json.loads(file.read_text()) if file.exists() else []
-    rows = [other for other in rows if (other["scene"], other["tiles"]) != (row["scene"], tiles)] + [row]
+    rows = [other for other in rows if (other["scene"], other["tiles"], other["steps"]) != (row["scene"], tiles, steps)] + [row]
     write_json(file, rows, overwrite=True)
     (RESULTS / "tiles.md").write_text(page(rows), encoding="utf-8")
 

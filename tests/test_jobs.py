@@ -210,6 +210,14 @@ def test_only_the_same_request_is_finished(tmp_path):
         assert finished(replace(job, **other)) is None
 
 
+def test_a_large_scene_that_took_fewer_steps_is_finished(tmp_path, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.recipes.DEFAULT_OUT", dict(steps=8, most_draws=1.0, check_every=2))
+    job = job_of(tmp_path, settings={"seed": 0, "views": "given"})
+    assert run_job(job).report["settings"]["steps"] == 2
+    assert finished(job) is not None and run_job(job).status == "finished before"
+    assert finished(replace(job, settings=job.settings | {"steps": 8})) is None  # which takes all of them
+
+
 def test_another_base_or_another_file_is_not_finished(tmp_path):
     job = job_of(tmp_path)
     run_job(job)
@@ -395,7 +403,7 @@ def test_a_job_whose_worker_is_killed_is_done_again(worker, tmp_path):
 
     outcome = do(job_of(tmp_path), worker, kill_once)
     assert killed and outcome.status == "done" and (tmp_path / "out.ply").exists()
-    failed = do(job_of(tmp_path), worker, lambda: os.kill(worker._process.pid, signal.SIGKILL))
+    failed = do(job_of(tmp_path, target=tmp_path / "other.ply"), worker, lambda: os.kill(worker._process.pid, signal.SIGKILL))
     assert failed.status == "failed" and "was killed, perhaps for want of memory" in failed.reason
     worker.stop()
     assert do(job_of(tmp_path), worker).status == "interrupted"

@@ -434,6 +434,14 @@ def test_a_scene_in_tiles_is_whole_and_better_than_its_base(job, monkeypatch):
     assert joined.file.read_bytes()[read_header(joined.file).body :] == cores
 
 
+def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.recipes.DEFAULT_OUT", dict(steps=16, most_draws=1.0, check_every=2))
+    settings = {name: value for name, value in job.settings.items() if name != "steps"}
+    report = adapt_in_tiles(replace(job, settings=settings), 2).report
+    assert report.settings.steps == report.curve[-1].step == 4
+    assert report.ended_by.startswith("2 tiles of 4 steps (of 16, because the scene is large")
+
+
 def test_a_model_folder_is_written_as_one(job, tmp_path):
     joined = adapt_in_tiles(replace(job, target=tmp_path / "out"), 2)
     assert (tmp_path / "out" / "cameras.json").is_file() and (tmp_path / "out" / "cfg_args").is_file()

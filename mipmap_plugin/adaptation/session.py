@@ -16,7 +16,7 @@ from torch import Tensor
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
-from mipmap_plugin.adaptation.optimization.amount import affordable, splats_in_view
+from mipmap_plugin.adaptation.optimization.amount import affordable, fewer_note, splats_in_view
 from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
@@ -95,7 +95,7 @@ class Session:
         """The settings with no more steps than a scene of this size can have."""
         if config.most_draws is None or not (self.base.traits.same_for_all_views and cameras):
             return config
-        return affordable(config, splats_in_view(self.base, cameras, self.effects.near_plane))
+        return affordable(config, splats_in_view(self.base.parameters()["means"], cameras, self.effects.near_plane))
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
@@ -201,8 +201,7 @@ class Session:
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
-        large = f" (of {self.asked_steps}, because the scene is large; --steps takes more)" if self.config.steps < self.asked_steps else ""
-        return run, ended_by + large + growth_note(run)
+        return run, ended_by + fewer_note(self.asked_steps, self.config) + growth_note(run)
 
     def copy_of_base(self) -> SplatModel:
         """A copy of the base that is rendered with the target's screen filter."""

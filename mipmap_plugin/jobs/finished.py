@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from mipmap_plugin.adaptation.optimization.amount import as_taken
 from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError
@@ -69,7 +70,8 @@ def _is_requested(provenance: dict[str, Any], job: Job) -> bool:
         expected = recipe(job.recipe, job.scale, **(settings_for_several(expected) | job.settings))
     if "merge_to" not in job.settings and settings.merge_to == 1:  # splats of this family are not merged
         expected = expected.model_copy(update={"merge_to": 1.0})
-    return (provenance.get("scale"), provenance.get("viewer"), settings) == (job.scale, job.viewer, expected)
+    wanted = (job.scale, job.viewer, as_taken(expected, settings))  # the same base has the same size
+    return (provenance.get("scale"), provenance.get("viewer"), settings) == wanted
 
 
 def _inputs(job: Job) -> dict[str, str]:

@@ -24,7 +24,7 @@ from mipmap_plugin.tiles.scene import find_splats, make_cut
 PLAN = "plan.json"
 
 # Of the folder's files: those of another format are not gone on with.
-FORMAT = 2
+FORMAT = 3
 
 
 def refuse(job: Job, tiles: int) -> None:

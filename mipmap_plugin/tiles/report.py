@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.effects import explain
 from mipmap_plugin.formats.ply import read_header
@@ -17,6 +18,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
     """The report of the whole. `files`: what it is made of; `validation`: dB of each state on views that nothing was adapted to."""
     after = sum(read_header(file).vertex.count for file in files)
     model, config = scene.wrapped.model, scene.config
+    large = fewer_note(scene.asked_steps, config)
     effects = explain(scene.target, model.gaussians(scene.wrapped.any_camera()), effects_of(model), config, scene.scale)
     psnr = validation.get(returned, 0.0)
     return Report(
@@ -32,7 +34,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         gaussians_before=sum(map(len, scene.cores)),
         gaussians_after=after,
         seconds=seconds,
-        ended_by=f"{len(files)} tiles",
+        ended_by=f"{len(files)} tiles{large and f' of {config.steps} steps{large}'}",
         returned=returned,
         validation=validation,
         curve=[CurvePoint(step=config.steps, seconds=seconds["total"], psnr_db=None, validation_db=psnr, gaussians=after)],

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.optimization.amount import affordable, splats_in_view
 from mipmap_plugin.adaptation.optimization.validation import split_validation
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
@@ -124,7 +125,7 @@ class TiledScene:
 
     def __init__(self, base: Base, scale: float, viewer: str | None, config: AdaptConfig, folder: Path) -> None:
         """`folder`: holds what `make_cut` wrote. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
-        self.scale, self.viewer, self.config = scale, viewer, config
+        self.scale, self.viewer = scale, viewer
         self.checkpoint, self.kind = find_splats(base.checkpoint)
         stored: dict[str, Any] = load_torch(folder / CUT)
         self.base = Splats(self.kind, [Store(folder / BASE)], stored["places"])
@@ -137,6 +138,7 @@ class TiledScene:
         targets = self.wrapped.targets(viewer)
         self.target: Effects = next(iter(targets.values()))
         self.backend, self.backend_note = self._backend(base.backend)
+        self.asked_steps, self.config = config.steps, self._affordable(config)
 
     def _wrapped(self, base: Base, sample: Tensor) -> Wrapped:
         """Some of the splats with the cameras of all."""
@@ -156,6 +158,13 @@ class TiledScene:
     def _backend(self, name: str) -> tuple[Any, str]:
         splats = self.wrapped.model.gaussians(self.wrapped.any_camera())
         return choose_backend(name, Needs.of(splats, self.base_effects, gradients=True), Needs.of(splats, self.target, gradients=True))
+
+    def _affordable(self, config: AdaptConfig) -> AdaptConfig:
+        """The settings with no more steps than a scene of this size can have, as without tiles."""
+        cameras = self.wrapped.cameras
+        if config.most_draws is None or not cameras:
+            return config
+        return affordable(config, splats_in_view(self.base.places[:, :3], cameras, self.target.near_plane))
 
     @cached_property
     def base_effects(self) -> Effects:
@@ -193,7 +202,7 @@ class TiledScene:
     def at(self, scale: float, config: AdaptConfig) -> TiledScene:
         """The same scene at another scale, for its truths only: its views, and the base that they show. It shares this one's memory."""
         other = copy(self)
-        other.scale, other.config = scale, config
+        other.scale, other.config = scale, self._affordable(config)
         for name in ("views", "sweeps", "used_views"):
             other.__dict__.pop(name, None)
         return other

@@ -9,7 +9,6 @@ import torch
 
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.models.base import SplatModel
 
 # Views and splats that are counted; more change the result by a few percent.
 VIEWS, SPLATS = 12, 1 << 16
@@ -17,14 +16,16 @@ VIEWS, SPLATS = 12, 1 << 16
 # At least this fraction of the steps is taken: it costs 1 to 3 dB of what all of them reach (docs/recipes.md), and fewer were not tried.
 LEAST_FRACTION = 1 / 4
 
+# The settings that a large scene has fewer of.
+FEWER = ("steps", "extra_views", "truth_oversampling")
+
 # The base is drawn so many times finer than the target at most.
 OVERSAMPLING = 3
 
 
 @torch.no_grad()
-def splats_in_view(model: SplatModel, views: Sequence[Camera], near: float) -> float:
-    """The number of splats whose centers lie in a view, mean of some views."""
-    means = model.parameters()["means"]
+def splats_in_view(means: torch.Tensor, views: Sequence[Camera], near: float) -> float:
+    """The number of splats whose `means` [N, 3] lie in a view, mean of some views."""
     some = means[:: max(1, len(means) // SPLATS)]
     shares = [_in_frame(some, view, near) for view in evenly(views, VIEWS)]
     return len(means) * sum(shares) / max(1, len(shares))
@@ -53,3 +54,15 @@ def affordable(config: AdaptConfig, in_view: float) -> AdaptConfig:
     if config.truth_oversampling is not None:
         fewer["truth_oversampling"] = min(OVERSAMPLING, config.truth_oversampling)
     return config.model_copy(update=fewer)
+
+
+def as_taken(config: AdaptConfig, taken: AdaptConfig) -> AdaptConfig:
+    """The settings as a run took them that was asked for `config`, if `taken`, those of a run, are what `affordable` made of them."""
+    if config.most_draws is None or taken.steps >= config.steps:
+        return config
+    return config.model_copy(update={name: getattr(taken, name) for name in FEWER})
+
+
+def fewer_note(asked_steps: int, config: AdaptConfig) -> str:
+    """Why a run took fewer steps than it was asked for, in brackets; empty if it did not."""
+    return f" (of {asked_steps}, because the scene is large; --steps takes more)" if config.steps < asked_steps else ""
