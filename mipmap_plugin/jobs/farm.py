@@ -59,6 +59,7 @@ def on_dask(jobs: Sequence[Job], place: str, threads: int | None = None, *, send
     """
     jobs = longest_first(jobs)
     with _connected(place) as client, _kept_workers(client, place):
+        client.wait_for_workers(1)  # which says whether files have to be sent, and whether there are GPUs
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         needs = {"GPU": 1} if any("GPU" in worker.get("resources", {}) for worker in workers) else None
         share = max(1, (threads or usable_threads()) // len(workers)) if place.startswith("local:") else threads
