@@ -157,9 +157,9 @@ def _connected(place: str) -> Iterator[Client]:
 
 @contextmanager
 def _kept_workers(client: Client, place: str) -> Iterator[None]:
-    """Inside, a line says when there are no workers, at two looks in a row; those of this machine are replaced, also where dask does not.
+    """Inside, a line says when there are no workers, at two looks in a row. Workers of this machine that died are replaced.
 
-    It does not where one dies while it starts, as in place of one that died.
+    dask does so itself, but for a worker that dies while it starts.
     """
     ended = threading.Event()
 

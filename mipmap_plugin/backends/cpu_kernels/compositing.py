@@ -109,6 +109,7 @@ def composite(start, stop, integrated, limits, table, lists, frame, outputs):
 
 @inner
 def prefetch_rows(array, rows, begin, end):
+    """Bring the rows[begin..end] of an array [n, m] into the cache, while others are worked on."""
     for at in range(begin, end):
         prefetch(array, rows[at])
 
