@@ -96,7 +96,11 @@ def side_by_side(function: Callable[[Item], Result], items: Sequence[Item], thre
                     index = todo.popleft()
                 except IndexError:  # another thread was quicker
                     break
-                results[index] = function(items[index])
+                try:
+                    results[index] = function(items[index])
+                except BaseException:  # Ctrl-C too, which comes in the main thread alone
+                    todo.clear()
+                    raise
 
     token = _side_by_side.set(min(threads, len(items)))
     try:

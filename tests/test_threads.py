@@ -109,6 +109,20 @@ def test_no_threads_are_refused():
         pass
 
 
+def test_what_ends_one_thread_lets_the_others_begin_nothing_more():
+    main, begun = threading.current_thread(), []
+
+    def interrupted(item):
+        begun.append(item)
+        if threading.current_thread() is main:
+            raise KeyboardInterrupt
+        time.sleep(0.05)
+
+    with pytest.raises(KeyboardInterrupt):
+        list(threads.side_by_side(interrupted, range(100), 2))
+    assert len(begun) < 10
+
+
 class Terminal(io.StringIO):
     def isatty(self):
         return True
