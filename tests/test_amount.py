@@ -7,7 +7,7 @@ import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.optimization.amount import LEAST_FRACTION, OVERSAMPLING, affordable, splats_in_view
+from mipmap_plugin.adaptation.optimization.amount import LEAST_FRACTION, OVERSAMPLING, affordable, as_taken, splats_in_view
 from mipmap_plugin.recipes import MOST_DRAWS, recipe
 
 
@@ -24,6 +24,17 @@ def test_steps_and_views_fall_with_what_views_show_but_not_to_none(in_view, step
     settings = affordable(recipe("default", 1 / 4), in_view)
     assert (settings.steps, settings.extra_views) == (pytest.approx(steps, abs=1), pytest.approx(views, abs=1))
     assert settings.truth_oversampling == (4 if steps == 600 else OVERSAMPLING)
+
+
+def test_settings_of_a_large_scene_are_recognized_as_those_that_were_asked_for():
+    asked = recipe("default", 1 / 4)
+    for draws in range(100, 3000, 7):  # from all steps to a fourth of them
+        taken = affordable(asked, MOST_DRAWS / draws)
+        assert as_taken(asked, taken) == taken
+        other = asked.model_copy(update={"extra_views": 400})
+        assert as_taken(other, taken) != taken
+    none = recipe("default", 1 / 4, steps=600)
+    assert as_taken(none, affordable(asked, 1e9)) == none
 
 
 def test_steps_that_somebody_asks_for_are_taken():

@@ -16,7 +16,7 @@ from torch import Tensor
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
-from mipmap_plugin.adaptation.optimization.amount import affordable, fewer_note, splats_in_view
+from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note
 from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
@@ -93,9 +93,9 @@ class Session:
 
     def _affordable(self, config: AdaptConfig, cameras: list[Camera]) -> AdaptConfig:
         """The settings with no more steps than a scene of this size can have."""
-        if config.most_draws is None or not (self.base.traits.same_for_all_views and cameras):
+        if not self.base.traits.same_for_all_views:
             return config
-        return affordable(config, splats_in_view(self.base.parameters()["means"], cameras, self.effects.near_plane))
+        return affordable_for(config, self.base.parameters()["means"], cameras, self.effects.near_plane)
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""

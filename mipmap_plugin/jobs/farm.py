@@ -171,7 +171,7 @@ def _kept_workers(client: Client, place: str) -> Iterator[None]:
             with suppress(OSError):  # a scheduler that cannot be reached now is found again, or ends the jobs
                 looks = 0 if client.scheduler_info(n_workers=1)["workers"] else looks + 1
                 if looks == 2:
-                    note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this command, and loses nothing")
+                    note(f"--dask {place}: there are no workers, so nothing is done until one comes; Ctrl-C ends this, and the same command goes on")
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.optimization.amount import affordable, splats_in_view
+from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.optimization.validation import split_validation
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
@@ -161,10 +161,7 @@ class TiledScene:
 
     def _affordable(self, config: AdaptConfig) -> AdaptConfig:
         """The settings with no more steps than a scene of this size can have, as without tiles."""
-        cameras = self.wrapped.cameras
-        if config.most_draws is None or not cameras:
-            return config
-        return affordable(config, splats_in_view(self.base.places[:, :3], cameras, self.target.near_plane))
+        return affordable_for(config, self.base.places[:, :3], self.wrapped.cameras, self.target.near_plane)
 
     @cached_property
     def base_effects(self) -> Effects:

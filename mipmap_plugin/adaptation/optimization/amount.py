@@ -16,9 +16,6 @@ VIEWS, SPLATS = 12, 1 << 16
 # At least this fraction of the steps is taken: it costs 1 to 3 dB of what all of them reach (docs/recipes.md), and fewer were not tried.
 LEAST_FRACTION = 1 / 4
 
-# The settings that a large scene has fewer of.
-FEWER = ("steps", "extra_views", "truth_oversampling")
-
 # The base is drawn so many times finer than the target at most.
 OVERSAMPLING = 3
 
@@ -38,18 +35,28 @@ def _in_frame(means: torch.Tensor, view: Camera, near: float) -> float:
     return float(inside.float().mean())
 
 
-def affordable(config: AdaptConfig, in_view: float) -> AdaptConfig:
-    """The settings with as many steps as `most_draws` allows, where a view shows `in_view` splats.
+def affordable_for(config: AdaptConfig, means: torch.Tensor, views: Sequence[Camera], near: float) -> AdaptConfig:
+    """`affordable` for a scene of splats at `means` [N, 3]; the settings themselves where there are no views to count splats in."""
+    if config.most_draws is None or not views:
+        return config
+    return affordable(config, splats_in_view(means, views, near))
 
-    Fewer steps have fewer extra views, of which each costs a picture of the base, and smaller pictures: with a fourth of the steps, half of the
-    extra views are as good on flowers and better on bird, and the base drawn three times as fine as the target is worth what four times are.
-    """
+
+def affordable(config: AdaptConfig, in_view: float) -> AdaptConfig:
+    """The settings with as many steps as `most_draws` allows, where a view shows `in_view` splats."""
     if config.most_draws is None:
         return config
     most = int(config.most_draws / max(1.0, in_view * config.views_per_step))
     fraction = min(1.0, max(most / max(1, config.steps), LEAST_FRACTION))
-    if fraction == 1:
-        return config
+    return config if fraction == 1 else _fewer(config, fraction)
+
+
+def _fewer(config: AdaptConfig, fraction: float) -> AdaptConfig:
+    """The settings with a fraction of the steps.
+
+    Fewer steps have fewer extra views, of which each costs a picture of the base, and smaller pictures: with a fourth of the steps, half of the
+    extra views are as good on flowers and better on bird, and the base drawn three times as fine as the target is worth what four times are.
+    """
     fewer = {"steps": math.ceil(fraction * config.steps), "extra_views": math.ceil(fraction**0.5 * config.extra_views)}
     if config.truth_oversampling is not None:
         fewer["truth_oversampling"] = min(OVERSAMPLING, config.truth_oversampling)
@@ -57,10 +64,15 @@ def affordable(config: AdaptConfig, in_view: float) -> AdaptConfig:
 
 
 def as_taken(config: AdaptConfig, taken: AdaptConfig) -> AdaptConfig:
-    """The settings as a run took them that was asked for `config`, if `taken`, those of a run, are what `affordable` made of them."""
-    if config.most_draws is None or taken.steps >= config.steps:
+    """What `affordable` makes of the settings for the scene of which it made `taken`, if it did so of the same settings.
+
+    The fraction is known by the steps, which are rounded up, and so the extra views up to one or a few.
+    """
+    if config.most_draws is None or not LEAST_FRACTION * config.steps <= taken.steps < config.steps:
         return config
-    return config.model_copy(update={name: getattr(taken, name) for name in FEWER})
+    least, most = (_fewer(config, steps / config.steps) for steps in (taken.steps - 1, taken.steps))
+    extra_views = min(max(taken.extra_views, least.extra_views), most.extra_views)
+    return most.model_copy(update={"steps": taken.steps, "extra_views": extra_views})
 
 
 def fewer_note(asked_steps: int, config: AdaptConfig) -> str:
