@@ -81,9 +81,10 @@ def _torch_threads(count: int) -> Iterator[None]:
 def side_by_side(function: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:
     """Yield `function(item)` for all items in their order, computed in parallel; with one thread, each when it is requested.
 
-    Gradients are recorded in every thread if the caller records them.
+    Gradients are recorded in every thread if the caller records them. Kernels divide the threads that there are among the items.
     """
-    if threads == 1 or len(items) < 2:
+    threads = min(threads, len(items))
+    if threads <= 1:
         yield from map(function, items)
         return
     results: list[Result | None] = [None] * len(items)
@@ -102,11 +103,12 @@ def side_by_side(function: Callable[[Item], Result], items: Sequence[Item], thre
                     todo.clear()
                     raise
 
-    token = _side_by_side.set(min(threads, len(items)))
+    together, each = _side_by_side.set(threads), _shared.set(max(1, for_kernels() // threads))
     try:
-        team(work, min(threads, len(items)))
+        team(work, threads)
     finally:
-        _side_by_side.reset(token)
+        _shared.reset(each)
+        _side_by_side.reset(together)
     yield from results  # type: ignore[misc]
 
 
@@ -115,7 +117,8 @@ def team(work: Callable[[int], None], threads: int) -> None:
 
     `work` takes items from a common queue until it is empty, so that one thread completes it if no other is free.
     """
-    helpers = [_pool(max(threads, for_kernels()) - 1, os.getpid()).submit(copy_context().run, work, thread) for thread in range(1, threads)]
+    most = max(threads, for_kernels() * side_by_side_now())
+    helpers = [_pool(most - 1, os.getpid()).submit(copy_context().run, work, thread) for thread in range(1, threads)]
     try:
         work(0)
     finally:

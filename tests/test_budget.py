@@ -33,7 +33,7 @@ def a_run(seconds: float, step: int = 0) -> Run:
 
 def test_steps_fill_the_budget_with_their_truths_and_checks():
     config = recipe("default", 1 / 4)
-    a_step = 3 * (0.01 + 0.02 / USES) + 0.05 / config.check_every
+    a_step = config.views_per_step * (0.01 + 0.02 / USES) + 0.05 / config.check_every
     assert PACE.steps(config, 2.0) == int(SPARE * 2.0 / a_step)
     assert PACE.steps(config, 0.0) == 1
 
@@ -42,7 +42,7 @@ def test_a_short_run_has_fewer_views():
     task, config = a_task(40), recipe("default", 1 / 4, time_budget_s=3.0)
     fewer, shorter = within_budget(a_run(2.5), task, config)
     assert shorter.steps == PACE.steps(config, 0.5)
-    assert len(fewer.views) == -(-3 * shorter.steps // USES) < 40 and set(fewer.views) < set(task.views)
+    assert len(fewer.views) == -(-config.views_per_step * shorter.steps // USES) < 40 and set(fewer.views) < set(task.views)
     assert shorter.warm_up_steps < config.warm_up_steps
 
 

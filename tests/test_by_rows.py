@@ -18,6 +18,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.splatting.bands import neighbors
 from mipmap_plugin.splatting.viewers import BUILT_IN
+from mipmap_plugin.threads import side_by_side
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
 BACKEND, VIEWS = CpuBackend(), tiny.cameras(3)
@@ -39,6 +40,16 @@ def loss(drawn) -> torch.Tensor:
     return sum((rendered.image - 0.4).square().mean() for rendered in drawn)
 
 
+def draw(rows, shots=SHOTS) -> list[torch.Tensor]:
+    return [rows.stepper.render(number, *shot).image for number, shot in enumerate(shots)]
+
+
+def differentiate(rows, shots=SHOTS) -> None:
+    """Hand the gradients of `loss` to the stepper."""
+    for number, image in enumerate(draw(rows, shots)):
+        rows.stepper.differentiate(number, 2 * (image - 0.4) / image.numel())
+
+
 def dense_step(model, optimizer, shots=SHOTS):
     loss(BACKEND.render_views(model.gaussians(), shots)).backward()
     optimizer.step()
@@ -46,10 +57,9 @@ def dense_step(model, optimizer, shots=SHOTS):
 
 
 def step_by_rows(model, optimizer, shots=SHOTS):
-    draw = SteppingRenderer(BACKEND.stepper, [Effects(1)])
-    rows = ByRows.of(model, draw, known.get(model))
+    rows = of(model, known.get(model))
     known[model] = rows
-    loss(rows.stepper.render(shots)).backward()
+    differentiate(rows, shots)
     assert all(tensor.grad is None for tensor in model.parameters().values())
     rows.step(optimizer)
 
@@ -94,6 +104,20 @@ def test_a_step_has_the_same_bytes_on_any_number_of_threads(monkeypatch):
     assert all(torch.equal(result[name], tensor) for result in results[1:] for name, tensor in results[0].items())
 
 
+def test_views_of_a_step_may_be_differentiated_in_any_order_and_thread():
+    models = [student(), student()]
+    for model, order in zip(models, (range(3), (2, 0, 1)), strict=True):
+        rows = of(model)
+        images = draw(rows)
+
+        def one(number, rows=rows, images=images):
+            rows.stepper.differentiate(number, images[number])
+
+        list(side_by_side(one, order, 3))
+        rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    assert all(torch.equal(one, other) for one, other in zip(*(model.parameters().values() for model in models), strict=True))
+
+
 def test_the_kernel_of_a_step_against_float64():
     """One splat parameter, several steps: the formulas of Kingma and Ba."""
     model = student(16)
@@ -118,24 +142,24 @@ def of(model, previous=None) -> ByRows | None:
 def test_what_is_drawn_after_a_step_are_the_moved_parameters():
     model = student()
     rows = of(model)
-    loss(rows.stepper.render(SHOTS)).backward()
+    differentiate(rows)
     rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
     assert of(model, rows) is rows
     with torch.no_grad():
-        for drawn, expected in zip(rows.stepper.render(SHOTS), BACKEND.render_views(model.gaussians(), SHOTS), strict=True):
-            torch.testing.assert_close(drawn.image, expected.image, atol=1e-5, rtol=1e-4)
+        for image, expected in zip(draw(rows), BACKEND.render_views(model.gaussians(), SHOTS), strict=True):
+            torch.testing.assert_close(image, expected.image, atol=1e-5, rtol=1e-4)
 
 
 def test_changed_parameters_are_activated_anew_to_the_same_bytes():
     model = student()
     rows = of(model)
-    loss(rows.stepper.render(SHOTS)).backward()
+    differentiate(rows)
     rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
     with torch.no_grad():
         model.parameters()["scales"].add_(0)
         again = of(model, rows)
         assert again is not rows
-        assert torch.equal(again.stepper.render(SHOTS)[0].image, rows.stepper.render(SHOTS)[0].image)  # so a run can be resumed
+        assert torch.equal(draw(again)[0], draw(rows)[0])  # so a run can be resumed
     model.replace_parameters(neighbors({name: tensor.detach().clone() for name, tensor in model.parameters().items()}))
     assert of(model, again) not in (None, again)
 
@@ -166,6 +190,6 @@ def test_a_family_that_activates_otherwise_is_not_plain():
 
 def test_a_step_before_the_gradients_are_known_is_refused():
     rows = of(student())
-    rows.stepper.render(SHOTS)
-    with pytest.raises(RuntimeError, match="backward"):
+    draw(rows)
+    with pytest.raises(RuntimeError, match="differentiate"):
         rows.stepper.step(AdamStep({}, {}, {}, {}, (0.9, 0.999), 1.0, 0.0))

@@ -111,11 +111,15 @@ class ForgetsTheOpacity:
     def __init__(self, raw):
         self._raw = {name: tensor.requires_grad_() for name, tensor in raw.items()}
 
-    def render(self, shots):
+    def render(self, number, camera, effects):
         raw = self._raw
         self._opacities = raw["opacities"].detach().sigmoid().requires_grad_()
         splats = Gaussians(raw["means"], unit_quaternions(raw["quats"]), raw["scales"].exp(), self._opacities, raw["sh"])
-        return [ReferenceBackend().render(splats, *shot) for shot in shots]
+        self._drawn = ReferenceBackend().render(splats, camera, effects)
+        return Rendered(self._drawn.image.detach(), self._drawn.alpha.detach())
+
+    def differentiate(self, number, d_image, d_alpha):
+        torch.autograd.backward([self._drawn.image, self._drawn.alpha], [d_image, d_alpha])
 
     def step(self, step):
         for name, moment in step.first.items():

@@ -1,14 +1,18 @@
 """The time left is told right early, by a clock on which every part of a run has a price."""
 
 import time
+from types import SimpleNamespace
 
 import pytest
 import tiny
 import torch
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.recipes import recipe
@@ -71,3 +75,18 @@ def test_truth_and_validation_have_rows_of_their_own_in_the_report():
     seconds = wrap_model(tiny.model(10), cameras=tiny.cameras(4)).adapt(SCALE, steps=4, extra_views=2).report.seconds
     assert all(seconds[phase] > 0 for phase in ("pseudo truth", "validation", "optimization"))
     assert sum(seconds[phase] for phase in seconds.keys() - {"total"}) == pytest.approx(seconds["total"], rel=0.2)
+
+
+def test_truths_are_made_side_by_side_and_ahead(monkeypatch):
+    """One for each thread, from the steps that come next; each once."""
+    made, views = [], tiny.cameras(12)
+    config = recipe("default", SCALE, steps=40, views_per_step=2, warm_up=0, gathering=1.0)
+    run = SimpleNamespace(student=tiny.model(10), costs=Costs(), step=3, progress=lambda config: 0.0)
+    task = SimpleNamespace(scale=SCALE, truth=lambda view: made.append((view, threads.side_by_side_now())))
+    order = ViewSchedule(views, config)
+    with threads.limited(4, shared=True):
+        loop._make_truths(run, task, config, order, order(3, 0.0))
+        assert len({view for view, _ in made}) == 4 and {at_once for _, at_once in made} == {4}
+        assert {*order(3, 0.0)} <= {view for view, _ in made} <= {view for step in range(3, 12) for view in order(step, 0.0)}
+        loop._make_truths(run, task, config, order, order(3, 0.0))
+    assert len(made) == 4

@@ -47,16 +47,6 @@ def test_what_truths_cost_is_not_counted(monkeypatch):
     assert noted == [(4, 3.0)]
 
 
-def test_truths_are_made_with_all_threads():
-    with threads.limited(4, shared=True):
-        choice = QuickestThreads()
-        choice._best, choice._step = 1, 2 * TRIED
-        with choice.step(2, Costs()):
-            assert threads.for_views() == 1
-            with choice.paused():
-                assert threads.for_views() == 4
-
-
 def test_one_thread_tries_nothing():
     with threads.limited(1, shared=True):
         choice = QuickestThreads()

@@ -76,6 +76,13 @@ def test_gradients_are_recorded_where_the_caller_records_them(records):
         assert set(threads.side_by_side(lambda _: torch.is_grad_enabled(), range(6), 3)) == {records}
 
 
+def test_kernels_of_items_side_by_side_divide_the_threads():
+    with threads.limited(8, shared=True):
+        assert set(threads.side_by_side(lambda _: (threads.for_kernels(), threads.side_by_side_now()), range(5), 4)) == {(2, 4)}
+        assert set(threads.side_by_side(lambda _: threads.for_kernels(), range(5), 1)) == {8}
+        assert threads.for_kernels() == 8
+
+
 def test_what_fails_in_a_thread_fails_for_the_caller():
     def fail(item):
         if item == 2:

@@ -262,7 +262,7 @@ def test_a_run_goes_on_gently_after_harm():
     boldly = {name: 10 * rate for name, rate in recipe("default", SCALE).rates.model_dump().items()}
     points = wrapped().adapt(SCALE, **{**HARMFUL, "steps": 16, "decay": 1.0, "rates": boldly}).report.curve
     assert points[1].taken_back and not points[-1].taken_back
-    assert points[-1].validation_db > points[0].validation_db + 1
+    assert points[-1].validation_db > points[0].validation_db + 0.5
 
 
 def test_the_last_state_is_returned_where_it_is_asked_for():

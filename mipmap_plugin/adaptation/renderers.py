@@ -12,6 +12,9 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 
+# An image [h, w, 3] -> the gradient of its loss, [h, w, 3], and its mean square error, [].
+Comparison = Callable[[Tensor], tuple[Tensor, Tensor]]
+
 # Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
 ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
 
@@ -35,7 +38,7 @@ def views_renderer(backend: Backend, targets: Sequence[Effects]) -> ViewsRendere
 
 @dataclass(frozen=True)
 class SteppingRenderer:
-    """Draws the images of a step by what moves the splats afterwards; the targets take turns."""
+    """Draws the images of a step, several at the same time, by what moves the splats afterwards; the targets take turns."""
 
     stepper: Callable[[Mapping[str, Tensor]], Stepper]  # `Backend.stepper`
     targets: Sequence[Effects]
@@ -46,9 +49,12 @@ class SteppingRenderer:
         stepper = getattr(backend, "stepper", None)
         return None if stepper is None or any(target.settings.packing is not None for target in targets) else cls(stepper, targets)
 
-    def images(self, stepper: Stepper, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
-        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it."""
-        return [rendered.image for rendered in stepper.render(_shots(cameras, self.targets, draw))]
+    def differentiate(self, stepper: Stepper, number: int, camera: Camera, draw: int, compare: Comparison) -> Tensor:
+        """Draw the view of that number in a step, the `draw`-th since the beginning, and compare its image; return the mean square error."""
+        drawn = stepper.render(number, camera, self.targets[draw % len(self.targets)])
+        gradient, square_error = compare(drawn.image)
+        stepper.differentiate(number, gradient)
+        return square_error
 
 
 def _shots(cameras: Sequence[Camera], targets: Sequence[Effects], draw: int) -> list[tuple[Camera, Effects]]:

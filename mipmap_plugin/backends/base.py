@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -148,11 +148,17 @@ class AdamStep:
 class Stepper(Protocol):
     """Draws splats of 3DGS and moves them, by their raw parameters, which only it changes."""
 
-    def render(self, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
-        """Several views, each with effects of its own, differentiable for `step` alone."""
+    def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
+        """The view of that number in the next step, without gradients. Several threads may each draw and differentiate one."""
+
+    def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
+        """Take a loss's gradients in the image [H, W, 3] and the alpha [H, W] of that view, once it is drawn."""
 
     def step(self, step: AdamStep) -> None:
-        """Move the raw parameters down the gradient of what `backward` of the latest `render` was called for. Raises RuntimeError before that."""
+        """Move the raw parameters down the gradient of the views differentiated since the step before, added in the order of their numbers.
+
+        Raises RuntimeError if there is none.
+        """
 
 
 class Backend(Protocol):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
@@ -13,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, SETTINGS, AdamStep, Capabilities, Needs, Rendered, Stepper
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import INTEGRATED, Effects
 from mipmap_plugin.errors import BackendUnavailable
@@ -24,7 +22,7 @@ from mipmap_plugin.splatting.packing import packed
 NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
 
 # The position of the coefficients among the arguments of `_Draw.forward`.
-SH = 6
+SH = 5
 
 
 class CpuBackend:
@@ -61,12 +59,15 @@ class CpuBackend:
 
     def stepper(self, raw: Mapping[str, Tensor]) -> Stepper:
         """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`; effects without packing only."""
-        return _Stepper(self, raw)
+        _drawing()  # reports what numba lacks
+        from mipmap_plugin.backends.cpu_kernels.stepping import CpuStepper
 
-    def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]], later: _Stepper | None = None) -> list[Rendered]:
+        return CpuStepper(raw, self._prepared)
+
+    def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         prepared = [self._prepared(gaussians, camera, effects) for camera, effects in shots]
         wanted = [(*shot, ranks) for shot, (_, ranks) in zip(shots, prepared, strict=True)]
-        outputs = _Draw.apply(wanted, later, *prepared[0][0])  # type: ignore[no-untyped-call]  # torch's
+        outputs = _Draw.apply(wanted, *prepared[0][0])  # type: ignore[no-untyped-call]  # torch's
         return [Rendered(image, alpha) for image, alpha in zip(outputs[::2], outputs[1::2], strict=True)]
 
     @torch.no_grad()
@@ -119,43 +120,16 @@ def _ahead() -> ModuleType:
     return ahead
 
 
-class _Stepper:
-    """See `base.Stepper`. It keeps the activated splats from step to step: the kernel that moves a row activates it anew."""
-
-    def __init__(self, backend: CpuBackend, raw: Mapping[str, Tensor]) -> None:
-        _drawing()  # reports what numba lacks
-        from mipmap_plugin.backends.cpu_kernels import descending
-
-        self._backend, self._descend = backend, descending.descend
-        self._splats = Gaussians(**{name: torch.from_numpy(array) for name, array in descending.activated(raw).items()})
-        self._draw_back: Callable[[AdamStep], None] | None = None  # ends with a step, once the gradients of the images are known
-
-    def render(self, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
-        leaf = self._splats.opacities.detach().requires_grad_(torch.is_grad_enabled())  # one is enough for autograd to come back
-        return self._backend._drawn(replace(self._splats, opacities=leaf), shots, later=self)
-
-    def step(self, step: AdamStep) -> None:
-        if self._draw_back is None:
-            raise RuntimeError("a step needs the gradients of the images; call backward() on a loss of them first")
-        draw_back, self._draw_back = self._draw_back, None
-        draw_back(step)
-
-    def wait_for_step(self, *drawn: Any) -> None:
-        """Keep what `descending.descend` needs besides the step."""
-        self._draw_back = partial(self._descend, *drawn)
-
-
 class _Draw(torch.autograd.Function):
-    """The image and the alpha of each shot, one after the other. `later`: takes the place of the backward pass, if there is one."""
+    """The image and the alpha of each shot, one after the other."""
 
     @staticmethod
-    def forward(ctx: Any, shots: Sequence[tuple[Camera, Effects, Any]], later: _Stepper | None, *tensors: Any) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, shots: Sequence[tuple[Camera, Effects, Any]], *tensors: Any) -> tuple[Tensor, ...]:
         drawing, gradients = _drawing(), any(ctx.needs_input_grad)
         ctx.kinds = {(tensors[-1] is not None, effects) for _, effects, _ in shots}
         if gradients:
             for kind in ctx.kinds:
                 _ahead().start(*kind)
-        ctx.later = later
         ctx.splats = drawing.as_arrays(*tensors)
         ctx.drawings = drawing.draw(ctx.splats, [drawing.Shot(*shot) for shot in shots], gradients=gradients)
         ctx.save_for_backward(*tensors)
@@ -169,9 +143,6 @@ class _Draw(torch.autograd.Function):
         for kind in ctx.kinds:
             _ahead().wait(*kind)
         pairs = list(zip(arrays[::2], arrays[1::2], strict=True))
-        if ctx.later is not None:
-            ctx.later.wait_for_step(ctx.splats, ctx.drawings, pairs)
-            return (None,) * (SH + 2)
         grads = _drawing().draw_back(ctx.splats, ctx.drawings, pairs, harmonics=ctx.needs_input_grad[SH])
         # Gradients that are not wanted, and those of the shape that is not in use, are empty: None for torch.
-        return None, None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in zip(tensors, grads, strict=True))
+        return None, *(torch.from_numpy(g) if t is not None and len(g) == len(t) else None for t, g in zip(tensors, grads, strict=True))

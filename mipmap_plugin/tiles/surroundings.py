@@ -7,7 +7,7 @@ picture and the change of T (c + t B) since then.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
-from mipmap_plugin.adaptation.renderers import SteppingRenderer
+from mipmap_plugin.adaptation.renderers import Comparison, SteppingRenderer
 from mipmap_plugin.backends.base import Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -95,25 +95,17 @@ class Surroundings:
 
     def render(self, core: Gaussians, camera: Camera) -> Tensor:
         """The image [h, w, 3] of a crop, differentiable in the core's splats."""
-        return self._whole(camera, self._scene.backend.render(core, camera, self._effects))
+        return self.whole(camera, self._scene.backend.render(core, camera, self._effects))
 
     def render_views(self, core: Gaussians, cameras: Sequence[Camera], _: int = 0) -> list[Tensor]:
         """The same of several cameras, in one call if the backend can."""
         together = getattr(self._scene.backend, "render_views", None)
 
-        def draw(shots: Sequence[Shot]) -> list[Rendered]:
-            if together is None or len(shots) < 2:
-                return [self._scene.backend.render(core, *shot) for shot in shots]
-            return list(together(core, shots))
-
-        return self.images(cameras, draw)
-
-    def images(self, cameras: Sequence[Camera], draw: Callable[[Sequence[Shot]], list[Rendered]]) -> list[Tensor]:
-        """The images [h, w, 3] of cameras, from the pictures of the core that `draw` draws."""
         shown = [camera for camera in cameras if camera.name != NOTHING] or cameras[:1]  # one at least, so that every step has gradients
-        drawn = iter(draw([(camera, self._effects) for camera in shown]))
-        wholes = {camera: self._whole(camera, next(drawn)) for camera in shown}
-        return [wholes[camera] if camera in wholes else torch.zeros(1, 1, 3) for camera in cameras]
+        shots = [(camera, self._effects) for camera in shown]
+        drawn = [self._scene.backend.render(core, *shot) for shot in shots] if together is None or len(shots) < 2 else together(core, shots)
+        wholes = {camera: self.whole(camera, core) for camera, core in zip(shown, drawn, strict=True)}
+        return [wholes[camera] if camera in wholes else 0 * wholes[shown[0]][:1, :1] for camera in cameras]
 
     @property
     def to_step(self) -> SteppingRenderer | None:
@@ -121,7 +113,8 @@ class Surroundings:
         usual = SteppingRenderer.of(self._scene.backend, [self._effects])
         return None if usual is None else _InHalo(usual.stepper, usual.targets, self)
 
-    def _whole(self, camera: Camera, core: Rendered) -> Tensor:
+    def whole(self, camera: Camera, core: Rendered) -> Tensor:
+        """The image [h, w, 3] of a camera, in which the core looks like this."""
         if camera.name == NOTHING:
             return 0 * core.image
         around = self._surrounding(camera.name)
@@ -142,9 +135,18 @@ class _InHalo(SteppingRenderer):
 
     around: Surroundings
 
-    def images(self, stepper: Stepper, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
-        """See `SteppingRenderer`."""
-        return self.around.images(cameras, stepper.render)
+    def differentiate(self, stepper: Stepper, number: int, camera: Camera, draw: int, compare: Comparison) -> Tensor:
+        """See `SteppingRenderer`. The first view of a step is drawn whatever it shows, so that every step has gradients."""
+        if camera.name == NOTHING and number > 0:
+            return torch.zeros(())
+        core = stepper.render(number, camera, *self.targets)
+        image, alpha = core.image.requires_grad_(), core.alpha.requires_grad_()
+        whole = self.around.whole(camera, core)
+        gradient, square_error = compare(whole.detach())
+        whole.backward(gradient)
+        assert image.grad is not None  # since the whole contains it
+        stepper.differentiate(number, image.grad, alpha.grad)
+        return square_error
 
 
 def nothing(view: Camera) -> Camera:

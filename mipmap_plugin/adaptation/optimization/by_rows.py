@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.adam import Adam
-from mipmap_plugin.adaptation.renderers import SteppingRenderer
+from mipmap_plugin.adaptation.renderers import Comparison, SteppingRenderer
 from mipmap_plugin.backends.base import AdamStep, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
@@ -44,12 +44,12 @@ class ByRows:
         same = len(parameters) == len(self.parameters) and all(one is other for one, other in zip(parameters, self.parameters, strict=True))
         return same and self.versions == tuple(tensor._version for tensor in parameters)
 
-    def images(self, cameras: Sequence[Camera], draw: int) -> list[Tensor]:
-        """The images [h, w, 3] of the `draw`-th view since the beginning and of those after it, all views of a step."""
-        return self.draw.images(self.stepper, cameras, draw)
+    def differentiate(self, number: int, camera: Camera, draw: int, compare: Comparison) -> Tensor:
+        """Draw the view of that number in a step, the `draw`-th since the beginning, and compare its image; return the mean square error."""
+        return self.draw.differentiate(self.stepper, number, camera, draw, compare)
 
     def step(self, optimizer: Adam) -> None:
-        """Move the parameters, after `backward` for a loss of the images."""
+        """Move the parameters, once some views are differentiated."""
         self.stepper.step(adam_step(optimizer))
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 
+import torch
 from torch import Tensor
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.curve import CurvePoint, decibel, reason_to_stop
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
@@ -14,6 +16,7 @@ from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.estimate import BAR, Bar, Forecast
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
+from mipmap_plugin.adaptation.optimization.losses import gradient_of
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, views_at_once
@@ -24,11 +27,11 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.progress import ticking
 from mipmap_plugin.threads import side_by_side
 
-# The square of half a step of an 8-bit image: smaller mean square differences are invisible on a display, and hardly count.
-INVISIBLE_ERROR = (0.5 / 255) ** 2
-
 # Number of checks during the warm-up, while the rates rise.
 CHECKS_IN_WARM_UP = 10
+
+# Steps from which truths are made ahead, for each thread: as long as views are new, most steps have one.
+STEPS_AHEAD = 2
 
 # What ends a run whose observer returns True.
 STOPPED = "its observer"
@@ -49,6 +52,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
+                _make_truths(run, task, config, order, views)
                 with run.threads.step(len(views), run.costs):
                     _step(run, task, config, views, cameras)
                 if is_checked(run.step, config):
@@ -90,15 +94,26 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     at_once = views_at_once(cameras[views[0]]) if run.gradients is None else 1
     run.by_rows = ByRows.of(run.student, task.render_to_step, run.by_rows) if len(views) <= at_once else None
     if run.by_rows is not None:
-        images = run.by_rows.images([cameras[view] for view in views], run.step * config.views_per_step)  # x: the student
-        targets = _truths(run, task, views, cameras)  # r(x̂): the frozen base, resized
-        run.square_error = run.square_error + _backward(task, config, views, images, targets) / len(views)
-        run.by_rows.step(run.optimizer)
+        _step_by_rows(run, run.by_rows, task, config, views, cameras)
     else:
         _step_by_autograd(run, task, config, views, cameras, at_once)
     run.step += 1
     if run.step % config.prune_every == 0 and run.step < config.steps:
         control_density(run, task, config)
+
+
+def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
+    """A step by the backend, which sums the gradients of the views that are drawn and compared side by side."""
+
+    def differentiate(number: int) -> Tensor:
+        view = views[number]
+        target = run.costs.truth(view, task.truth)  # r(x̂): the frozen base, resized
+        draw = run.step * config.views_per_step + number
+        return rows.differentiate(number, cameras[view], draw, lambda x: _compare(task, config, view, x, target))  # x: the student
+
+    square_errors = list(side_by_side(differentiate, range(len(views)), math.gcd(len(views), threads.for_views())))
+    run.square_error = run.square_error + torch.stack(square_errors).mean()
+    rows.step(run.optimizer)
 
 
 # --8<-- [end:step]
@@ -114,10 +129,12 @@ def _step_by_autograd(
     at_once = at_once if splats.shares and task.render_views else 1
     for number in range(0, len(views), at_once):
         some = views[number : number + at_once]
-        targets = _truths(run, task, some, cameras)
+        targets = [run.costs.truth(view, task.truth) for view in some]
         gaussians = splats(cameras[some[0]])
         images = task.images(gaussians, [cameras[view] for view in some], run.step * config.views_per_step + number)
-        run.square_error = run.square_error + _backward(task, config, some, images, targets) / len(views)
+        compared = [_compare(task, config, *each) for each in zip(some, images, targets, strict=True)]
+        torch.autograd.backward(images, [gradient for gradient, _ in compared])
+        run.square_error = run.square_error + sum(square_error for _, square_error in compared) / len(views)
         if run.gradients is not None:
             run.gradients.add(*splats.means_gradient(gaussians), cameras[some[0]])
         splats.accumulate(gaussians)
@@ -128,35 +145,29 @@ def _step_by_autograd(
     run.optimizer.zero_grad()
 
 
-def _backward(task: Task, config: AdaptConfig, views: Sequence[Camera], images: Sequence[Tensor], targets: Sequence[Tensor]) -> Tensor:
-    """Differentiate the loss of some views; return the sum of their mean square errors."""
-    losses, square_errors = zip(*(_compare(task, config, *each) for each in zip(views, images, targets, strict=True)), strict=True)
-    sum(losses[1:], losses[0]).backward()
-    total: Tensor = sum(square_errors[1:], square_errors[0])
-    return total
-
-
-def _truths(run: Run, task: Task, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> list[Tensor]:
-    """The truths of some views; those that no step used yet are made side by side, with all threads."""
-    new = [view for view in views if view not in run.costs.truths]
-    with run.threads.paused():
-        threads = max_threads(run.student.parameters()["means"], cameras[views[0]]) if len(new) > 1 else 1
-        return list(side_by_side(lambda view: run.costs.truth(view, task.truth), views, threads))
-
-
 def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """The loss of one image, and its mean square error."""
-    difference = difference_from(target, image, config.resize)
-    square_error = difference.square().mean()
-    loss = _loss(difference, square_error, config.loss)
-    return loss if task.detail is None else loss + task.detail(view, image), square_error.detach().double()
+    """The gradient of the loss of an image, [h, w, 3], and its mean square error, []."""
+    image = image.detach()
+    if task.detail is None and image.shape == target.shape:
+        return gradient_of(image - target, config.loss)
+    difference = difference_from(target, image.requires_grad_(), config.resize)
+    gradient, square_error = gradient_of(difference.detach(), config.loss)
+    further = () if task.detail is None else (task.detail(view, image),)
+    [whole] = torch.autograd.grad((difference, *further), image, (gradient, *map(torch.ones_like, further)))
+    return whole, square_error
 
 
-def _loss(difference: Tensor, square_error: Tensor, name: str) -> Tensor:
-    """The loss of one image. `psnr` is the logarithm of the mean square error, so that a view that is far off does not outweigh the others."""
-    if name == "l1":
-        return difference.abs().mean()
-    return (square_error + INVISIBLE_ERROR).log() if name == "psnr" else square_error
+def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule, views: Sequence[Camera]) -> None:
+    """Make the truths of the views of a step that none used yet, and of some that are next to be used, so that each thread makes one."""
+    known, new = run.costs.truths, [view for view in views if view not in run.costs.truths]
+    if not new:
+        return
+    at_once = max_threads(run.student.parameters()["means"], new[0].zoomed(task.scale))
+    for step in range(run.step + 1, min(run.step + 1 + STEPS_AHEAD * at_once, config.steps)):
+        if len(new) >= at_once:
+            break
+        new += [view for view in order(step, run.progress(config)) if view not in known and view not in new]
+    list(side_by_side(lambda view: run.costs.truth(view, task.truth), new, at_once))
 
 
 def _check(run: Run, task: Task, config: AdaptConfig) -> None:

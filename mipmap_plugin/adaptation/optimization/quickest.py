@@ -43,15 +43,6 @@ class QuickestThreads:
             yield
         self.note(count, (time.perf_counter() - began - costs.seconds() + before) / max(1, views))
 
-    @contextmanager
-    def paused(self) -> Iterator[None]:
-        """Inside a step, all threads again, for work that is not the step's own."""
-        if self._most == 1:
-            yield
-            return
-        with threads.limited(self._most, shared=True):
-            yield
-
     def note(self, count: int, seconds: float) -> None:
         """Take note of the seconds that a step with so many threads took."""
         if self._step < 2 * TRIED:

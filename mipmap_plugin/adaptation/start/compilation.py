@@ -38,7 +38,7 @@ def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:
     raw = {name: getattr(splats, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
     stepper = backend.stepper(raw)
     unpacked = replace(effects, settings=replace(effects.settings, packing=None))
-    stepper.render([(CAMERA, unpacked)])[0].image.sum().backward()
+    stepper.differentiate(0, torch.zeros_like(stepper.render(0, CAMERA, unpacked).image))
     moments = {name: torch.zeros_like(tensor) for name, tensor in raw.items()}
     rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 0.0)
     stepper.step(AdamStep(raw, moments, moments, rates, betas=(0.9, 0.999), correction=1.0, eps=1.0))

@@ -111,8 +111,8 @@ def _step_answer(backend: Any, raw: Mapping[str, Tensor], case: HardCase, beta: 
     """The gradients that a first step of rate 0 shows: the first moments over 1 - beta1."""
     own, first, second = ({name: make(tensor) for name, tensor in raw.items()} for make in (torch.clone, torch.zeros_like, torch.zeros_like))
     stepper = backend.stepper(own)
-    [rendered] = stepper.render([(case.camera, case.effects)])
-    _squares(rendered).backward()
+    rendered = stepper.render(0, case.camera, case.effects)
+    stepper.differentiate(0, 2 * rendered.image, 2 * rendered.alpha)  # the gradients of `_squares`
     rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 0.0)
     stepper.step(AdamStep(own, first, second, rates, betas=(beta, beta), correction=1.0, eps=1.0))
     return Answer(_plain(rendered.image), _plain(rendered.alpha)[..., None], {name: _plain(each) / (1 - beta) for name, each in first.items()})

@@ -13,20 +13,19 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import AdamStep
 from mipmap_plugin.backends.cpu_kernels import adam
-from mipmap_plugin.backends.cpu_kernels.drawing import Drawing, add_views, tile_gradients
+from mipmap_plugin.backends.cpu_kernels.drawing import Drawing, add_views
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.records import SplatArrays
 from mipmap_plugin.backends.cpu_kernels.threads import team
 
 # Rows that are moved at a time: with their gradients, parameters and moments (four times 236 bytes each) they stay in the cache.
-ROWS = 1 << 11
+ROWS = 1 << 13
 
 
-def descend(splats: SplatArrays, drawings: Sequence[Drawing], d_outputs: Sequence[tuple[np.ndarray, np.ndarray]], step: AdamStep) -> None:
-    """Move the raw parameters of `splats` down the gradient, which follows from those of each view's image [H, W, 3] and alpha [H, W]."""
+def descend(splats: SplatArrays, views: Sequence[tuple[Drawing, np.ndarray]], step: AdamStep) -> None:
+    """Move the raw parameters of `splats` down the gradient, which follows from each view's gradient table (`drawing.tile_gradients`)."""
     count = len(splats.means)
-    threads = team(sum(count + drawn.alpha.size for drawn in drawings))
-    tiles = tile_gradients(drawings, d_outputs, threads)
+    threads = team(count * len(views))
     raw, firsts, seconds = (_arrays(tensors) for tensors in (step.raw, step.first, step.second))
     rates = _rates(step, splats.sh.shape[1])
     settings = tuple(np.float32(number) for number in (1 - step.betas[0], 1 - step.betas[1], step.correction, step.eps))
@@ -36,7 +35,7 @@ def descend(splats: SplatArrays, drawings: Sequence[Drawing], d_outputs: Sequenc
         for first in range(start, stop, ROWS):
             last = min(first + ROWS, stop)
             grads = room.zeros(last - first)
-            add_views(first, last, splats, drawings, tiles, grads)
+            add_views(first, last, splats, views, grads)
             adam.step(first, last, splats, grads, raw, firsts, seconds, rates, settings)
 
     threads.share(move, count, of_rows=True)

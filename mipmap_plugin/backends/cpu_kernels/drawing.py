@@ -102,7 +102,7 @@ def draw_back(
     harmonics: whether to compute those of the coefficients, by far the largest array; else that array is empty.
     """
     threads = team(sum(len(splats.means) + drawn.alpha.size for drawn in drawings))
-    tiles = tile_gradients(drawings, d_outputs, threads)
+    views = list(zip(drawings, tile_gradients(drawings, d_outputs), strict=True))
     grads = SplatArrays(*(empty(*array.shape) for array in splats))
     if not harmonics:
         grads = grads._replace(sh=grads.sh[:0])
@@ -113,14 +113,15 @@ def draw_back(
             own = SplatArrays(*(array[first:last] for array in grads))
             for array in own:
                 array[:] = 0
-            add_views(first, last, splats, drawings, tiles, own)
+            add_views(first, last, splats, views, own)
 
     threads.share(add, len(splats.means), of_rows=True)
     return grads
 
 
-def tile_gradients(drawings: Sequence[Drawing], d_outputs: Sequence[tuple[np.ndarray, np.ndarray]], threads: Team) -> list[np.ndarray]:
+def tile_gradients(drawings: Sequence[Drawing], d_outputs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
     """The gradient table [pairs, GRADS] of each view, from the gradients of its image [H, W, 3] and alpha [H, W]."""
+    threads = team(sum(len(drawn.table) + drawn.alpha.size for drawn in drawings))
     tables = [empty(len(drawn.lists.members), layout.GRADS) for drawn in drawings]
     windows, points = [], []
     for d, outputs, into in zip(drawings, d_outputs, tables, strict=True):
@@ -134,9 +135,12 @@ def tile_gradients(drawings: Sequence[Drawing], d_outputs: Sequence[tuple[np.nda
     return tables
 
 
-def add_views(start: int, stop: int, splats: SplatArrays, drawings: Sequence[Drawing], tiles: Sequence[np.ndarray], grads: SplatArrays) -> None:
-    """Add the gradients of the splats start..stop to the rows of `grads`: what no view shows has none, and costs nothing."""
-    for drawn, table in zip(drawings, tiles, strict=True):
+def add_views(start: int, stop: int, splats: SplatArrays, views: Sequence[tuple[Drawing, np.ndarray]], grads: SplatArrays) -> None:
+    """Add the gradients of the splats start..stop, from the views' gradient tables, to the rows of `grads`.
+
+    What no view shows has none, and costs nothing.
+    """
+    for drawn, table in views:
         projection_back.project_back(start, stop, drawn.flags, drawn.view, splats, drawn.table, drawn.slots, table, grads)
 
 

@@ -1,0 +1,51 @@
+"""Steps over the splats of 3DGS: views are drawn and differentiated, in threads if wanted, and one kernel moves what they are drawn from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mipmap_plugin.backends.base import AdamStep, Rendered
+from mipmap_plugin.backends.cpu_kernels import ahead, descending, drawing
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+
+# Splats, a camera and effects -> the splats' tensors as drawn, and their ranks; it raises BackendUnavailable.
+Prepare = Callable[[Gaussians, Camera, Effects], tuple[tuple[Any, ...], Any]]
+
+
+class CpuStepper:
+    """See `base.Stepper`. It keeps the activated splats from step to step: the kernel that moves a row activates it anew."""
+
+    def __init__(self, raw: Mapping[str, Tensor], prepare: Prepare) -> None:
+        activated, self._prepare = descending.activated(raw), prepare
+        self._gaussians = Gaussians(**{name: torch.from_numpy(array) for name, array in activated.items()})
+        self._splats = drawing.SplatArrays(**activated, covariances=np.empty((0, 3, 3), np.float32))
+        self._drawn: dict[int, drawing.Drawing] = {}  # the views of a step, by their numbers
+        self._tables: dict[int, np.ndarray] = {}  # and their gradient tables
+
+    def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
+        _, ranks = self._prepare(self._gaussians, camera, effects)
+        ahead.start(False, effects)
+        [drawn] = drawing.draw(self._splats, [drawing.Shot(camera, effects, ranks)])
+        self._drawn[number] = drawn
+        ahead.wait(False, effects)
+        return Rendered(torch.from_numpy(drawn.image), torch.from_numpy(drawn.alpha))
+
+    def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
+        drawn = self._drawn[number]
+        outputs = d_image.contiguous().numpy(), np.zeros_like(drawn.alpha) if d_alpha is None else d_alpha.contiguous().numpy()
+        [self._tables[number]] = drawing.tile_gradients([drawn], [outputs])
+
+    def step(self, step: AdamStep) -> None:
+        if not self._tables:
+            raise RuntimeError("a step needs the gradient of an image; call differentiate() first")
+        views = [(self._drawn[number], self._tables[number]) for number in sorted(self._tables)]
+        self._drawn.clear()
+        self._tables.clear()
+        descending.descend(self._splats, views, step)
