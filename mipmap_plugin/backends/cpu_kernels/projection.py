@@ -11,8 +11,9 @@ from numba import types
 from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout, windows
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, lowest_bit, maximum, narrow, select, sqrt
-from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
+from mipmap_plugin.backends.cpu_kernels.columns import apart, transpose
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, lowest_bit, maximum, narrow, select, sqrt, total, wide
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
 from mipmap_plugin.backends.cpu_kernels.powers import log2
 from mipmap_plugin.backends.cpu_kernels.records import OVER_PIXEL
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, minus, plus, times
@@ -38,15 +39,19 @@ new_block, new_bands = scratch(layout.SPLAT_FIELDS * WIDTH, types.float32), scra
 @kernel
 def project(start, stop, flags, view, splats, table, depths, counts):
     """Fill the rows start..stop of the table, of the depths and of the numbers of tiles touched; 0 tiles: not drawn. flags: see `Flags`."""
-    covariances, integrated, reshaped, _, fourth = flags
+    covariances, integrated, reshaped, _, fourth, third = flags
     sh = pointer(splats.sh)
     arrays, rows, stride = pointers(splats), pointer(table), 3 * splats.sh.shape[1]
-    world, sizes, block, bands = new_world(), new_sizes(), new_block(), new_bands()
+    world, sizes, block, row_of, bands, bands_of = new_world(), new_sizes(), new_block(), new_block(), new_bands(), new_bands()
     for first in range(start, stop, WIDTH):
         size = min(WIDTH, stop - first)
         for lane in range(size):
             counts[first + lane] = 0
-            load_splat(first + lane, lane, arrays, covariances, world)
+        if size == WIDTH and covariances is None:
+            load_splats(first, arrays, world)
+        else:
+            for lane in range(size):
+                load_splat(first + lane, lane, arrays, covariances, world)
         p = plus(apply(view.rotation, get_vector(world, MEAN)), view.translation)
         jac = ellipses.jacobian(view, p)
         shape = project_any(jac, covariances, world)
@@ -56,20 +61,46 @@ def project(start, stop, flags, view, splats, table, depths, counts):
         visible = bits(get(sizes, 1) > 0) & ((1 << size) - 1)
         if visible != 0:
             harmonics.basis(narrowed(view_direction(view, get_vector(world, MEAN))[0]), view.sh_degree, fourth, bands)
+            transpose(block, row_of)
+            if third is not None:
+                transpose(bands, bands_of)
         while visible != 0:
             lane = lowest_bit(visible)
             visible &= visible - 1
             i = first + lane
-            if fill_color(i * stride, lane, view, sh, bands, block):
+            if fill_color(color_of(i * stride, lane, view, third, sh, bands, bands_of), lane * layout.SPLAT_FIELDS, view, row_of):
                 depths[i], counts[i] = sizes[lane], int(sizes[WIDTH + lane])
-                for k in range(layout.SPLAT_FIELDS):
-                    rows[i * layout.SPLAT_FIELDS + k] = block[k * WIDTH + lane]
+                store(rows, i * layout.SPLAT_FIELDS, load(row_of, lane * layout.SPLAT_FIELDS))
 
 
 @inner
 def pointers(splats):
     """Pointers to the arrays of splats, without the coefficients."""
     return pointer(splats.means), pointer(splats.opacities), pointer(splats.quats), pointer(splats.scales), pointer(splats.covariances)
+
+
+@inner
+def load_splats(first, arrays, world):
+    """Load 16 splats in a row, which have no covariances."""
+    means, opacities, quats, scales, _ = arrays
+    put_wide(world, MEAN, apart(load_rows_of_3(means, first)))
+    put(world, OPACITY, wide(load(opacities, first)))
+    at = 4 * first
+    put_wide(world, QUAT, apart((load(quats, at), load(quats, at + WIDTH), load(quats, at + 2 * WIDTH), load(quats, at + 3 * WIDTH))))
+    put_wide(world, SCALE, apart(load_rows_of_3(scales, first)))
+
+
+@inner
+def load_rows_of_3(array, first):
+    """16 rows of an array [n, 3], as `apart` takes them."""
+    at = 3 * first
+    return load(array, at), load(array, at + WIDTH), load(array, at + 2 * WIDTH)
+
+
+@inner
+def put_wide(world, field, columns):
+    for k in range(len(columns)):
+        put(world, field + k, wide(columns[k]))
 
 
 @inner
@@ -195,19 +226,31 @@ def fill_ellipse(x, y, shape, opacity, block):
 
 
 @inner
-def fill_color(at, lane, view, sh, bands, block):
-    """Write a splat's color in this view's direction to its lane; returns whether it is finite. Its coefficients start at sh[at]."""
-    half, largest = np.float32(0.5), np.float32(view.max_color)
+def color_of(at, lane, view, third, sh, bands, bands_of):
+    """The color of the splat in a lane, in this view's direction. Its coefficients start at sh[at]; `bands_of`, if `third`: bands lane by lane."""
+    half = np.float32(0.5)
     red, green, blue = half, half, half
+    if third is not None:
+        band = load(bands_of, lane * WIDTH)
+        reds, greens, blues = apart((load(sh, at), load(sh, at + WIDTH), load(sh, at + 2 * WIDTH)))
+        return half + total(band * reds), half + total(band * greens), half + total(band * blues)
     for j in range((view.sh_degree + 1) ** 2):
         band = bands[j * WIDTH + lane]
         red += band * sh[at + 3 * j]
         green += band * sh[at + 3 * j + 1]
         blue += band * sh[at + 3 * j + 2]
+    return red, green, blue
+
+
+@inner
+def fill_color(color, at, view, row_of):
+    """Write a splat's color to its row, which begins at row_of[at]; returns whether it is finite."""
+    red, green, blue = color
+    largest = np.float32(view.max_color)
     red_step, green_step, blue_step = view.color_steps
-    block[layout.RED * WIDTH + lane] = quantized(min(max(red, 0), largest), red_step, largest)
-    block[layout.GREEN * WIDTH + lane] = quantized(min(max(green, 0), largest), green_step, largest)
-    block[layout.BLUE * WIDTH + lane] = quantized(min(max(blue, 0), largest), blue_step, largest)
+    row_of[at + layout.RED] = quantized(min(max(red, 0), largest), red_step, largest)
+    row_of[at + layout.GREEN] = quantized(min(max(green, 0), largest), green_step, largest)
+    row_of[at + layout.BLUE] = quantized(min(max(blue, 0), largest), blue_step, largest)
     return abs(red) < HUGE and abs(green) < HUGE and abs(blue) < HUGE
 
 

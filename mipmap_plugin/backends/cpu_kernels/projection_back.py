@@ -10,8 +10,9 @@ from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
+from mipmap_plugin.backends.cpu_kernels.columns import apart, repeated, thrice, transpose
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, select, wide
-from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
 from mipmap_plugin.backends.cpu_kernels.projection import (
     COVARIANCE,
     MEAN,
@@ -38,11 +39,12 @@ def project_back(start, stop, flags, view, splats, table, slots, tile_grads, gra
 
     Splat i's tiles have the rows slots[i]..slots[i + 1] of tile_grads.
     """
-    covariances, integrated, reshaped, _, fourth = flags
+    covariances, integrated, reshaped, _, fourth, third = flags
     stride = 3 * splats.sh.shape[1]
     colors = pointer(splats.sh), pointer(grads.sh), pointer(table), stride, len(grads.sh) > 0, start
     arrays, targets, tile_rows = pointers(splats), pointers(grads), pointer(tile_grads)
-    world, d_world, sums, bands, d_bands, rows, size = new_world(), new_world(), new_sums(), new_bands(), new_bands(), new_rows(), 0
+    world, d_world, sums, rows, size = new_world(), new_world(), new_sums(), new_rows(), 0
+    bands = new_bands(), new_bands(), new_bands(), new_bands()
     for i in range(start, stop):
         if slots[i] < slots[i + 1]:
             sum_tiles(tile_rows, slots[i], slots[i + 1], size, sums)
@@ -51,7 +53,7 @@ def project_back(start, stop, flags, view, splats, table, slots, tile_grads, gra
             size += 1
         if size == WIDTH or (i == stop - 1 and size > 0):
             grad_splats(view, covariances, integrated, reshaped, world, sums, d_world)
-            grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d_world)
+            grad_colors(view, fourth, third, rows, size, world, sums, colors, bands, d_world)
             for lane in range(size):
                 store_grads(rows[lane] - start, lane, d_world, targets, covariances)
             size = 0
@@ -186,12 +188,19 @@ def grad_integral(view, shape, dilated, opacity, sums):
 
 
 @inner
-def grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d_world):
-    """The gradients through the color: add those of the coefficients if wanted, and those of the means in `d_world`."""
+def grad_colors(view, fourth, third, rows, size, world, sums, colors, spaces, d_world):
+    """The gradients through the color: add those of the coefficients if wanted, and those of the means in `d_world`. spaces: for bands."""
+    bands, d_bands, bands_of, d_bands_of = spaces
     direction, length = view_direction(view, get_vector(world, MEAN))
     harmonics.basis(narrowed(direction), view.sh_degree, fourth, bands)
-    for lane in range(size):
-        grad_color(rows[lane], lane, view, colors, sums, bands, d_bands)
+    if third is not None:
+        transpose(bands, bands_of)
+        for lane in range(size):
+            grad_color_of_third(rows[lane], lane, view, colors, sums, bands_of, d_bands_of)
+        transpose(d_bands_of, d_bands)
+    else:
+        for lane in range(size):
+            grad_color(rows[lane], lane, view, colors, sums, bands, d_bands)
     if view.sh_degree > 0:
         d_x, d_y, d_z = harmonics.grad_direction(narrowed(direction), view.sh_degree, fourth, d_bands)
         d_direction = wide(d_x), wide(d_y), wide(d_z)
@@ -201,15 +210,21 @@ def grad_colors(view, fourth, rows, size, world, sums, colors, bands, d_bands, d
 
 
 @inner
-def grad_color(i, lane, view, colors, sums, bands, d_bands):
-    """The gradients of splat i's coefficients and, in its lane, of its spherical harmonics."""
-    sh, d_sh, table, stride, wanted, start = colors
-    at, row, zero, largest = i * stride, i * layout.SPLAT_FIELDS, np.float32(0), np.float32(view.max_color)
-    # A channel that was clamped to black or to the largest color has no gradient.
+def grad_shown(i, lane, view, table, sums):
+    """The gradient of splat i's color. A channel that was clamped to black or to the largest color has none."""
+    row, zero, largest = i * layout.SPLAT_FIELDS, np.float32(0), np.float32(view.max_color)
     d_red = np.float32(sums[layout.GRAD_RED * WIDTH + lane]) if 0 < table[row + layout.RED] < largest else zero
     d_green = np.float32(sums[layout.GRAD_GREEN * WIDTH + lane]) if 0 < table[row + layout.GREEN] < largest else zero
     d_blue = np.float32(sums[layout.GRAD_BLUE * WIDTH + lane]) if 0 < table[row + layout.BLUE] < largest else zero
-    used = (view.sh_degree + 1) ** 2
+    return d_red, d_green, d_blue
+
+
+@inner
+def grad_color(i, lane, view, colors, sums, bands, d_bands):
+    """The gradients of splat i's coefficients and, in its lane, of its spherical harmonics."""
+    sh, d_sh, table, stride, wanted, start = colors
+    at, used = i * stride, (view.sh_degree + 1) ** 2
+    d_red, d_green, d_blue = grad_shown(i, lane, view, table, sums)
     for j in range(used):
         d_bands[j * WIDTH + lane] = d_red * sh[at + 3 * j] + d_green * sh[at + 3 * j + 1] + d_blue * sh[at + 3 * j + 2]
     if wanted:
@@ -219,3 +234,19 @@ def grad_color(i, lane, view, colors, sums, bands, d_bands):
             d_sh[into + 3 * j] += d_red * band
             d_sh[into + 3 * j + 1] += d_green * band
             d_sh[into + 3 * j + 2] += d_blue * band
+
+
+@inner
+def grad_color_of_third(i, lane, view, colors, sums, bands_of, d_bands_of):
+    """`grad_color` for harmonics of degree 3, to the same bits; bands lane by lane."""
+    sh, d_sh, table, stride, wanted, start = colors
+    at = i * stride
+    d_red, d_green, d_blue = grad_shown(i, lane, view, table, sums)
+    first, second, third = repeated(d_red, d_green, d_blue)
+    reds, greens, blues = apart((first * load(sh, at), second * load(sh, at + WIDTH), third * load(sh, at + 2 * WIDTH)))
+    store(d_bands_of, lane * WIDTH, reds + greens + blues)
+    if wanted:
+        into, (one, two, three) = at - start * stride, thrice(load(bands_of, lane * WIDTH))
+        store(d_sh, into, load(d_sh, into) + first * one)
+        store(d_sh, into + WIDTH, load(d_sh, into + WIDTH) + second * two)
+        store(d_sh, into + 2 * WIDTH, load(d_sh, into + 2 * WIDTH) + third * three)

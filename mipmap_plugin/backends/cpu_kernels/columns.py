@@ -1,0 +1,84 @@
+"""Rows and columns of 16: of arrays whose rows are short, and of a splat's coefficients of degree 3, 16 bands of red, green and blue."""
+
+# numba redefines calls and operators.
+# mypy: ignore-errors
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from mipmap_plugin.backends.cpu_kernels.lanes import INTS32, LANES, VECTOR32, WIDTH
+
+CHANNELS, BANDS = 3, WIDTH
+THREE = types.UniTuple(LANES, CHANNELS)
+
+
+def _shuffled(builder, first, second, pattern):
+    """The numbers of two vectors, of which the second's count from 16, at the positions of a pattern."""
+    return builder.shuffle_vector(first, second, ir.Constant(INTS32, pattern))
+
+
+@intrinsic
+def apart(_context, rows):
+    """The columns of an array [16, n], whose rows lie in n vectors, one after the other."""
+
+    def generate(context, builder, signature, values):
+        vectors, columns = cgutils.unpack_tuple(builder, values[0], rows.count), []
+        for column in range(rows.count):
+            places = [rows.count * row + column for row in range(WIDTH)]
+            found = _shuffled(builder, vectors[0], vectors[1], [min(place, 2 * WIDTH - 1) for place in places])
+            for number in range(2, rows.count):
+                pattern = [row if place < number * WIDTH else WIDTH + min(place - number * WIDTH, WIDTH - 1) for row, place in enumerate(places)]
+                found = _shuffled(builder, found, vectors[number], pattern)
+            columns.append(found)
+        return cgutils.pack_array(builder, columns)
+
+    return types.UniTuple(LANES, rows.count)(rows), generate
+
+
+@intrinsic
+def thrice(_context, bands):
+    """The number of each band, once for each of its coefficients."""
+
+    def generate(context, builder, signature, values):
+        patterns = [[(WIDTH * part + lane) // CHANNELS for lane in range(WIDTH)] for part in range(CHANNELS)]
+        return cgutils.pack_array(builder, [_shuffled(builder, values[0], values[0], pattern) for pattern in patterns])
+
+    return THREE(bands), generate
+
+
+@intrinsic
+def repeated(_context, red, green, blue):
+    """A number of each channel, float32, once for each of its coefficients."""
+
+    def generate(context, builder, signature, values):
+        once = ir.Constant(VECTOR32, ir.Undefined)
+        for channel, value in enumerate(values):
+            once = builder.insert_element(once, value, ir.IntType(32)(channel))
+        patterns = [[(WIDTH * part + lane) % CHANNELS for lane in range(WIDTH)] for part in range(CHANNELS)]
+        return cgutils.pack_array(builder, [_shuffled(builder, once, once, pattern) for pattern in patterns])
+
+    return THREE(types.float32, types.float32, types.float32), generate
+
+
+@intrinsic
+def transpose(_context, source, target):
+    """Write the transpose of 16 x 16 float32 at one pointer to another: blocks that lie across from each other are swapped, ever larger ones."""
+
+    def generate(context, builder, signature, values):
+        read, written = (builder.bitcast(value, VECTOR32.as_pointer()) for value in values)
+        rows = [builder.load(builder.gep(read, [ir.IntType(64)(row)]), align=4) for row in range(WIDTH)]
+        size = 1
+        while size < WIDTH:
+            upper = [lane if not lane & size else WIDTH + lane - size for lane in range(WIDTH)]
+            lower = [lane + size if not lane & size else WIDTH + lane for lane in range(WIDTH)]
+            for row in (row for row in range(WIDTH) if not row & size):
+                pair = rows[row], rows[row + size]
+                rows[row], rows[row + size] = _shuffled(builder, *pair, upper), _shuffled(builder, *pair, lower)
+            size *= 2
+        for row, vector in enumerate(rows):
+            builder.store(vector, builder.gep(written, [ir.IntType(64)(row)]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, target), generate
