@@ -27,9 +27,10 @@ def columns_of_4(source, target):
 
 @numba.njit
 def bands_and_channels(source, target):
-    for k, (bands, channels) in enumerate(zip(thrice(load(source, 0)), repeated(source[0], source[1], source[2]), strict=True)):
-        store(target, 16 * k, bands)
-        store(target, 48 + 16 * k, channels)
+    bands, channels = thrice(load(source, 0)), repeated(source[0], source[1], source[2])
+    for k in range(3):
+        store(target, 16 * k, bands[k])
+        store(target, 48 + 16 * k, channels[k])
 
 
 def made(function, numbers, size):

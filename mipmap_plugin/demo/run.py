@@ -44,9 +44,6 @@ SAMPLES = {True: 64, False: 4}  # zoomed out, zoomed in
 # Pictures are shown at this many px, so that a small image is enlarged pixel by pixel and the eye sees what a screen shows.
 SHOWN = 480
 
-# Steps at zoom-out and zoom-in: half of the recipe's, and at most 0.4 dB behind it, for whoever waits.
-STEPS = {True: 300, False: 100}
-
 # Seconds to adapt to each scale at most, where there is only the reference: the demo should end within three minutes. It then adapts to
 # every so many-th training view, one a step, for the truth of a view costs as much as some steps.
 REFERENCE_BUDGET_S = 45.0
@@ -94,7 +91,7 @@ def run_demo(
     for scale in scales:
         judge = Evaluator(judged_views(base, scale), PROTOCOL, watcher=gallery)
         # Adapted first, because that begins with all compilation, on two cores.
-        adapted = base.adapt(scale, viewer=viewer, resize="box", **settings_for(base, scale))
+        adapted = base.adapt(scale, viewer=viewer, resize="box", **settings_for(base))
         rows += training_free_rows(base, judge, scale, without=("window",), viewer=viewer)  # most of a minute a view on the reference
         rows.append(adapted_row("adapted", adapted, judge))
         adapted.save(output / f"x{scale:g}.ply", overwrite=overwrite)
@@ -128,10 +125,10 @@ def judged_views(base: Wrapped, scale: float) -> list[WorldView]:
     return views
 
 
-def settings_for(base: Wrapped, scale: float) -> dict[str, Any]:
-    """Less work than the recipe's, and less again where only the reference can do it."""
+def settings_for(base: Wrapped) -> dict[str, Any]:
+    """Those of the recipe, and less work where only the reference can do it."""
     if base.backend(gradients=True)[0].name != "reference":
-        return {"steps": STEPS[scale < 1]}
+        return {}
     train = [camera for camera in base.cameras if camera.split == "train"][::REFERENCE_EVERY]
     return dict(cameras=train, views="given", views_per_step=1, time_budget_s=REFERENCE_BUDGET_S)
 
