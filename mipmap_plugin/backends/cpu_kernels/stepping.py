@@ -31,7 +31,7 @@ class CpuStepper:
 
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
         _, ranks = self._prepare(self._gaussians, camera, effects)
-        ahead.start(False, effects)
+        ahead.start(False, effects)  # the backward pass is compiled while the forward pass is
         [drawn] = drawing.draw(self._splats, [drawing.Shot(camera, effects, ranks)])
         self._drawn[number] = drawn
         ahead.wait(False, effects)
