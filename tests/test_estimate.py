@@ -77,7 +77,7 @@ def test_truth_and_validation_have_rows_of_their_own_in_the_report():
     assert sum(seconds[phase] for phase in seconds.keys() - {"total"}) == pytest.approx(seconds["total"], rel=0.2)
 
 
-def test_truths_are_made_side_by_side_and_ahead(monkeypatch):
+def test_truths_are_made_side_by_side_and_ahead():
     """One for each thread, from the steps that come next; each once."""
     made, views = [], tiny.cameras(12)
     config = recipe("default", SCALE, steps=40, views_per_step=2, warm_up=0, gathering=1.0)

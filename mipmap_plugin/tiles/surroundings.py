@@ -19,7 +19,6 @@ from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
 from mipmap_plugin.adaptation.renderers import Comparison, SteppingRenderer
 from mipmap_plugin.backends.base import Rendered, Stepper
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.tiles.folder import halo_file, layer_file
 from mipmap_plugin.tiles.halo import FINE
@@ -34,8 +33,6 @@ KEPT = 2 * VIEWS_AT_ONCE
 
 # The name of a view that does not show the core.
 NOTHING = "nothing"
-
-Shot = tuple[Camera, Effects]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +97,10 @@ class Surroundings:
     def render_views(self, core: Gaussians, cameras: Sequence[Camera], _: int = 0) -> list[Tensor]:
         """The same of several cameras, in one call if the backend can."""
         together = getattr(self._scene.backend, "render_views", None)
-
         shown = [camera for camera in cameras if camera.name != NOTHING] or cameras[:1]  # one at least, so that every step has gradients
         shots = [(camera, self._effects) for camera in shown]
         drawn = [self._scene.backend.render(core, *shot) for shot in shots] if together is None or len(shots) < 2 else together(core, shots)
-        wholes = {camera: self.whole(camera, core) for camera, core in zip(shown, drawn, strict=True)}
+        wholes = {camera: self.whole(camera, picture) for camera, picture in zip(shown, drawn, strict=True)}
         return [wholes[camera] if camera in wholes else 0 * wholes[shown[0]][:1, :1] for camera in cameras]
 
     @property

@@ -8,7 +8,9 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import INTS32, LANES, VECTOR32, WIDTH
+from mipmap_plugin.backends.cpu_kernels.memory import load
 
 CHANNELS, BANDS = 3, WIDTH
 THREE = types.UniTuple(LANES, CHANNELS)
@@ -17,6 +19,12 @@ THREE = types.UniTuple(LANES, CHANNELS)
 def _shuffled(builder, first, second, pattern):
     """The numbers of two vectors, of which the second's count from 16, at the positions of a pattern."""
     return builder.shuffle_vector(first, second, ir.Constant(INTS32, pattern))
+
+
+@inner
+def load_three(array, at):
+    """The 48 numbers from array[at] on, as three vectors: 16 rows of an array [n, 3], or a splat's coefficients."""
+    return load(array, at), load(array, at + WIDTH), load(array, at + 2 * WIDTH)
 
 
 @intrinsic

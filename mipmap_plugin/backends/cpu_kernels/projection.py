@@ -11,7 +11,7 @@ from numba import types
 from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout, windows
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put
-from mipmap_plugin.backends.cpu_kernels.columns import apart, transpose
+from mipmap_plugin.backends.cpu_kernels.columns import apart, load_three, transpose
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, lowest_bit, maximum, narrow, select, sqrt, total, wide
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
 from mipmap_plugin.backends.cpu_kernels.powers import log2
@@ -83,22 +83,16 @@ def pointers(splats):
 def load_splats(first, arrays, world):
     """Load 16 splats in a row, which have no covariances."""
     means, opacities, quats, scales, _ = arrays
-    put_wide(world, MEAN, apart(load_rows_of_3(means, first)))
+    put_wide(world, MEAN, apart(load_three(means, 3 * first)))
     put(world, OPACITY, wide(load(opacities, first)))
     at = 4 * first
     put_wide(world, QUAT, apart((load(quats, at), load(quats, at + WIDTH), load(quats, at + 2 * WIDTH), load(quats, at + 3 * WIDTH))))
-    put_wide(world, SCALE, apart(load_rows_of_3(scales, first)))
-
-
-@inner
-def load_rows_of_3(array, first):
-    """16 rows of an array [n, 3], as `apart` takes them."""
-    at = 3 * first
-    return load(array, at), load(array, at + WIDTH), load(array, at + 2 * WIDTH)
+    put_wide(world, SCALE, apart(load_three(scales, 3 * first)))
 
 
 @inner
 def put_wide(world, field, columns):
+    """Write consecutive fields, as float64."""
     for k in range(len(columns)):
         put(world, field + k, wide(columns[k]))
 
@@ -232,7 +226,7 @@ def color_of(at, lane, view, third, sh, bands, bands_of):
     red, green, blue = half, half, half
     if third is not None:
         band = load(bands_of, lane * WIDTH)
-        reds, greens, blues = apart((load(sh, at), load(sh, at + WIDTH), load(sh, at + 2 * WIDTH)))
+        reds, greens, blues = apart(load_three(sh, at))
         return half + total(band * reds), half + total(band * greens), half + total(band * blues)
     for j in range((view.sh_degree + 1) ** 2):
         band = bands[j * WIDTH + lane]

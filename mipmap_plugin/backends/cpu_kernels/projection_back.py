@@ -10,7 +10,7 @@ from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
-from mipmap_plugin.backends.cpu_kernels.columns import apart, repeated, thrice, transpose
+from mipmap_plugin.backends.cpu_kernels.columns import apart, load_three, repeated, thrice, transpose
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, select, wide
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
 from mipmap_plugin.backends.cpu_kernels.projection import (
@@ -243,7 +243,8 @@ def grad_color_of_third(i, lane, view, colors, sums, bands_of, d_bands_of):
     at = i * stride
     d_red, d_green, d_blue = grad_shown(i, lane, view, table, sums)
     first, second, third = repeated(d_red, d_green, d_blue)
-    reds, greens, blues = apart((first * load(sh, at), second * load(sh, at + WIDTH), third * load(sh, at + 2 * WIDTH)))
+    one, two, three = load_three(sh, at)
+    reds, greens, blues = apart((first * one, second * two, third * three))
     store(d_bands_of, lane * WIDTH, reds + greens + blues)
     if wanted:
         into, (one, two, three) = at - start * stride, thrice(load(bands_of, lane * WIDTH))

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import AdamStep, Rendered
 from mipmap_plugin.backends.cpu_kernels import ahead, descending, drawing
+from mipmap_plugin.backends.cpu_kernels.records import SplatArrays
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -25,7 +26,7 @@ class CpuStepper:
     def __init__(self, raw: Mapping[str, Tensor], prepare: Prepare) -> None:
         activated, self._prepare = descending.activated(raw), prepare
         self._gaussians = Gaussians(**{name: torch.from_numpy(array) for name, array in activated.items()})
-        self._splats = drawing.SplatArrays(**activated, covariances=np.empty((0, 3, 3), np.float32))
+        self._splats = SplatArrays(**activated, covariances=np.empty((0, 3, 3), np.float32))
         self._drawn: dict[int, drawing.Drawing] = {}  # the views of a step, by their numbers
         self._tables: dict[int, np.ndarray] = {}  # and their gradient tables
 
@@ -33,8 +34,8 @@ class CpuStepper:
         _, ranks = self._prepare(self._gaussians, camera, effects)
         ahead.start(False, effects)  # the backward pass is compiled while the forward pass is
         [drawn] = drawing.draw(self._splats, [drawing.Shot(camera, effects, ranks)])
-        self._drawn[number] = drawn
         ahead.wait(False, effects)
+        self._drawn[number] = drawn
         return Rendered(torch.from_numpy(drawn.image), torch.from_numpy(drawn.alpha))
 
     def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:

@@ -19,7 +19,7 @@ from mipmap_plugin import threads
 CHUNK_SHARE, MIN_CHUNK_SHARE = 1 / 2, 1 / 32
 
 # Rows of splats that are worth a call of their own.
-LEAST_ROWS = 1 << 11
+LEAST_ROWS = 1 << 12
 
 # Splats plus pixels from which on a second thread pays off: this many take some 0.8 ms, and to begin a share of them 60 us.
 MIN_WORK = 1 << 12
