@@ -9,7 +9,7 @@ from collections import deque
 
 import numpy as np
 
-# Bytes of a cache line, at which arrays begin, unlike numpy's own.
+# Bytes of a cache line. Arrays whose rows are cache lines begin at one, unlike numpy's own, and so do large ones.
 CACHE_LINE = 64
 
 # Bytes from which on memory is used again. The system hands out memory below this size without asking the kernel for it.
@@ -23,22 +23,27 @@ class Pool:
     """Blocks of memory whose arrays are gone. It never holds more spare bytes than were in use at one time."""
 
     def __init__(self) -> None:
+        self._returned: deque[np.ndarray] = deque()  # by finalizers. Python may run these anywhere, also in here, so that they wait for no lock
         self._spare: deque[np.ndarray] = deque()
         self._used = self._most_used = 0
         self._lock = threading.Lock()
 
     def empty(self, shape: tuple[int, ...], dtype: type) -> np.ndarray:
         """An uninitialized array. Its memory is spare again when no array or tensor refers to it any more."""
-        size = math.prod(shape) * np.dtype(dtype).itemsize
+        number = np.dtype(dtype).itemsize
+        size = math.prod(shape) * number
+        if size < LARGE and shape[-1] * number != CACHE_LINE:
+            return np.empty(shape, dtype)
         block = self._take(size) if size >= LARGE else _new_block(size)
         start = -block.__array_interface__["data"][0] % CACHE_LINE
         array: np.ndarray = np.frombuffer(block.data[start : start + size], dtype)
         if size >= LARGE:
-            weakref.finalize(array, self._give_back, block).atexit = False  # all views of the array refer to it
+            weakref.finalize(array, self._returned.append, block).atexit = False  # all views of the array refer to it
         return array.reshape(shape)
 
     def _take(self, size: int) -> np.ndarray:
         with self._lock:
+            self._collect()
             fitting = [block for block in self._spare if size <= len(block) - CACHE_LINE <= MOST_WASTE * size]
             block = min(fitting, key=len, default=None)
             if block is None:
@@ -49,21 +54,26 @@ class Pool:
             self._most_used = max(self._most_used, self._used)
         return block
 
-    def _give_back(self, block: np.ndarray) -> None:
-        with self._lock:
+    def _collect(self) -> None:
+        """Take back what was returned, as far as it may be kept."""
+        while self._returned:
+            block = self._returned.popleft()
             self._used -= len(block)
             self._spare.append(block)
-            while self.spare_bytes > self._most_used:
-                self._spare.popleft()
+        while sum(map(len, self._spare)) > self._most_used:
+            self._spare.popleft()
 
     def release(self) -> None:
         """Free the spare blocks."""
         with self._lock:
+            self._collect()
             self._spare.clear()
 
     @property
     def spare_bytes(self) -> int:
-        return sum(map(len, self._spare))
+        with self._lock:
+            self._collect()
+            return sum(map(len, self._spare))
 
 
 def _new_block(size: int) -> np.ndarray:

@@ -324,7 +324,8 @@ def test_depths_sort_as_floats_with_ties_in_order(length):
     splats = rng.permutation(length).astype(np.int32)
     entries = depths.view(np.int32).astype(np.int64) << SLOT_BITS | np.arange(length)
     members = np.empty_like(splats)
-    sort(0, 1, Lists(np.array([0, length]), members, entries, splats))
+    unused = np.empty(0, np.int64)
+    sort(0, 1, Lists(np.array([0, length]), members, entries, unused, unused, splats))
     order = np.argsort(depths, kind="stable")
     assert np.array_equal(entries, order) and np.array_equal(members, splats[order])
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 numba = pytest.importorskip("numba")
-from mipmap_plugin.backends.cpu_kernels.columns import apart, repeated, thrice, transpose  # noqa: E402
-from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, store  # noqa: E402
+from mipmap_plugin.backends.cpu_kernels.columns import apart, outlines, repeated, thrice, together, transpose  # noqa: E402
+from mipmap_plugin.backends.cpu_kernels.layout import OUTLINE_FIELDS, SPLAT_FIELDS  # noqa: E402
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, store, store_bit_ranges, store_integers  # noqa: E402
 
 
 @numba.njit
@@ -23,6 +24,35 @@ def columns_of_3(source, target):
 def columns_of_4(source, target):
     for k, column in enumerate(apart((load(source, 0), load(source, 16), load(source, 32), load(source, 48)))):
         store(target, 16 * k, column)
+
+
+@numba.njit
+def rows_of_3(source, target):
+    for k, row in enumerate(together((load(source, 0), load(source, 16), load(source, 32)))):
+        store(target, 16 * k, row)
+
+
+@numba.njit
+def rows_of_4(source, target):
+    for k, row in enumerate(together((load(source, 0), load(source, 16), load(source, 32), load(source, 48)))):
+        store(target, 16 * k, row)
+
+
+@numba.njit
+def outlines_of(table, splats, begin, end, target):
+    for k, field in enumerate(outlines(table, pointer(splats), begin, end)):
+        store(target, 16 * k, field)
+
+
+@numba.njit
+def ranges(begins, ends, words):
+    from_bits = load(begins, 0), load(begins, 16), load(begins, 32), load(begins, 48)
+    store_bit_ranges(pointer(words), from_bits, (load(ends, 0), load(ends, 16), load(ends, 32), load(ends, 48)))
+
+
+@numba.njit
+def integers(source, target):
+    store_integers(pointer(target), 1, load(source, 0))
 
 
 @numba.njit
@@ -48,6 +78,38 @@ def test_transposed():
 def test_columns_apart(function, columns):
     source, target = made(function, 16 * columns, 16 * columns)
     assert np.array_equal(target.reshape(columns, 16), source.reshape(16, columns).T)
+
+
+@pytest.mark.parametrize(("function", "columns"), [(rows_of_3, 3), (rows_of_4, 4)])
+def test_columns_together(function, columns):
+    source, target = made(function, 16 * columns, 16 * columns)
+    assert np.array_equal(target.reshape(16, columns), source.reshape(columns, 16).T)
+
+
+@pytest.mark.parametrize("count", [1, 7, 16, 20])
+def test_outlines_of_some_splats(count):
+    rng = np.random.default_rng(count)
+    table, splats = rng.normal(size=(40, SPLAT_FIELDS)).astype(np.float32), rng.permutation(40).astype(np.int32)
+    target = np.zeros(16 * OUTLINE_FIELDS, np.float32)
+    outlines_of(table, splats, 3, 3 + count, target)
+    shown = min(16, count)
+    assert np.array_equal(target.reshape(OUTLINE_FIELDS, 16)[:, :shown], table[splats[3 : 3 + shown], :OUTLINE_FIELDS].T)
+
+
+def test_bits_of_ranges():
+    rng = np.random.default_rng(0)
+    edges = np.sort(rng.integers(0, 17, (2, 4, 16)), axis=0).astype(np.float32)
+    words = np.zeros(16, np.int64)
+    ranges(edges[0].ravel(), edges[1].ravel(), words)
+    for lane, word in enumerate(words.tolist()):
+        expected = [edges[0, row, lane] <= bit < edges[1, row, lane] for row in range(4) for bit in range(16)]
+        assert [bool(word >> bit & 1) for bit in range(64)] == expected
+
+
+def test_lanes_as_integers():
+    target = np.zeros(20, np.int32)
+    integers(np.arange(-5, 11, dtype=np.float32), target)
+    assert target.tolist() == [0, *range(-5, 11), 0, 0, 0]
 
 
 def test_a_number_of_each_band_or_channel_for_each_coefficient():

@@ -143,9 +143,11 @@ def test_reading_in_pieces_makes_no_difference(on_disk, monkeypatch):
     assert torch.equal(splats.gaussians(rows).means, in_memory[rows].means) and torch.equal(splats.gaussians(rows).sh, in_memory[rows].sh)
     assert torch.equal(splats.gaussians(rows, colored=False).opacities, in_memory[rows].opacities)
     camera = tiny.cameras(1)[0]
-    whole, depths = Splats.of(VanillaModel, splats.parts).seen_by(camera, 0.01)
+    rows, depths = Splats.of(VanillaModel, splats.parts).seen_by(camera, 0.01)
     monkeypatch.undo()
-    assert torch.equal(splats.seen_by(camera, 0.01)[0], whole) and torch.equal(splats.seen_by(camera, 0.01)[1], depths)
+    whole, whole_depths = splats.seen_by(camera, 0.01)
+    assert torch.equal(rows, whole)
+    torch.testing.assert_close(depths, whole_depths)  # on some processors torch multiplies few rows in another order
 
 
 def test_slabs_are_cut_by_depth():

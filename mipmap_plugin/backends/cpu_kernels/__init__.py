@@ -4,7 +4,7 @@ Memory layout. All arrays are contiguous; a pair is a splat and a tile that it t
 
     splat table [N, 16] float32 (`layout`): one row, one cache line, per splat.
 
-        splat 0   | X | Y | SHEAR | FALL_Y | FALL_X | PEAK | ... | RED | GREEN | BLUE | GAIN | OFFSET | GATE | unused |
+        splat 0   | X | Y | SHEAR | FALL_Y | PEAK | PER_FALL_X | ... | RED | GREEN | BLUE | GAIN | OFFSET | GATE | unused |
         splat 1   | ...
 
     block (`blocks`), on the stack: the fields of 16 splats, so that one field is one set of lanes (`lanes`).
@@ -14,15 +14,16 @@ Memory layout. All arrays are contiguous; a pair is a splat and a tile that it t
     gradient table [pairs, 9] float32 (`layout`): one row per pair, splat after splat; the row is the pair's slot. The backward pass of
     compositing writes the rows tile by tile; `projection_back` sums the rows of each splat.
 
-                        slots[0]            slots[1]     slots[2]                        slots[N] = pairs
+                        firsts[0]           firsts[1]    firsts[2]                       firsts[N] = pairs
                         v                   v            v                               v
         rows            | splat 0: 3 tiles  | 2 tiles    | ...                           |
 
-    lists (`records.Lists`): the pairs by tile, and in each tile front to back. `members` has their splats, `slots` their slots.
+    lists (`records.Lists`): the pairs by tile, and in each tile front to back. `members` has their splats, `slots` their slots, and
+    `patches` integers whose bits are the patches that they touch.
 
                         starts[0]                        starts[1]                       starts[tiles] = pairs
                         v                                v                               v
-        members, slots  | tile 0, front to back          | tile 1 ...                    |
+        members, ...    | tile 0, front to back          | tile 1 ...                    |
 
     tile (`planes`), on the stack: 16 x 4 patches of 4 x 4 px. Each quantity is a plane with the 16 px of one patch after the other's, so
     that a patch is one set of lanes.
@@ -30,8 +31,6 @@ Memory layout. All arrays are contiguous; a pair is a splat and a tile that it t
         red, green, blue, TRANSMITTANCE,      | patch 0: 16 px | patch 1 ...                  | patch 15 |
         STOPS, BEHIND_DOT_GRAD: each          | patch 16       | ...                          |          |
                                               | ...            |                              | patch 63 |
-
-    batch (`compositing.find_patches`), on the stack: for 32 splats of a list, an integer whose bits are the patches that each touches.
 
 numba counts references to arrays, and to records that hold arrays; each count is an atomic operation, and a few per splat cost more
 than all of its geometry. So a kernel takes arrays out of their records once, and passes pointers, numbers and tuples of them to the

@@ -70,14 +70,16 @@ def tiles_in_row(first, last, tile_y, block, width):
 
 @inner
 def count_tiles(block, drawn, width, height):
-    """The number of tiles that each splat touches; 0 for splats that are not drawn."""
+    """The number of tiles that each splat touches, 0 for splats that are not drawn, and the first of them."""
+    tiles_x = tile_grid(width, height)[0]
     first, last = pixel_rows(block, height)
-    tile_y, count = floor(first * (1 / TILE_HEIGHT)), first * 0
+    tile_y, count, first_tile = floor(first * (1 / TILE_HEIGHT)), first * 0, first * 0
     while bits(both(drawn, both(tile_y * TILE_HEIGHT <= last, first <= last))) != 0:
         touching, first_x, last_x = tiles_in_row(first, last, tile_y, block, width)
+        first_tile = select(both(touching, count < 1), tile_y * tiles_x + first_x, first_tile)
         count = count + select(touching, last_x - first_x + 1, 0)
         tile_y = tile_y + 1
-    return select(drawn, count, 0)
+    return select(drawn, count, 0), first_tile
 
 
 @inner

@@ -10,7 +10,8 @@ from numba.extending import intrinsic
 
 from mipmap_plugin.backends.cpu_kernels import inner
 from mipmap_plugin.backends.cpu_kernels.lanes import INTS32, LANES, VECTOR32, WIDTH
-from mipmap_plugin.backends.cpu_kernels.memory import load
+from mipmap_plugin.backends.cpu_kernels.layout import OUTLINE_FIELDS
+from mipmap_plugin.backends.cpu_kernels.memory import load, rows_of, store
 
 CHANNELS, BANDS = 3, WIDTH
 THREE = types.UniTuple(LANES, CHANNELS)
@@ -25,6 +26,19 @@ def _shuffled(builder, first, second, pattern):
 def load_three(array, at):
     """The 48 numbers from array[at] on, as three vectors: 16 rows of an array [n, 3], or a splat's coefficients."""
     return load(array, at), load(array, at + WIDTH), load(array, at + 2 * WIDTH)
+
+
+@inner
+def load_four(array, at):
+    """16 rows of an array [n, 4]."""
+    return load(array, at), load(array, at + WIDTH), load(array, at + 2 * WIDTH), load(array, at + 3 * WIDTH)
+
+
+@inner
+def store_rows(array, at, vectors):
+    """Store vectors one after the other."""
+    for number in range(len(vectors)):
+        store(array, at + number * WIDTH, vectors[number])
 
 
 @intrinsic
@@ -43,6 +57,24 @@ def apart(_context, rows):
         return cgutils.pack_array(builder, columns)
 
     return types.UniTuple(LANES, rows.count)(rows), generate
+
+
+@intrinsic
+def together(_context, columns):
+    """The rows of an array [16, n], as n vectors, from its columns: the inverse of `apart`."""
+
+    def generate(context, builder, signature, values):
+        vectors, rows = cgutils.unpack_tuple(builder, values[0], columns.count), []
+        for number in range(columns.count):
+            places = [divmod(WIDTH * number + lane, columns.count) for lane in range(WIDTH)]  # the row and the column of each
+            found = vectors[0]
+            for column in range(1, columns.count):
+                pattern = [WIDTH + row if of == column else row if column == 1 else lane for lane, (row, of) in enumerate(places)]
+                found = _shuffled(builder, found, vectors[column], pattern)
+            rows.append(found)
+        return cgutils.pack_array(builder, rows)
+
+    return types.UniTuple(LANES, columns.count)(columns), generate
 
 
 @intrinsic
@@ -77,16 +109,44 @@ def transpose(_context, source, target):
     def generate(context, builder, signature, values):
         read, written = (builder.bitcast(value, VECTOR32.as_pointer()) for value in values)
         rows = [builder.load(builder.gep(read, [ir.IntType(64)(row)]), align=4) for row in range(WIDTH)]
-        size = 1
-        while size < WIDTH:
-            upper = [lane if not lane & size else WIDTH + lane - size for lane in range(WIDTH)]
-            lower = [lane + size if not lane & size else WIDTH + lane for lane in range(WIDTH)]
-            for row in (row for row in range(WIDTH) if not row & size):
-                pair = rows[row], rows[row + size]
-                rows[row], rows[row + size] = _shuffled(builder, *pair, upper), _shuffled(builder, *pair, lower)
-            size *= 2
-        for row, vector in enumerate(rows):
+        for row, vector in enumerate(_transposed(builder, rows)):
             builder.store(vector, builder.gep(written, [ir.IntType(64)(row)]), align=4)
         return context.get_dummy_value()
 
     return types.void(source, target), generate
+
+
+def _transposed(builder, rows):
+    """The transposes of the blocks, as wide as there are rows, that lie side by side in vectors."""
+    rows, size = list(rows), 1
+    while size < len(rows):
+        upper = [lane if not lane & size else WIDTH + lane - size for lane in range(WIDTH)]
+        lower = [lane + size if not lane & size else WIDTH + lane for lane in range(WIDTH)]
+        for row in (row for row in range(len(rows)) if not row & size):
+            pair = rows[row], rows[row + size]
+            rows[row], rows[row + size] = _shuffled(builder, *pair, upper), _shuffled(builder, *pair, lower)
+        size *= 2
+    return rows
+
+
+@intrinsic
+def outlines(_context, table, splats, begin, end):
+    """The outlines (`layout`) of the splats[begin..end], of which the last stands for those that are missing to 16: a set of lanes each field."""
+
+    def generate(context, builder, signature, values):
+        data, fields = rows_of(context, builder, signature, values[0])
+        half, i64 = ir.VectorType(ir.FloatType(), OUTLINE_FIELDS), ir.IntType(64)
+        first, stop = (context.cast(builder, value, kind, types.intp) for value, kind in zip(values[2:], signature.args[2:], strict=True))
+        last = builder.sub(stop, i64(1))
+
+        def outline(number):
+            at = builder.add(first, i64(number))
+            splat = builder.load(builder.gep(values[1], [builder.select(builder.icmp_signed("<", at, last), at, last)]))
+            address = builder.gep(data, [builder.mul(builder.sext(splat, i64), fields)])
+            return builder.load(builder.bitcast(address, half.as_pointer()), align=4)
+
+        beside = ir.Constant(INTS32, list(range(WIDTH)))
+        rows = [builder.shuffle_vector(outline(row), outline(row + OUTLINE_FIELDS), beside) for row in range(OUTLINE_FIELDS)]
+        return cgutils.pack_array(builder, _transposed(builder, rows))
+
+    return types.UniTuple(LANES, OUTLINE_FIELDS)(table, splats, begin, end), generate

@@ -6,29 +6,11 @@
 # numba redefines calls and operators.
 # mypy: ignore-errors
 
-import numpy as np
-from numba import types
-
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout
-from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, SLACK, TILE_HEIGHT, TILE_WIDTH, tile_grid
-from mipmap_plugin.backends.cpu_kernels.lanes import (
-    WIDTH,
-    across,
-    bit_ranges,
-    bits,
-    both,
-    ceil,
-    down,
-    floor,
-    fma,
-    lowest_bit,
-    maximum,
-    minimum,
-    next_four,
-    select,
-    sqrt,
-)
-from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, prefetch, row_of, scratch
+from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA, TILE_HEIGHT, TILE_WIDTH, tile_grid
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, lowest_bit
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of
+from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found, prefetch_rows
 from mipmap_plugin.backends.cpu_kernels.planes import (
     BEHIND_DOT_GRAD,
     PATCH,
@@ -45,11 +27,6 @@ from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MIN_ALPHA
 
-# Splats whose patches are found before the first of them is drawn: drawing waits for nothing then, and what is finished is left out.
-BATCH = 32
-
-new_patches = scratch(BATCH, types.int64)
-
 
 @inner
 def tile_box(tile, width, height):
@@ -59,23 +36,6 @@ def tile_box(tile, width, height):
     return left, top, min(TILE_WIDTH, width - left), min(TILE_HEIGHT, height - top)
 
 
-@inner
-def touched_patches(splat, box):
-    """A bit per patch of a tile that the box around a splat's ellipse reaches in that row of patches."""
-    left, top, width, height = box
-    # Lanes 0 to 3 are the rows of patches for the rightmost x of the ellipse in each, lanes 4 to 7 for the leftmost x.
-    side, first_row = select(down(0) < 1, 1, -1), across(0) * PATCH
-    above = first_row + (np.float32(top + 0.5) - splat[layout.Y])
-    dy = minimum(maximum(side * splat[layout.RIGHTMOST_DY], above), above + (PATCH - 1))
-    margin = fma(dy * dy, 0 - splat[layout.FALL_Y], splat[layout.PEAK] - np.float32(LOG_MIN_ALPHA))
-    half_width = sqrt(maximum(margin, 0) * splat[layout.PER_FALL_X]) + SLACK
-    edge = fma(dy, splat[layout.SHEAR], fma(side, half_width, splat[layout.X] - np.float32(left + 0.5)))
-    touched = both(margin >= 0, first_row < height)
-    end = select(touched, maximum(floor(minimum(edge, width - 1) * (1 / PATCH)) + 1, 0), 0)
-    begin = minimum(maximum(ceil((next_four(edge) - (PATCH - 1)) * (1 / PATCH)), 0), end)
-    return bit_ranges(begin, end)
-
-
 @kernel
 def composite(start, stop, integrated, limits, table, lists, frame, outputs):
     """Render the tiles start..stop into `frame`, and into the outputs: image [H, W, 3] and alpha [H, W].
@@ -83,10 +43,10 @@ def composite(start, stop, integrated, limits, table, lists, frame, outputs):
     integrated: True where splats are integrated over pixels, else None.
     """
     sort(start, stop, lists)
-    starts, members, _, _ = lists
+    starts, members, patches = lists.starts, pointer(lists.members), pointer(lists.patches)
     _, transmittance, _ = frame
     height, width = transmittance.shape
-    state, patches = new_state(), new_patches()
+    state, found = new_state(), new_found()
     for tile in range(start, stop):
         box, first = tile_box(tile, width, height), starts[tile]
         length = starts[tile + 1] - first
@@ -97,28 +57,14 @@ def composite(start, stop, integrated, limits, table, lists, frame, outputs):
                 break
             end = min(begin + BATCH, length)
             prefetch_rows(table, members, first + end, first + min(end + BATCH, length))
-            find_patches(table, members, first + begin, first + end, box, unfinished, patches)
+            find_patches(table, members, patches, first + begin, first + end, box, found)
             for n in range(begin, end):
                 splat = row_of(table, members[first + n])
                 if integrated is not None:
-                    draw_integral(splat, limits, patches[n - begin], n, box, state)
+                    draw_integral(splat, limits, patches[first + n] & unfinished, n, box, state)
                 elif splat[layout.GATE] > 0:
-                    draw_splat(splat, limits, patches[n - begin], n, box, state)
+                    draw_splat(splat, limits, patches[first + n] & unfinished, n, box, state)
         write_tile(box, state, frame, outputs)
-
-
-@inner
-def prefetch_rows(array, rows, begin, end):
-    """Bring the rows[begin..end] of an array [n, m] into the cache, while others are worked on."""
-    for at in range(begin, end):
-        prefetch(array, rows[at])
-
-
-@inner
-def find_patches(table, members, begin, end, box, wanted, patches):
-    """Write the patches that each of the members begin..end touches, of those `wanted`."""
-    for at in range(begin, end):
-        patches[at - begin] = touched_patches(row_of(table, members[at]), box) & wanted
 
 
 @inner

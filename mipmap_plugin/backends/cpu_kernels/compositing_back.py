@@ -5,9 +5,10 @@
 
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
-from mipmap_plugin.backends.cpu_kernels.compositing import BATCH, fill_range, find_patches, log_alpha, new_patches, prefetch_rows, tile_box
+from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, log_alpha, tile_box
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, broadcast, fma, lowest_bit, total, totals
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store_half
+from mipmap_plugin.backends.cpu_kernels.patches import BATCH, prefetch_rows
 from mipmap_plugin.backends.cpu_kernels.planes import (
     BEHIND_DOT_GRAD,
     PATCH,
@@ -32,11 +33,11 @@ def composite_back(start, stop, integrated, reshaped, faded, limits, table, list
 
     d_outputs: the gradients of the image [H, W, 3] and of its alpha [H, W].
     """
-    starts, members, slots, _ = lists
+    starts, members, slots, patches = lists.starts, lists.members, lists.slots, pointer(lists.patches)
     background, transmittance, stops = frame
     d_image, d_alpha = d_outputs
     height, width = transmittance.shape
-    state, patches = new_state(), new_patches()
+    state = new_state()
     for tile in range(start, stop):
         box, first = tile_box(tile, width, height), starts[tile]
         used = init_tile_back(box, background, transmittance, stops, d_image, d_alpha, state)
@@ -47,13 +48,13 @@ def composite_back(start, stop, integrated, reshaped, faded, limits, table, list
             begin = max(end - BATCH, 0)
             prefetch_rows(table, members, first + max(begin - BATCH, 0), first + begin)
             prefetch_rows(tile_grads, slots, first + max(begin - BATCH, 0), first + begin)
-            find_patches(table, members, first + begin, first + end, box, begun_patches(begin, state), patches)
+            begun = begun_patches(begin, state)
             for n in range(end - 1, begin - 1, -1):
                 splat, grads = row_of(table, members[first + n]), row_of(tile_grads, slots[first + n])
                 if integrated is not None:
-                    undraw_integral(splat, limits, patches[n - begin], n, box, state, grads)
+                    undraw_integral(splat, limits, patches[first + n] & begun, n, box, state, grads)
                 else:
-                    undraw_at_center(splat, limits, reshaped, faded, patches[n - begin], n, box, state, grads)
+                    undraw_at_center(splat, limits, reshaped, faded, patches[first + n] & begun, n, box, state, grads)
 
 
 @inner

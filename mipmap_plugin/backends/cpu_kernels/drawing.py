@@ -41,7 +41,6 @@ class Drawing(NamedTuple):
     flags: Flags
     limits: Limits
     table: np.ndarray  # [N, SPLAT_FIELDS]
-    slots: np.ndarray  # [N + 1] each splat's first slot
     lists: Lists
     frame: Frame
     image: np.ndarray  # [H, W, 3]
@@ -54,15 +53,10 @@ def draw(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = True) 
     threads = team(sum(count + shot.camera.width * shot.camera.height for shot in shots))
     views = [view_of(shot.camera, shot.effects, splats, gradients) for shot in shots]
     flags = [flags_of(view, splats) for view in views]
-    tables = [(empty(count, layout.SPLAT_FIELDS), empty(count), empty(count, dtype=np.int64)) for _ in shots]
-    jobs = [(count, (*drawn, splats, *table)) for *drawn, table in zip(flags, views, tables, strict=True)]
+    projected = [sorting.Projected.of(count, shot.camera.size) for shot in shots]
+    jobs = [(count, (own, view, splats, *of.arrays)) for own, view, of in zip(flags, views, projected, strict=True)]
     threads.share_all(projection.project, jobs, of_rows=True)
-    projected = []
-    for shot, (table, depths, counts) in zip(shots, tables, strict=True):
-        slots = empty(count + 1, dtype=np.int64)
-        slots[0] = 0
-        np.cumsum(counts, out=slots[1:])
-        projected.append(sorting.Projected(table, depths if shot.ranks is None else shot.ranks, slots, shot.camera.size))
+    projected = [of if shot.ranks is None else of._replace(order=shot.ranks) for shot, of in zip(shots, projected, strict=True)]
     drawings = [
         _blank(shot, view, own, of, lists)
         for shot, view, own, of, lists in zip(shots, views, flags, projected, sorting.tile_lists(projected, threads), strict=True)
@@ -76,7 +70,7 @@ def _blank(shot: Shot, view: View, flags: Flags, of: sorting.Projected, lists: L
     (height, width), settings = of.size, shot.effects.settings
     frame = Frame(np.array(shot.effects.background, np.float32), empty(height, width), empty(height, width))
     limits = Limits(settings.max_alpha, settings.min_transmittance, settings.picture_step or 0.0)
-    return Drawing(view, flags, limits, of.table, of.slots, lists, frame, empty(height, width, 3), empty(height, width))
+    return Drawing(view, flags, limits, of.table, lists, frame, empty(height, width, 3), empty(height, width))
 
 
 def _composite(drawings: Sequence[Drawing], threads: Team) -> None:
@@ -142,7 +136,7 @@ def add_views(start: int, stop: int, splats: SplatArrays, views: Sequence[tuple[
     What no view shows has none, and costs nothing.
     """
     for drawn, table in views:
-        projection_back.project_back(start, stop, drawn.flags, drawn.view, splats, drawn.table, drawn.slots, table, grads)
+        projection_back.project_back(start, stop, drawn.flags, drawn.view, splats, drawn.table, drawn.lists.firsts, table, grads)
 
 
 def flags_of(view: View, splats: SplatArrays) -> Flags:

@@ -187,6 +187,11 @@ def maximum(_context, a, b):
 
 
 @intrinsic
+def absolute(_context, a):
+    return lane_wise(partial(_call, "fabs"))(a)
+
+
+@intrinsic
 def sqrt(_context, a):
     return lane_wise(partial(_call, "sqrt"))(a)
 
@@ -223,27 +228,6 @@ def across(_context, start):
 def down(_context, start):
     """start plus the row 0..3 of each lane, for lanes that are 4 x 4 pixels, row by row."""
     return lane_wise(_plus(lane // 4 for lane in range(WIDTH)))(start)
-
-
-@intrinsic
-def next_four(_context, lanes):
-    """The lanes moved down by four: lanes 4 to 7 become lanes 0 to 3. What the last four hold is undefined."""
-    pattern = ir.Constant(INTS32, [min(lane + 4, WIDTH - 1) for lane in range(WIDTH)])
-    return LANES(lanes), lambda context, builder, signature, values: builder.shuffle_vector(values[0], values[0], pattern)
-
-
-@intrinsic
-def bit_ranges(_context, begin, end):
-    """Four words of 16 bits as one integer: word k has the bits from `begin` up to, but without, `end` of lane k, both 0..16."""
-
-    def generate(context, builder, signature, values):
-        pattern, ones = (ir.Constant(ir.VectorType(ir.IntType(32), 4), four) for four in ([0, 1, 2, 3], [1] * 4))
-        first_four = [builder.shuffle_vector(value, value, pattern) for value in values]
-        powers = [builder.shl(ones, builder.fptosi(four, ones.type)) for four in first_four]
-        words = builder.trunc(builder.sub(powers[1], powers[0]), ir.VectorType(ir.IntType(16), 4))
-        return builder.bitcast(words, ir.IntType(64))
-
-    return types.int64(begin, end), generate
 
 
 @intrinsic

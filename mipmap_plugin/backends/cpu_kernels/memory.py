@@ -8,7 +8,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from mipmap_plugin.backends.cpu_kernels.lanes import DOUBLES, LANES, VECTOR32, VECTOR64, WIDTH
+from mipmap_plugin.backends.cpu_kernels.lanes import DOUBLES, INTS32, INTS64, LANES, VECTOR32, VECTOR64, WIDTH
 
 # Bytes of a cache line.
 CACHE_LINE = 64
@@ -29,14 +29,14 @@ def row_of(_context, array, row):
     """A pointer to array[row] of a contiguous array [n, m]; as `pointer`."""
 
     def generate(context, builder, signature, values):
-        data, fields = _rows(context, builder, signature, values[0])
+        data, fields = rows_of(context, builder, signature, values[0])
         row = context.cast(builder, values[1], signature.args[1], types.intp)
         return builder.gep(data, [builder.mul(row, fields)])
 
     return types.CPointer(array.dtype)(array, row), generate
 
 
-def _rows(context, builder, signature, array):
+def rows_of(context, builder, signature, array):
     """A pointer to an array [n, m], and m."""
     record = context.make_array(signature.args[0])(context, builder, array)
     return record.data, builder.extract_value(record.shape, 1)
@@ -90,6 +90,19 @@ def store(_context, array, index, lanes):
 
 
 @intrinsic
+def store_integers(_context, array, index, lanes):
+    """array[index : index + 16] = lanes, for a pointer to int32; what is no integer of 32 bits becomes any."""
+
+    def generate(context, builder, signature, values):
+        index = context.cast(builder, values[1], signature.args[1], types.intp)
+        address = builder.bitcast(builder.gep(values[0], [index]), INTS32.as_pointer())
+        builder.store(builder.fptosi(values[2], INTS32), address, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, index, lanes), generate
+
+
+@intrinsic
 def store_half(_context, array, lanes):
     """array[0 : 8] = the first half of float32 lanes, for a pointer."""
 
@@ -103,11 +116,32 @@ def store_half(_context, array, lanes):
 
 
 @intrinsic
+def store_bit_ranges(_context, array, begins, ends):
+    """Store 16 integers, for a pointer to int64: word k of each, of 16 bits, has the bits from `begins`[k] up to, but without, `ends`[k], 0..16.
+
+    Both are tuples of four lanes.
+    """
+
+    def generate(context, builder, signature, values):
+        begins, ends = (cgutils.unpack_tuple(builder, value, 4) for value in values[1:])
+        one, word = (ir.Constant(INTS32, [number] * WIDTH) for number in (1, 16))
+        first, second, third, fourth = (
+            builder.sub(*(builder.shl(one, builder.fptosi(edge, INTS32)) for edge in edges)) for edges in zip(ends, begins, strict=True)
+        )
+        low, high = (builder.or_(even, builder.shl(odd, word)) for even, odd in ((first, second), (third, fourth)))
+        integers = builder.or_(builder.zext(low, INTS64), builder.shl(builder.zext(high, INTS64), ir.Constant(INTS64, [32] * WIDTH)))
+        builder.store(integers, builder.bitcast(values[0], INTS64.as_pointer()), align=8)
+        return context.get_dummy_value()
+
+    return types.void(array, begins, ends), generate
+
+
+@intrinsic
 def prefetch(_context, array, row):
     """Prefetch the cache line at array[row] of a contiguous array [n, m]."""
 
     def generate(context, builder, signature, values):
-        data, fields = _rows(context, builder, signature, values[0])
+        data, fields = rows_of(context, builder, signature, values[0])
         row = context.cast(builder, values[1], signature.args[1], types.intp)
         address = builder.bitcast(builder.gep(data, [builder.mul(row, fields)]), cgutils.voidptr_t)
         i32 = ir.IntType(32)

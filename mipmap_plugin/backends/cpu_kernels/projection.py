@@ -5,15 +5,16 @@
 
 import math
 
-import numpy as np
 from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout, windows
 from mipmap_plugin.backends.cpu_kernels.binning import count_tiles
-from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put
-from mipmap_plugin.backends.cpu_kernels.columns import apart, load_three, transpose
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, lowest_bit, maximum, narrow, select, sqrt, total, wide
-from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
+from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
+from mipmap_plugin.backends.cpu_kernels.colors import clamp_colors, fill_colors
+from mipmap_plugin.backends.cpu_kernels.columns import apart, load_four, load_three, transpose
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, absolute, bits, both, broadcast, lowest_bit, maximum, narrow, select, sqrt, wide
+from mipmap_plugin.backends.cpu_kernels.layout import HUGE
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store, store_integers
 from mipmap_plugin.backends.cpu_kernels.powers import log2
 from mipmap_plugin.backends.cpu_kernels.records import OVER_PIXEL
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, minus, plus, times
@@ -22,31 +23,26 @@ from mipmap_plugin.effects import MIN_ALPHA
 # -q/2 = -HALF_LOG2E · q in powers of two.
 HALF_LOG2E = 0.5 / math.log(2)
 
-# Sizes (px, px²), opacities and colors beyond this count as infinite: their squares would overflow float32.
-HUGE = 1e30
-
-# The least positive color, and the factor that makes the largest color slightly less, in float32.
-MIN_COLOR, BELOW_MAX = 1e-30, 1 - 1e-7
-
 # Fields of a block of splats in the world, float64, as in `SplatArrays`. A shape is either a covariance or a quaternion and scales.
 MEAN, OPACITY, COVARIANCE, QUAT, SCALE = 0, 3, 4, 4, 8
 WORLD_FIELDS = 13
 
-new_world, new_sizes = scratch(WORLD_FIELDS * WIDTH, types.float64), scratch(2 * WIDTH, types.float64)
+new_world = scratch(WORLD_FIELDS * WIDTH, types.float64)
 new_block, new_bands = scratch(layout.SPLAT_FIELDS * WIDTH, types.float32), scratch(harmonics.MAX_BANDS * WIDTH, types.float32)
 
 
 @kernel
-def project(start, stop, flags, view, splats, table, depths, counts):
-    """Fill the rows start..stop of the table, of the depths and of the numbers of tiles touched; 0 tiles: not drawn. flags: see `Flags`."""
+def project(start, stop, flags, view, splats, table, depths, counts, first_tiles):
+    """Fill the rows start..stop of the table, the depths, the numbers of tiles touched, 0 where not drawn, and the first of these tiles.
+
+    flags: see `Flags`.
+    """
     covariances, integrated, reshaped, _, fourth, third = flags
-    sh = pointer(splats.sh)
-    arrays, rows, stride = pointers(splats), pointer(table), 3 * splats.sh.shape[1]
-    world, sizes, block, row_of, bands, bands_of = new_world(), new_sizes(), new_block(), new_block(), new_bands(), new_bands()
+    arrays, sh, rows, stride = pointers(splats), pointer(splats.sh), pointer(table), 3 * splats.sh.shape[1]
+    outputs = pointer(depths), pointer(counts), pointer(first_tiles)
+    world, block, row_of, bands, bands_of = new_world(), new_block(), new_block(), new_bands(), new_bands()
     for first in range(start, stop, WIDTH):
         size = min(WIDTH, stop - first)
-        for lane in range(size):
-            counts[first + lane] = 0
         if size == WIDTH and covariances is None:
             load_splats(first, arrays, world)
         else:
@@ -56,21 +52,42 @@ def project(start, stop, flags, view, splats, table, depths, counts):
         jac = ellipses.jacobian(view, p)
         shape = project_any(jac, covariances, world)
         drawn = both(p[2] > view.near_plane, fill_shape(view, integrated, reshaped, p, shape, get(world, OPACITY), block))
-        put(sizes, 0, sqrt(dot(p, p)) if view.radial else p[2])
-        put(sizes, 1, count_tiles(block, drawn, view.width, view.height))
-        visible = bits(get(sizes, 1) > 0) & ((1 << size) - 1)
+        count, first_tile = count_tiles(block, drawn, view.width, view.height)
+        visible = bits(count > 0) & ((1 << size) - 1)
         if visible != 0:
             harmonics.basis(narrowed(view_direction(view, get_vector(world, MEAN))[0]), view.sh_degree, fourth, bands)
-            transpose(block, row_of)
             if third is not None:
                 transpose(bands, bands_of)
-        while visible != 0:
-            lane = lowest_bit(visible)
-            visible &= visible - 1
-            i = first + lane
-            if fill_color(color_of(i * stride, lane, view, third, sh, bands, bands_of), lane * layout.SPLAT_FIELDS, view, row_of):
-                depths[i], counts[i] = sizes[lane], int(sizes[WIDTH + lane])
-                store(rows, i * layout.SPLAT_FIELDS, load(row_of, lane * layout.SPLAT_FIELDS))
+            fill_colors(visible, first * stride, stride, view, third, sh, bands, bands_of, block)
+            finite = clamp_colors(view, block)
+            count = select(finite, count, 0)
+            transpose(block, row_of)
+            store_rows_of(visible & bits(finite), first, row_of, rows)
+        store_places(first, size, sqrt(dot(p, p)) if view.radial else p[2], count, first_tile, outputs, world)
+
+
+@inner
+def store_rows_of(shown, first, row_of, rows):
+    """Copy the rows of the splats whose bit is set; `first` is that of lane 0."""
+    while shown != 0:
+        lane = lowest_bit(shown)
+        shown &= shown - 1
+        store(rows, (first + lane) * layout.SPLAT_FIELDS, load(row_of, lane * layout.SPLAT_FIELDS))
+
+
+@inner
+def store_places(first, size, depth, count, first_tile, outputs, spare):
+    """Write the depths, the numbers of tiles and the first tiles of `size` splats. spare: a block."""
+    depths, counts, first_tiles = outputs
+    if size == WIDTH:
+        store(depths, first, narrow(depth))
+        store_integers(counts, first, count)
+        store_integers(first_tiles, first, first_tile)
+    else:
+        put_vector(spare, 0, (depth, count, first_tile))
+        for lane in range(size):
+            depths[first + lane] = spare[lane]
+            counts[first + lane], first_tiles[first + lane] = int(spare[WIDTH + lane]), int(spare[2 * WIDTH + lane])
 
 
 @inner
@@ -85,8 +102,7 @@ def load_splats(first, arrays, world):
     means, opacities, quats, scales, _ = arrays
     put_wide(world, MEAN, apart(load_three(means, 3 * first)))
     put(world, OPACITY, wide(load(opacities, first)))
-    at = 4 * first
-    put_wide(world, QUAT, apart((load(quats, at), load(quats, at + WIDTH), load(quats, at + 2 * WIDTH), load(quats, at + 3 * WIDTH))))
+    put_wide(world, QUAT, apart(load_four(quats, 4 * first)))
     put_wide(world, SCALE, apart(load_three(scales, 3 * first)))
 
 
@@ -192,11 +208,6 @@ def reshape(view, drawn, shape, opacity, block):
 
 
 @inner
-def absolute(lanes):
-    return maximum(lanes, 0 - lanes)
-
-
-@inner
 def fill_ellipse(x, y, shape, opacity, block):
     """Write the ellipses alpha >= 1/255 of shapes; returns which are finite and bright enough."""
     xx, xy, yy, det = shape
@@ -217,43 +228,6 @@ def fill_ellipse(x, y, shape, opacity, block):
     put(block, layout.REACH_Y, sqrt(narrow(reach * yy)))
     put(block, layout.RIGHTMOST_DY, narrow(xy) * sqrt(narrow(reach) / narrow(xx)))
     return drawn
-
-
-@inner
-def color_of(at, lane, view, third, sh, bands, bands_of):
-    """The color of the splat in a lane, in this view's direction. Its coefficients start at sh[at]; `bands_of`, if `third`: bands lane by lane."""
-    half = np.float32(0.5)
-    red, green, blue = half, half, half
-    if third is not None:
-        band = load(bands_of, lane * WIDTH)
-        reds, greens, blues = apart(load_three(sh, at))
-        return half + total(band * reds), half + total(band * greens), half + total(band * blues)
-    for j in range((view.sh_degree + 1) ** 2):
-        band = bands[j * WIDTH + lane]
-        red += band * sh[at + 3 * j]
-        green += band * sh[at + 3 * j + 1]
-        blue += band * sh[at + 3 * j + 2]
-    return red, green, blue
-
-
-@inner
-def fill_color(color, at, view, row_of):
-    """Write a splat's color to its row, which begins at row_of[at]; returns whether it is finite."""
-    red, green, blue = color
-    largest = np.float32(view.max_color)
-    red_step, green_step, blue_step = view.color_steps
-    row_of[at + layout.RED] = quantized(min(max(red, 0), largest), red_step, largest)
-    row_of[at + layout.GREEN] = quantized(min(max(green, 0), largest), green_step, largest)
-    row_of[at + layout.BLUE] = quantized(min(max(blue, 0), largest), blue_step, largest)
-    return abs(red) < HUGE and abs(green) < HUGE and abs(blue) < HUGE
-
-
-@inner
-def quantized(value, step, largest):
-    """The nearest multiple of `step`; step 0: unchanged. Other values never become 0 or `largest`, where a channel has no gradient."""
-    if step == 0 or value <= 0 or value >= largest:
-        return value
-    return np.float32(max(min(round(value / step) * step, largest * BELOW_MAX), MIN_COLOR))
 
 
 @inner

@@ -10,8 +10,8 @@ from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import culling, ellipses, harmonics, inner, integrals, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, get_vector, put, put_vector
-from mipmap_plugin.backends.cpu_kernels.columns import apart, load_three, repeated, thrice, transpose
-from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, select, wide
+from mipmap_plugin.backends.cpu_kernels.columns import apart, load_four, load_three, repeated, store_rows, thrice, together, transpose
+from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, narrow, select, wide
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
 from mipmap_plugin.backends.cpu_kernels.projection import (
     COVARIANCE,
@@ -21,6 +21,7 @@ from mipmap_plugin.backends.cpu_kernels.projection import (
     SCALE,
     covariance_of,
     load_splat,
+    load_splats,
     narrowed,
     new_bands,
     new_world,
@@ -34,10 +35,10 @@ new_sums, new_rows = scratch(layout.GRADS * WIDTH, types.float64), scratch(WIDTH
 
 
 @kernel
-def project_back(start, stop, flags, view, splats, table, slots, tile_grads, grads):
+def project_back(start, stop, flags, view, splats, table, firsts, tile_grads, grads):
     """Add a view's gradients to those of the splats start..stop, the first of which has row 0 of `grads`.
 
-    Splat i's tiles have the rows slots[i]..slots[i + 1] of tile_grads.
+    Splat i's tiles have the rows firsts[i]..firsts[i + 1] of tile_grads.
     """
     covariances, integrated, reshaped, _, fourth, third = flags
     stride = 3 * splats.sh.shape[1]
@@ -46,16 +47,24 @@ def project_back(start, stop, flags, view, splats, table, slots, tile_grads, gra
     world, d_world, sums, rows, size = new_world(), new_world(), new_sums(), new_rows(), 0
     bands = new_bands(), new_bands(), new_bands(), new_bands()
     for i in range(start, stop):
-        if slots[i] < slots[i + 1]:
-            sum_tiles(tile_rows, slots[i], slots[i + 1], size, sums)
-            load_splat(i, size, arrays, covariances, world)
+        if firsts[i] < firsts[i + 1]:
+            sum_tiles(tile_rows, firsts[i], firsts[i + 1], size, sums)
             rows[size] = i
             size += 1
         if size == WIDTH or (i == stop - 1 and size > 0):
+            in_a_row = covariances is None and size == WIDTH and rows[WIDTH - 1] - rows[0] == WIDTH - 1
+            if in_a_row:
+                load_splats(rows[0], arrays, world)
+            else:
+                for lane in range(size):
+                    load_splat(rows[lane], lane, arrays, covariances, world)
             grad_splats(view, covariances, integrated, reshaped, world, sums, d_world)
             grad_colors(view, fourth, third, rows, size, world, sums, colors, bands, d_world)
-            for lane in range(size):
-                store_grads(rows[lane] - start, lane, d_world, targets, covariances)
+            if in_a_row:
+                add_grads(rows[0] - start, d_world, targets)
+            else:
+                for lane in range(size):
+                    store_grads(rows[lane] - start, lane, d_world, targets, covariances)
             size = 0
 
 
@@ -67,6 +76,37 @@ def sum_tiles(tile_rows, first, last, lane, sums):
     for slot in range(first + 1, last):
         for k in range(layout.GRADS):
             sums[k * WIDTH + lane] += tile_rows[slot * layout.GRADS + k]
+
+
+@inner
+def add_grads(first, d_world, targets):
+    """Add the block `d_world` to 16 rows of the gradients, to the same bits as `store_grads`."""
+    d_means, d_opacities, d_quats, d_scales, _ = targets
+    add_three(d_means, 3 * first, MEAN, d_world)
+    store(d_opacities, first, added(load(d_opacities, first), OPACITY, d_world))
+    add_four(d_quats, 4 * first, QUAT, d_world)
+    add_three(d_scales, 3 * first, SCALE, d_world)
+
+
+@inner
+def add_three(array, at, field, d_world):
+    """Add three fields of a block to the 16 rows that begin at array[at]."""
+    x, y, z = apart(load_three(array, at))
+    store_rows(array, at, together((added(x, field, d_world), added(y, field + 1, d_world), added(z, field + 2, d_world))))
+
+
+@inner
+def add_four(array, at, field, d_world):
+    """As `add_three`, for four."""
+    w, x, y, z = apart(load_four(array, at))
+    w, x, y, z = added(w, field, d_world), added(x, field + 1, d_world), added(y, field + 2, d_world), added(z, field + 3, d_world)
+    store_rows(array, at, together((w, x, y, z)))
+
+
+@inner
+def added(lanes, field, d_world):
+    """float32 lanes plus a field of a block, rounded once."""
+    return narrow(wide(lanes) + get(d_world, field))
 
 
 @inner

@@ -84,6 +84,8 @@ class Lists(NamedTuple):
     starts: np.ndarray  # [tiles + 1] where each tile's list begins
     members: np.ndarray  # [pairs] the splats of each list
     slots: np.ndarray  # [pairs] the slot of each member: its row of the gradient table, where the pairs of a splat are adjacent
+    patches: np.ndarray  # [pairs] the patches of its tile that each member touches, a bit for each; from `patches.find_patches`
+    firsts: np.ndarray  # [N + 1] each splat's first slot
     splats: np.ndarray  # [pairs] the splat of each slot
 
 

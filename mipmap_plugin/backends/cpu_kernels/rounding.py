@@ -5,9 +5,10 @@
 
 from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
-from mipmap_plugin.backends.cpu_kernels.compositing import BATCH, fill_range, find_patches, log_alpha, new_patches, tile_box
+from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, log_alpha, tile_box
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, fma, lowest_bit, maximum, minimum, select
-from mipmap_plugin.backends.cpu_kernels.memory import load, row_of, store
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
+from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import PATCH, PLANE, distances, new_state, offset_of
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
 
@@ -18,11 +19,11 @@ ROUNDER = 12582912.0
 @kernel
 def composite(start, stop, limits, table, lists, frame, outputs):
     """Draw the image [H, W, 3] of the tiles start..stop again; `lists` are sorted."""
-    starts, members, _, _ = lists
+    starts, members, patches = lists.starts, pointer(lists.members), pointer(lists.patches)
     background, transmittance, _ = frame
     image, _ = outputs
     height, width = transmittance.shape
-    state, patches = new_state(), new_patches()
+    state, found = new_state(), new_found()
     for tile in range(start, stop):
         box = tile_box(tile, width, height)
         left, top, tile_width, tile_height = box
@@ -30,11 +31,11 @@ def composite(start, stop, limits, table, lists, frame, outputs):
             fill_range(state, k * PLANE, (k + 1) * PLANE, background[k])
         for end in range(starts[tile + 1], starts[tile], -BATCH):
             begin = max(end - BATCH, starts[tile])
-            find_patches(table, members, begin, end, box, -1, patches)
+            find_patches(table, members, patches, begin, end, box, found)
             for at in range(end - 1, begin - 1, -1):
                 splat = row_of(table, members[at])
                 if splat[layout.GATE] > 0:
-                    draw_splat(splat, limits, patches[at - begin], box, state)
+                    draw_splat(splat, limits, patches[at], box, state)
         for r in range(tile_height):
             for c in range(tile_width):
                 for k in range(3):

@@ -7,6 +7,8 @@ splats of each tile. The runs are in order, so the lists do not depend on the nu
 # numba redefines calls and operators.
 # mypy: ignore-errors
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -14,6 +16,8 @@ import numpy as np
 from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import binning, inner, kernel, layout, threads
+from mipmap_plugin.backends.cpu_kernels.blocks import put
+from mipmap_plugin.backends.cpu_kernels.columns import outlines
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.records import Lists
@@ -34,7 +38,7 @@ SLOT_BITS = 32
 _SLOT = (1 << SLOT_BITS) - 1
 
 new_block, new_spans = scratch(layout.OUTLINE_FIELDS * WIDTH, types.float32), scratch(2 * WIDTH, types.float64)
-new_slots, new_counts = scratch(WIDTH, types.int64), scratch(1 << DIGIT_BITS, types.int64)
+new_many, new_slots, new_counts = scratch(WIDTH, types.int32), scratch(WIDTH, types.int64), scratch(1 << DIGIT_BITS, types.int64)
 
 
 class Projected(NamedTuple):
@@ -42,84 +46,121 @@ class Projected(NamedTuple):
 
     table: np.ndarray  # [N, SPLAT_FIELDS]
     order: np.ndarray  # [N] depths, or ranks: by what splats are sorted
-    slots: np.ndarray  # [N + 1] each splat's first slot
+    counts: np.ndarray  # [N] int32, the number of tiles that each touches
+    first_tiles: np.ndarray  # [N] int32, the first of these
     size: tuple[int, int]  # height, width
+
+    @classmethod
+    def of(cls, count: int, size: tuple[int, int]) -> Projected:
+        """Room for so many splats in a picture of this size."""
+        return cls(empty(count, layout.SPLAT_FIELDS), empty(count), empty(count, dtype=np.int32), empty(count, dtype=np.int32), size)
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """What `projection.project` fills."""
+        return self[:4]
 
 
 def tile_lists(views: Sequence[Projected], team: Team) -> list[Lists]:
     """Each tile's splats and their slots, of each view, not yet sorted by depth."""
     count = len(views[0].order)
     runs = 1 if team.threads == 1 else max(team.threads, min(RUNS_PER_THREAD * team.threads, count // threads.LEAST_ROWS))
-    written = []
-    for _, _, slots, (height, width) in views:
-        tiles_x, tiles_y = binning.tile_grid(width, height)
-        pairs = int(slots[-1])
-        written.append((empty(pairs, dtype=np.int32), empty(pairs, dtype=np.int32), np.empty((runs, tiles_x * tiles_y), np.int64)))
-    team.share_all(write_slots, [(runs, (view.table, view.slots, *view.size, *places)) for view, places in zip(views, written, strict=True)])
-    starts = [np.append(offsets(counts), len(tiles)) for tiles, _, counts in written]
-    entries = [empty(len(tiles), dtype=np.int64) for tiles, _, _ in written]
-    jobs = [
-        (runs, (view.order.view(np.int32), view.slots, tiles, counts, into))
-        for view, (tiles, _, counts), into in zip(views, written, entries, strict=True)
-    ]
+    written, jobs = [], []
+    for view in views:
+        befores = slots_before(view.counts, runs)
+        pairs, (tiles_x, tiles_y) = int(befores[-1]), binning.tile_grid(view.size[1], view.size[0])
+        firsts, splats, tiles = empty(count + 1, dtype=np.int64), empty(pairs, dtype=np.int32), empty(pairs, dtype=np.int32)
+        written.append((firsts, splats, tiles, np.empty((runs, tiles_x * tiles_y), np.int64)))
+        jobs.append((runs, (view.table, view.counts, view.first_tiles, *view.size, befores, *written[-1])))
+    team.share_all(write_slots, jobs)
+    lists, jobs = [], []
+    for view, (firsts, splats, tiles, counts) in zip(views, written, strict=True):
+        starts, pairs = offsets(counts), len(splats)
+        lists.append(Lists(starts, empty(pairs, dtype=np.int32), empty(pairs, dtype=np.int64), empty(pairs, dtype=np.int64), firsts, splats))
+        jobs.append((runs, (view.order.view(np.int32), firsts, tiles, counts, lists[-1].slots)))
     team.share_all(fill_entries, jobs)
-    splats_of = [splats for _, splats, _ in written]
-    return [Lists(*lists) for lists in zip(starts, [empty(len(splats), dtype=np.int32) for splats in splats_of], entries, splats_of, strict=True)]
+    return lists
 
 
 @inner
-def run_bounds(slots, run, runs):
+def run_bounds(count, run, runs):
     """The first splat of a run, and the first of the next."""
-    count = len(slots) - 1
     return count * run // runs, count * (run + 1) // runs
 
 
 @kernel
-def write_slots(start, stop, table, slots, height, width, tiles, splats, counts):
-    """Write the tile and the splat of every slot in the runs start..stop, and count the slots per run and tile."""
-    fields, block, spans, next_slots = pointer(table), new_block(), new_spans(), new_slots()
+def slots_before(counts, runs):
+    """The number of slots before each run, [runs + 1], the last of which is that of all."""
+    befores = np.zeros(runs + 1, np.int64)
+    for run in range(runs):
+        first, last = run_bounds(len(counts), run, runs)
+        befores[run + 1] = befores[run]
+        for i in range(first, last):
+            befores[run + 1] += counts[i]
+    return befores
+
+
+@kernel
+def write_slots(start, stop, table, counts, first_tiles, height, width, befores, firsts, splats, tiles, tile_counts):
+    """Number the slots of the runs start..stop, write the splat and the tile of each, and count the slots per run and tile."""
+    many, next_slots, spans, block, tiles_of = new_many(), new_slots(), new_spans(), new_block(), pointer(tiles)
     for run in range(start, stop):
-        counts[run] = 0
-        run_counts = pointer(counts[run])
-        first, last = run_bounds(slots, run, len(counts))
-        for block_start in range(first, last, WIDTH):
-            drawn = 0
-            for lane in range(min(WIDTH, last - block_start)):
-                i = block_start + lane
-                next_slots[lane] = slots[i]
-                if slots[i] < slots[i + 1]:
-                    drawn |= 1 << lane
-                    for k in range(layout.OUTLINE_FIELDS):
-                        block[k * WIDTH + lane] = fields[i * layout.SPLAT_FIELDS + k]
-                for slot in range(slots[i], slots[i + 1]):
-                    splats[slot] = i
-            if drawn != 0:
-                binning.write_tiles(block, spans, drawn, next_slots, width, height, pointer(tiles), run_counts)
+        tile_counts[run] = 0
+        run_counts, slot, waiting = pointer(tile_counts[run]), befores[run], 0
+        first, last = run_bounds(len(counts), run, len(tile_counts))
+        for i in range(first, last):
+            firsts[i], count = slot, counts[i]
+            if count == 1:
+                splats[slot], tiles[slot] = i, first_tiles[i]
+                run_counts[first_tiles[i]] += 1
+            elif count > 1:  # its tiles are found together with those of other such splats
+                for at in range(slot, slot + count):
+                    splats[at] = i
+                many[waiting], next_slots[waiting] = i, slot
+                waiting += 1
+            slot += count
+            if waiting == WIDTH or (waiting > 0 and i == last - 1):
+                put_outlines(table, many, waiting, block)
+                binning.write_tiles(block, spans, (1 << waiting) - 1, next_slots, width, height, tiles_of, run_counts)
+                waiting = 0
+        if last == len(counts):
+            firsts[last] = slot
+
+
+@inner
+def put_outlines(table, splats, count, block):
+    """Fill a block with the outlines of some splats."""
+    fields = outlines(table, splats, 0, count)
+    for k in range(layout.OUTLINE_FIELDS):
+        put(block, k, fields[k])
 
 
 @kernel
 def offsets(counts):
-    """Replace the counts [runs, tiles] by the offsets at which each run writes each tile, and return where each tile's list starts."""
-    at, starts = 0, np.empty(counts.shape[1], np.int64)
-    for tile in range(len(starts)):
+    """Replace the counts [runs, tiles] by the offsets at which each run writes each tile; return where each list starts, and the last one ends."""
+    at, starts = 0, np.empty(counts.shape[1] + 1, np.int64)
+    for tile in range(counts.shape[1]):
         starts[tile] = at
         for run in range(len(counts)):
             count = counts[run, tile]
             counts[run, tile] = at
             at += count
+    starts[-1] = at
     return starts
 
 
 @kernel
-def fill_entries(start, stop, depths, slots, tiles, run_offsets, entries):
+def fill_entries(start, stop, depths, firsts, tiles, run_offsets, entries):
     """Write the entries of the runs start..stop into the lists of their tiles."""
     for run in range(start, stop):
-        first, last = run_bounds(slots, run, len(run_offsets))
+        offsets_of = pointer(run_offsets[run])
+        first, last = run_bounds(len(depths), run, len(run_offsets))
         for i in range(first, last):
-            for slot in range(slots[i], slots[i + 1]):
-                at = run_offsets[run, tiles[slot]]
+            for slot in range(firsts[i], firsts[i + 1]):
+                tile = tiles[slot]
+                at = offsets_of[tile]
                 entries[at] = np.int64(depths[i]) << SLOT_BITS | slot
-                run_offsets[run, tiles[slot]] = at + 1
+                offsets_of[tile] = at + 1
 
 
 @kernel
@@ -128,7 +169,7 @@ def sort(start, stop, lists):
 
     Of splats at equal depth, the one with the lower index is in front.
     """
-    starts, members, entries, splats = lists
+    starts, members, entries, _, _, splats = lists
     longest = 0
     for tile in range(start, stop):
         longest = max(longest, starts[tile + 1] - starts[tile])

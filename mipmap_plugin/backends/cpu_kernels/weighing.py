@@ -7,10 +7,11 @@ import numpy as np
 
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout, projection, sorting
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
-from mipmap_plugin.backends.cpu_kernels.compositing import BATCH, find_patches, init_tile, log_alpha, new_patches, tile_box, unfinished_patches
+from mipmap_plugin.backends.cpu_kernels.compositing import init_tile, log_alpha, tile_box, unfinished_patches
 from mipmap_plugin.backends.cpu_kernels.drawing import flags_of, view_of
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, broadcast, fma, lowest_bit, minimum, select, total
-from mipmap_plugin.backends.cpu_kernels.memory import load, row_of, store
+from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
+from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import TRANSMITTANCE, distances, new_state
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.records import Limits, SplatArrays
@@ -25,14 +26,12 @@ def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarr
     view = view_of(camera, effects, splats, False)
     limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, 0.0)
     count, (height, width) = len(splats.means), camera.size
-    table, depths, counts, slots = empty(count, layout.SPLAT_FIELDS), empty(count), np.empty(count, np.int64), np.zeros(count + 1, np.int64)
-    threads, flags = team(count + width * height), flags_of(view, splats)
-    threads.share(projection.project, count, flags, view, splats, table, depths, counts, of_rows=True)
-    np.cumsum(counts, out=slots[1:])
-    [lists] = sorting.tile_lists([sorting.Projected(table, depths if ranks is None else ranks, slots, camera.size)], threads)
+    projected, threads, flags = sorting.Projected.of(count, camera.size), team(count + width * height), flags_of(view, splats)
+    threads.share(projection.project, count, flags, view, splats, *projected.arrays, of_rows=True)
+    [lists] = sorting.tile_lists([projected if ranks is None else projected._replace(order=ranks)], threads)
     by_pair, by_splat = empty(len(lists.members)), empty(count)
-    threads.share(weigh_tiles, len(lists.starts) - 1, flags.integrated, limits, table, lists, (width, height), by_pair)
-    threads.share(sum_pairs, count, slots, by_pair, by_splat, of_rows=True)
+    threads.share(weigh_tiles, len(lists.starts) - 1, flags.integrated, limits, projected.table, lists, (width, height), by_pair)
+    threads.share(sum_pairs, count, lists.firsts, by_pair, by_splat, of_rows=True)
     return by_splat
 
 
@@ -40,9 +39,9 @@ def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarr
 def weigh_tiles(start, stop, integrated, limits, table, lists, size, by_pair):
     """Write the weight of each pair of the tiles start..stop to its slot. integrated: as of `compositing.composite`."""
     sorting.sort(start, stop, lists)
-    starts, members, slots, _ = lists
+    starts, members, slots, patches = lists.starts, pointer(lists.members), lists.slots, pointer(lists.patches)
     width, height = size
-    state, patches = new_state(), new_patches()
+    state, found = new_state(), new_found()
     for tile in range(start, stop):
         box, first = tile_box(tile, width, height), starts[tile]
         length = starts[tile + 1] - first
@@ -54,21 +53,21 @@ def weigh_tiles(start, stop, integrated, limits, table, lists, size, by_pair):
             if unfinished == 0:
                 break
             end = min(begin + BATCH, length)
-            find_patches(table, members, first + begin, first + end, box, unfinished, patches)
+            find_patches(table, members, patches, first + begin, first + end, box, found)
             for n in range(begin, end):
                 splat = row_of(table, members[first + n])
                 if integrated is not None:
-                    by_pair[slots[first + n]] = weigh_integral(splat, limits, patches[n - begin], box, state)
+                    by_pair[slots[first + n]] = weigh_integral(splat, limits, patches[first + n] & unfinished, box, state)
                 elif splat[layout.GATE] > 0:
-                    by_pair[slots[first + n]] = weigh_splat(splat, limits, patches[n - begin], box, state)
+                    by_pair[slots[first + n]] = weigh_splat(splat, limits, patches[first + n] & unfinished, box, state)
 
 
 @kernel
-def sum_pairs(start, stop, slots, by_pair, by_splat):
+def sum_pairs(start, stop, firsts, by_pair, by_splat):
     """Add up the pairs of the splats start..stop."""
     for i in range(start, stop):
         weight = np.float32(0)
-        for slot in range(slots[i], slots[i + 1]):
+        for slot in range(firsts[i], firsts[i + 1]):
             weight += by_pair[slot]
         by_splat[i] = weight
 

@@ -12,19 +12,11 @@ from numba import types
 
 from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout, windows
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
-from mipmap_plugin.backends.cpu_kernels.compositing import (
-    BATCH,
-    fill_range,
-    find_patches,
-    init_tile,
-    new_patches,
-    tile_box,
-    unfinished_patches,
-    write_tile,
-)
+from mipmap_plugin.backends.cpu_kernels.compositing import fill_range, init_tile, tile_box, unfinished_patches, write_tile
 from mipmap_plugin.backends.cpu_kernels.compositing_back import init_tile_back, write_sums
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, broadcast, fma, lowest_bit, select
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, scratch, store
+from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import PATCHES, PLANE, STATE_SIZE, STOPS, TRANSMITTANCE, blend, distances, unblend
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
 from mipmap_plugin.effects import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
@@ -44,10 +36,10 @@ VISIT_SIZE = 4 * WIDTH
 def composite(start, stop, table, lists, frame, outputs):
     """Render the tiles start..stop into `frame`, and into the outputs: image [H, W, 3] and alpha [H, W]."""
     sort(start, stop, lists)
-    starts, members, _, _ = lists
+    starts, members, patches = lists.starts, pointer(lists.members), pointer(lists.patches)
     _, transmittance, _ = frame
     height, width = transmittance.shape
-    state, patches, no_record = new_window_state(), new_patches(), (pointer(table), pointer(starts), False)
+    state, found, no_record = new_window_state(), new_found(), (pointer(table), pointer(starts), False)
     for tile in range(start, stop):
         box, first = tile_box(tile, width, height), starts[tile]
         length = starts[tile + 1] - first
@@ -57,9 +49,9 @@ def composite(start, stop, table, lists, frame, outputs):
             if unfinished == 0:
                 break
             end = min(begin + BATCH, length)
-            find_patches(table, members, first + begin, first + end, box, unfinished, patches)
+            find_patches(table, members, patches, first + begin, first + end, box, found)
             for n in range(begin, end):
-                draw_splat(row_of(table, members[first + n]), patches[n - begin], n, box, state, no_record, 0)
+                draw_splat(row_of(table, members[first + n]), patches[first + n] & unfinished, n, box, state, no_record, 0)
         write_tile(box, state, frame, outputs)
 
 
@@ -134,11 +126,11 @@ def composite_back(start, stop, table, lists, frame, d_outputs, tile_grads):
 
     d_outputs: the gradients of the image [H, W, 3] and of its alpha [H, W].
     """
-    starts, members, slots, _ = lists
+    starts, members, slots, patches = lists.starts, pointer(lists.members), lists.slots, pointer(lists.patches)
     background, transmittance, stops = frame
     d_image, d_alpha = d_outputs
     height, width = transmittance.shape
-    state, patches = new_window_state(), new_patches()
+    state = new_window_state()
     stored, positions = np.empty(BATCH * PATCHES * VISIT_SIZE, np.float32), np.empty(BATCH * PATCHES, np.int64)
     for tile in range(start, stop):
         box, first = tile_box(tile, width, height), starts[tile]
@@ -152,9 +144,8 @@ def composite_back(start, stop, table, lists, frame, d_outputs, tile_grads):
             if visits + BATCH * PATCHES > len(positions):
                 stored, positions = np.append(stored, np.empty_like(stored)), np.append(positions, np.empty_like(positions))
             record, end = (pointer(stored), pointer(positions), True), min(begin + BATCH, length)
-            find_patches(table, members, first + begin, first + end, box, unfinished, patches)
             for n in range(begin, end):
-                visits = draw_splat(row_of(table, members[first + n]), patches[n - begin], n, box, state, record, visits)
+                visits = draw_splat(row_of(table, members[first + n]), patches[first + n] & unfinished, n, box, state, record, visits)
                 visit_offsets[n + 1] = visits
 
         used = init_tile_back(box, background, transmittance, stops, d_image, d_alpha, state)
