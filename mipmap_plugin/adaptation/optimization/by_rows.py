@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,31 +19,33 @@ from mipmap_plugin.splatting.bands import neighbors, one_tensor
 SH = ("sh0", "shN")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ByRows:
     """A model that a backend draws and moves, and what its parameters were after that."""
 
     draw: SteppingRenderer
     stepper: Stepper
-    parameters: tuple[Tensor, ...]
+    raw: Mapping[str, Tensor]  # `AdamStep.raw`
+    parameters: Mapping[str, Tensor]
     versions: tuple[int, ...]  # torch counts the changes in place that it makes; those of kernels it does not see
+    moments: _Moments | None = None
 
     @classmethod
     def of(cls, model: SplatModel, draw: SteppingRenderer | None, known: ByRows | None) -> ByRows | None:
         """`known` if it still holds, else a new one; None without `draw`, or if the model's parameters are not all those of 3DGS, and move."""
         if draw is None or not model.traits.plain:
             return None
-        parameters = tuple(model.parameters().values())
+        parameters = dict(model.parameters())
         if known is not None and known._holds_for(parameters):
             return known
-        joined = _joined(model.parameters())
-        if joined is None or not all(tensor.requires_grad for tensor in parameters):
+        raw = _joined(parameters)
+        if raw is None or not all(tensor.requires_grad for tensor in parameters.values()):
             return None
-        return cls(draw, draw.stepper(joined), parameters, tuple(tensor._version for tensor in parameters))
+        return cls(draw, draw.stepper(raw), raw, parameters, _versions(parameters))
 
-    def _holds_for(self, parameters: tuple[Tensor, ...]) -> bool:
-        same = len(parameters) == len(self.parameters) and all(one is other for one, other in zip(parameters, self.parameters, strict=True))
-        return same and self.versions == tuple(tensor._version for tensor in parameters)
+    def _holds_for(self, parameters: Mapping[str, Tensor]) -> bool:
+        same = parameters.keys() == self.parameters.keys() and all(tensor is self.parameters[name] for name, tensor in parameters.items())
+        return same and self.versions == _versions(parameters)
 
     def differentiate(self, number: int, camera: Camera, draw: int, compare: Comparison) -> Tensor:
         """Draw the view of that number in a step, the `draw`-th since the beginning, and compare its image; return the mean square error."""
@@ -50,22 +53,41 @@ class ByRows:
 
     def step(self, optimizer: Adam) -> None:
         """Move the parameters, once some views are differentiated."""
-        self.stepper.step(adam_step(optimizer))
+        if self.moments is None or not self.moments.are_of(optimizer):
+            self.moments = _Moments.of(optimizer, self.parameters)
+        self.stepper.step(self.moments.next_step(optimizer, self.raw))
 
 
-@torch.no_grad()
-def adam_step(optimizer: Adam) -> AdamStep:
-    """The optimizer's next step over the parameters of 3DGS, of which sh0 and shN lie in one tensor."""
-    tensors = {group["name"]: group["params"][0] for group in optimizer.param_groups}
-    states = {name: optimizer.state_of(tensor) for name, tensor in tensors.items()}
-    first, second = (_joined_moments(states, name) for name in ("exp_avg", "exp_avg_sq"))
-    counts = [state["step"] for state in states.values()]
-    torch._foreach_add_(counts, 1)
-    count, (beta1, beta2) = int(counts[0]), optimizer.betas
-    rates = {group["name"]: group["lr"] / (1 - beta1**count) for group in optimizer.param_groups}
-    raw = _joined(tensors)
-    assert raw is not None  # since `ByRows` has checked it
-    return AdamStep(raw, first, second, rates, optimizer.betas, (1 - beta2**count) ** -0.5, optimizer.eps)
+def _versions(parameters: Mapping[str, Tensor]) -> tuple[int, ...]:
+    return tuple(tensor._version for tensor in parameters.values())
+
+
+@dataclass(eq=False)
+class _Moments:
+    """The moments of an optimizer as a stepper takes them: those of sh0 and shN lie in one tensor."""
+
+    states: Mapping[Tensor, dict[str, Any]]  # of the optimizer, which makes new ones when it starts anew
+    first: Mapping[str, Tensor]
+    second: Mapping[str, Tensor]
+
+    @classmethod
+    def of(cls, optimizer: Adam, parameters: Mapping[str, Tensor]) -> _Moments:
+        states = {name: optimizer.state_of(tensor) for name, tensor in parameters.items()}
+        first, second = (_joined_moments(states, name) for name in ("exp_avg", "exp_avg_sq"))
+        return cls({parameters[name]: state for name, state in states.items()}, first, second)
+
+    def are_of(self, optimizer: Adam) -> bool:
+        """Whether the optimizer still has them."""
+        return all(optimizer.state.get(tensor) is state for tensor, state in self.states.items())
+
+    @torch.no_grad()
+    def next_step(self, optimizer: Adam, raw: Mapping[str, Tensor]) -> AdamStep:
+        """The optimizer's next step over the raw parameters of 3DGS."""
+        counts = [state["step"] for state in self.states.values()]
+        torch._foreach_add_(counts, 1)
+        count, (beta1, beta2) = int(counts[0]), optimizer.betas
+        rates = {group["name"]: group["lr"] / (1 - beta1**count) for group in optimizer.param_groups}
+        return AdamStep(raw, self.first, self.second, rates, optimizer.betas, (1 - beta2**count) ** -0.5, optimizer.eps)
 
 
 def _joined(parameters: Mapping[str, Tensor]) -> dict[str, Tensor] | None:

@@ -17,6 +17,7 @@ from mipmap_plugin.backends.cpu_kernels.drawing import Drawing, add_views
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.records import SplatArrays
 from mipmap_plugin.backends.cpu_kernels.threads import team
+from mipmap_plugin.pool import empty
 
 # Rows that are moved at a time. Their gradients, 236 bytes each, stay in the cache from view to view; a quarter as many take 3 % longer on small
 # scenes, for they need more calls, and as long on large ones.
@@ -55,7 +56,7 @@ class _Room:
 
     def __init__(self, splats: SplatArrays, rows: int) -> None:
         self._shapes = [array.shape[1:] if len(array) else None for array in splats]
-        self._block = np.empty(rows * sum(math.prod(shape) for shape in self._shapes if shape is not None), np.float32)
+        self._block = empty(rows * sum(math.prod(shape) for shape in self._shapes if shape is not None))
 
     def zeros(self, rows: int) -> SplatArrays:
         """Gradients of so many rows, all 0."""

@@ -40,7 +40,7 @@ class CpuStepper:
 
     def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
         drawn = self._drawn[number]
-        outputs = d_image.contiguous().numpy(), np.zeros_like(drawn.alpha) if d_alpha is None else d_alpha.contiguous().numpy()
+        outputs = d_image.contiguous().numpy(), np.zeros(drawn.alpha.shape, np.float32) if d_alpha is None else d_alpha.contiguous().numpy()
         [self._tables[number]] = drawing.tile_gradients([drawn], [outputs])
 
     def step(self, step: AdamStep) -> None:
