@@ -18,12 +18,12 @@ def test_splats_in_view_are_those_whose_centers_are_on_the_image():
 
 
 @pytest.mark.parametrize(
-    ("in_view", "steps", "views"), [(10.0, 450, 150), (MOST_DRAWS / 1800, 450, 150), (MOST_DRAWS / 900, 225, 106), (1e9, 450 * LEAST_FRACTION, 75)]
+    ("in_view", "steps", "views"), [(10.0, 360, 150), (MOST_DRAWS / 1440, 360, 150), (MOST_DRAWS / 720, 180, 106), (1e9, 360 * LEAST_FRACTION, 75)]
 )
 def test_steps_and_views_fall_with_what_views_show_but_not_to_none(in_view, steps, views):
     settings = affordable(recipe("default", 1 / 4), in_view)
     assert (settings.steps, settings.extra_views) == (pytest.approx(steps, abs=1), pytest.approx(views, abs=1))
-    assert settings.truth_oversampling == (4 if steps == 450 else OVERSAMPLING)
+    assert settings.truth_oversampling == (4 if steps == 360 else OVERSAMPLING)
 
 
 def test_settings_of_a_large_scene_are_recognized_as_those_that_were_asked_for():

@@ -118,10 +118,11 @@ def test_views_of_a_step_may_be_differentiated_in_any_order_and_thread():
     assert all(torch.equal(one, other) for one, other in zip(*(model.parameters().values() for model in models), strict=True))
 
 
-def test_the_kernel_of_a_step_against_float64():
-    """One splat parameter, several steps: the formulas of Kingma and Ba."""
+@pytest.mark.parametrize("nesterov", [False, True])
+def test_the_kernel_of_a_step_against_float64(nesterov):
+    """One splat parameter, several steps: the formulas of Kingma and Ba, and Nesterov's momentum."""
     model = student(16)
-    optimizer = make_optimizer(model, recipe("default", 1 / 4), pixel=0.1)
+    optimizer = make_optimizer(model, recipe("default", 1 / 4, nesterov=nesterov), pixel=0.1)
     opacity, mean, square = model.parameters()["opacities"].detach().double(), torch.zeros(16).double(), torch.zeros(16).double()
     (beta1, beta2), rate = optimizer.betas, recipe("default", 1 / 4).rates.opacities
     for count in (1, 2, 3):
@@ -130,7 +131,8 @@ def test_the_kernel_of_a_step_against_float64():
         loss(ReferenceBackend().render(raw.gaussians(), *shot) for shot in SHOTS).backward()
         gradient = raw.parameters()["opacities"].grad.double()
         mean, square = beta1 * mean + (1 - beta1) * gradient, beta2 * square + (1 - beta2) * gradient**2
-        opacity = opacity - rate * mean / (1 - beta1**count) / ((square / (1 - beta2**count)).sqrt() + 1e-15)
+        ahead = beta1 * mean + (1 - beta1) * gradient if nesterov else mean
+        opacity = opacity - rate * ahead / (1 - beta1**count) / ((square / (1 - beta2**count)).sqrt() + 1e-15)
         step_by_rows(model, optimizer)
     torch.testing.assert_close(model.parameters()["opacities"].detach().double(), opacity, atol=2e-4, rtol=1e-3)
 

@@ -336,12 +336,26 @@ def test_a_step_is_that_of_torchs_adam_bit_by_bit():
     assert all(torch.equal(a, b) for a, b in zip(ours, theirs, strict=True))
 
 
+def test_a_step_with_nesterovs_momentum_counts_the_newest_gradient_once_more():
+    ours, theirs = torch.linspace(-1, 1, 6).double().requires_grad_(), torch.linspace(-1, 1, 6).double()
+    adam, first, second = Adam([dict(params=[ours], lr=0.1)], (0.8, 0.99), 1e-15, nesterov=True), torch.zeros(6), torch.zeros(6)
+    for count in range(1, 5):
+        ours.sin().square().sum().backward()
+        gradient = (2 * theirs).sin()
+        first, second = 0.8 * first + 0.2 * gradient, 0.99 * second + 0.01 * gradient**2
+        ahead = 0.8 * first + 0.2 * gradient
+        theirs = theirs - 0.1 * ahead / (1 - 0.8**count) / ((second / (1 - 0.99**count)).sqrt() + 1e-15)
+        adam.step()
+        adam.zero_grad()
+    torch.testing.assert_close(ours.detach(), theirs, rtol=1e-6, atol=1e-7)  # torch counts steps in float32
+
+
 def test_a_step_of_a_part_of_a_tensor_is_that_of_the_same_numbers_alone():
     generator = torch.Generator().manual_seed(0)
     start, weights = (torch.randn(2 * ROWS + 5, 16, 3, generator=generator) for _ in range(2))
     alone, part = start[:, 1:].clone().requires_grad_(), start.clone()[:, 1:].requires_grad_()
     for tensor in (alone, part):
-        adam = Adam([dict(params=[tensor], lr=0.1)], (0.8, 0.99), 1e-15)
+        adam = Adam([dict(params=[tensor], lr=0.1)], (0.8, 0.99), 1e-15, nesterov=True)
         for _ in range(3):
             (tensor.sin() * weights[:, 1:]).sum().backward()
             adam.step()

@@ -11,7 +11,7 @@ from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
-from mipmap_plugin.adaptation.views import ShuffledRounds, ViewSchedule, choose_views, extent
+from mipmap_plugin.adaptation.views import Rounds, ViewSchedule, choose_views, extent
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.config import AdaptConfig
@@ -161,13 +161,13 @@ def test_a_split_without_views_is_refused():
 
 def test_rounds_show_every_view_once_and_start_anywhere():
     views = tiny.cameras(5)
-    rounds = ShuffledRounds(views, seed=2)
+    rounds = Rounds(views, seed=2)
     drawn = [rounds(draw) for draw in range(15)]
     for start in (0, 5, 10):
         assert set(drawn[start : start + 5]) == set(views)
     assert drawn[:5] != drawn[5:10]
-    assert [ShuffledRounds(views, seed=2)(draw) for draw in range(15)] == drawn
-    assert [ShuffledRounds(views, seed=3)(draw) for draw in range(15)] != drawn
+    assert [Rounds(views, seed=2)(draw) for draw in range(15)] == drawn
+    assert [Rounds(views, seed=3)(draw) for draw in range(15)] != drawn
 
 
 def test_views_are_spread_over_their_order():

@@ -1,4 +1,4 @@
-"""Which views are adapted to, and in which order: introduced one after the other, then repeated in shuffled rounds. All follows from one seed."""
+"""Which views are adapted to, and in which order: introduced one after the other, then repeated in rounds. All follows from one seed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.spreading import places, spread
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
@@ -30,7 +31,7 @@ class ViewSchedule:
     """The views that each step uses. It has no state, so that a run can be resumed at any step."""
 
     def __init__(self, views: Sequence[Camera], config: AdaptConfig) -> None:
-        self._rounds, self._seed, self._steps = ShuffledRounds(views, config.seed), config.seed, config.steps
+        self._rounds, self._seed, self._steps = Rounds(views, config.seed, spread_out=config.order == "spread"), config.seed, config.steps
         self._max_views, self._warm_up = min(config.views_per_step, len(views)), config.warm_up_steps
         self._gathering = math.ceil(config.gathering * config.steps)  # steps during which new views are introduced
         self._draws_in_warm_up = [0, *accumulate(self._views_in_step(step) for step in range(self._warm_up))]  # before each of its steps
@@ -71,11 +72,13 @@ class ViewSchedule:
         return min(count, self.draws_before(step + 1), len(self._rounds.views))
 
 
-class ShuffledRounds:
+class Rounds:
     """Each view once per round, in an order that follows from (seed, round) alone, so that a run can be resumed at any step."""
 
-    def __init__(self, views: Sequence[Camera], seed: int) -> None:
+    def __init__(self, views: Sequence[Camera], seed: int, *, spread_out: bool = False) -> None:
+        """`spread_out`: neighbors look from all sides; otherwise the order is shuffled."""
         self.views, self._seed = list(views), seed
+        self._places = places(views) if spread_out and views else None
         self._round = -1
         self._order: list[int] = []
 
@@ -83,9 +86,14 @@ class ShuffledRounds:
         """The `draw`-th view since the beginning of the run."""
         round_number, position = divmod(draw, len(self.views))
         if round_number != self._round:
-            generator = torch.Generator().manual_seed(derived_seed(self._seed, round_number))
-            self._round, self._order = round_number, torch.randperm(len(self.views), generator=generator).tolist()
+            self._round, self._order = round_number, self._order_of(round_number)
         return self.views[self._order[position]]
+
+    def _order_of(self, round_number: int) -> list[int]:
+        generator = torch.Generator().manual_seed(derived_seed(self._seed, round_number))
+        if self._places is not None:
+            return spread(range(len(self.views)), self._places, generator)
+        return torch.randperm(len(self.views), generator=generator).tolist()
 
 
 def extent(views: Sequence[Camera]) -> float:

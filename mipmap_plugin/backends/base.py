@@ -143,6 +143,7 @@ class AdamStep:
     betas: tuple[float, float]
     correction: float  # 1 / sqrt(1 - beta2^t)
     eps: float
+    nesterov: bool = False  # with beta1 · first + (1 - beta1) · gradient in place of the first moment (Dozat 2016, without its schedule of beta1)
 
 
 class Stepper(Protocol):

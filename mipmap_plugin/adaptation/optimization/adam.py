@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) with torch's fused kernel; state and results are identical to those of torch.optim.Adam.
+"""Adam (Kingma and Ba 2015) with torch's fused kernel; without Nesterov's momentum, state and results are those of torch.optim.Adam.
 
 torch.optim imports torch's compiler with the first optimizer, which takes over a second in every process and is not needed here.
 """
@@ -18,8 +18,9 @@ ROWS = 2048
 class Adam:
     """Adam over groups of tensors: dictionaries with `params`, `lr` and any other entries. Tensors without a gradient do not move."""
 
-    def __init__(self, groups: Iterable[dict[str, Any]], betas: tuple[float, float], eps: float) -> None:
-        self.param_groups, self.betas, self.eps = [dict(group) for group in groups], betas, eps
+    def __init__(self, groups: Iterable[dict[str, Any]], betas: tuple[float, float], eps: float, *, nesterov: bool = False) -> None:
+        """`nesterov`: as in `backends.base.AdamStep`."""
+        self.param_groups, self.betas, self.eps, self.nesterov = [dict(group) for group in groups], betas, eps, nesterov
         self.state: dict[Tensor, dict[str, Any]] = {}
 
     @torch.no_grad()
@@ -49,6 +50,15 @@ class Adam:
                 tensors, grads, first, second, [], steps, lr=rate, beta1=self.betas[0], beta2=self.betas[1], weight_decay=0.0, eps=self.eps,
                 amsgrad=False, maximize=False,
             )  # fmt: skip
+            if self.nesterov:
+                for tensor, value in zip(tensors, values, strict=True):
+                    self._count_newest_again(tensor, value, rate)
+
+    def _count_newest_again(self, tensor: Tensor, values: tuple[Tensor, ...], rate: float) -> None:
+        """What a step with Nesterov's momentum adds to one without. values: as of `_move`, after the step."""
+        (grad, steps, first, second), (beta1, beta2) = values, self.betas
+        newest = (grad - first) * (rate * (1 - beta1) / (1 - beta1**steps))
+        tensor.sub_(newest.div_(second.sqrt().mul_((1 - beta2**steps).rsqrt()).add_(self.eps)))
 
     def _move_parts(self, tensor: Tensor, rate: float) -> None:
         """Move a tensor whose rows do not follow each other in memory, which torch's kernel requires: some rows at a time, as copies."""

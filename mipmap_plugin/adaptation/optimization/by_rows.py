@@ -87,7 +87,8 @@ class _Moments:
         torch._foreach_add_(counts, 1)
         count, (beta1, beta2) = int(counts[0]), optimizer.betas
         rates = {group["name"]: group["lr"] / (1 - beta1**count) for group in optimizer.param_groups}
-        return AdamStep(raw, self.first, self.second, rates, optimizer.betas, (1 - beta2**count) ** -0.5, optimizer.eps)
+        correction = (1 - beta2**count) ** -0.5
+        return AdamStep(raw, self.first, self.second, rates, optimizer.betas, correction, optimizer.eps, optimizer.nesterov)
 
 
 def _joined(parameters: Mapping[str, Tensor]) -> dict[str, Tensor] | None:

@@ -79,7 +79,7 @@ def is_checked(step: int, config: AdaptConfig) -> bool:
     """Whether the run is checked after this step: more often during the warm-up, while the rates rise."""
     warm_up = config.warm_up_steps
     every = config.check_every if step >= warm_up else max(1, min(config.check_every, warm_up // CHECKS_IN_WARM_UP))
-    return step % every == 0 or step == config.steps
+    return step % every == 0 or step in (warm_up, config.steps)
 
 
 # docs/how_it_works.md shows the code up to the next such line.
@@ -119,9 +119,7 @@ def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views
 # --8<-- [end:step]
 
 
-def _step_by_autograd(
-    run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera], at_once: int
-) -> None:
+def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera], at_once: int) -> None:
     """A step from the gradients of all splats, which are summed over calls of `at_once` views each if the backend draws several in a call."""
     splats = Activation(run.student, share=len(views) > 1)
     with large_for_torch(run.student.parameters()["means"]):
@@ -175,14 +173,15 @@ def _check(run: Run, task: Task, config: AdaptConfig) -> None:
     steering, steps = run.steering, run.step - run.curve[-1].step
     validation_db = run.costs.check(lambda: task.validation.steer(run.student))
     growing = run.trial is not None and run.trial.before is not None  # a growth gets some steps before it is assessed
-    harmful = config.returns == "best" and not growing and steering.is_harmful(validation_db)
+    factor, rising = steering.rate_factor(run.progress(config), config), run.progress(config) < 2 * config.warm_up
+    harmful = config.returns == "best" and not growing and steering.is_harmful(validation_db, rising=rising)
     if harmful:
-        steering.reduce_rates(steering.rate_factor(run.progress(config), config))
+        steering.reduce_rates(factor, rising=rising)
         run.rows_changed |= len(steering.best.rows["means"]) != len(run.student.parameters()["means"])
         restore_snapshot(run.student, run.optimizer, steering.best)
         run.gradients = None if run.gradients is None else density.ScreenGradients.of(run.student.parameters()["means"], config)
     else:
-        steering.update_best(validation_db, run.step, run.student, run.rows_changed)
+        steering.update_best(validation_db, run.step, run.student, run.rows_changed, factor)
     mean = float(run.square_error) / max(1, steps)  # this waits for a GPU, so that the clock counts its work
     point = CurvePoint(
         step=run.step, seconds=run.watch.read(), psnr_db=decibel(mean) if steps else None,

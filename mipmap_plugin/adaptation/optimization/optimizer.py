@@ -26,7 +26,7 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> Adam
     groups = [{"params": [tensor], "lr": rates[name], "base_lr": rates[name], "name": name} for name, tensor in model.parameters().items()]
     if shared := list(model.shared_parameters().values()):
         groups.append({"params": shared, "lr": rates["networks"], "base_lr": rates["networks"], "name": "networks"})
-    return Adam(groups, betas=config.betas, eps=ADAM_EPS)
+    return Adam(groups, betas=config.betas, eps=ADAM_EPS, nesterov=config.nesterov)
 
 
 def set_rates(optimizer: Adam, config: AdaptConfig, progress: float, rate_factor: float, frozen: Collection[str] = ()) -> None:
@@ -40,11 +40,16 @@ def set_rates(optimizer: Adam, config: AdaptConfig, progress: float, rate_factor
 
 
 def restore_snapshot(model: SplatModel, optimizer: Adam, snapshot: Snapshot) -> None:
-    """Set the model to the snapshot, in its own leaves where it has as many rows, and reset Adam's state."""
+    """Set the model to the snapshot, in its own leaves where it has as many rows, without the momentum of the steps since.
+
+    The second moments stay, where rows are the same: without them Adam's first steps are longest, and may do harm again.
+    """
     if len(model.parameters()["means"]) != len(snapshot.rows["means"]):
         restore_parameters(model, optimizer, snapshot.rows)
     snapshot.put_into(model)
-    optimizer.state.clear()
+    for state in optimizer.state.values():
+        if state:
+            state["exp_avg"].zero_()
 
 
 def restore_parameters(model: SplatModel, optimizer: Adam, before: Mapping[str, Tensor]) -> None:
@@ -57,9 +62,7 @@ def restore_parameters(model: SplatModel, optimizer: Adam, before: Mapping[str, 
         optimizer.state.pop(tensor, None)
 
 
-def change_rows(
-    model: SplatModel, optimizer: Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]
-) -> None:
+def change_rows(model: SplatModel, optimizer: Adam, parameter: Callable[[str, Tensor], Tensor], moment: Callable[[Tensor], Tensor]) -> None:
     """Replace every parameter by `parameter(name, old)` and its moments by `moment(old)`, in the model and in the optimizer.
 
     Both functions return new tensors, or parts of the old ones.

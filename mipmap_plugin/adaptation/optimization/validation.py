@@ -47,6 +47,11 @@ TIE_DB = 0.01
 # The rates of a run are multiplied by this after harmful steps.
 RATE_REDUCTION = 0.5
 
+# While rates rise, steps do harm that lose this fraction of what the run gained so far, and this many dB at least: real captures gain up to a
+# rate of their own, and lose from there on, long before they are worse than at the start; objects gain at all rates. The first steps, of a view
+# each, may lose a little to any view they do not show.
+LOST_FRACTION, LOST_DB = 0.25, 0.25
+
 # A run with a warm-up begins with its rates multiplied by this.
 FIRST_RATE_FACTOR = 1 / 32
 
@@ -139,6 +144,7 @@ class Steering:
     best_db: float
     best: Snapshot
     best_step: int = 0
+    best_factor: float = 1.0  # the rate factor of the step that led there
     ceiling: float = 1.0  # upper limit of the rate factor, after larger rates did harm
 
     @classmethod
@@ -151,15 +157,19 @@ class Steering:
         factor = FIRST_RATE_FACTOR ** (1 - progress / config.warm_up) if progress < config.warm_up else 1.0
         return min(factor, self.ceiling)
 
-    def is_harmful(self, psnr: float) -> bool:
-        """Whether a state with this PSNR is worse than the start."""
+    def is_harmful(self, psnr: float, *, rising: bool = False) -> bool:
+        """Whether a state with this PSNR is worse than the start or, while rates are `rising`, has lost much of what was gained."""
+        if rising:
+            return psnr < self.best_db - max(LOST_DB, LOST_FRACTION * (self.best_db - self.start_db))
         return psnr < self.start_db - HARM_DB
 
-    def reduce_rates(self, rate_factor: float) -> None:
-        """Limit the rates to a fraction of `rate_factor`, which did harm."""
-        self.ceiling = RATE_REDUCTION * rate_factor
+    def reduce_rates(self, rate_factor: float, *, rising: bool = False) -> None:
+        """Limit the rates to a fraction of `rate_factor`, which did harm; while they were `rising`, to those that led to the best state."""
+        lower = rising and self.best_step > 0 and self.best_factor < rate_factor
+        self.ceiling = self.best_factor if lower else RATE_REDUCTION * rate_factor
 
-    def update_best(self, psnr: float, step: int, student: SplatModel, rows_changed: bool = False) -> None:
-        """Keep the student's state as the best one, unless it is worse."""
+    def update_best(self, psnr: float, step: int, student: SplatModel, rows_changed: bool = False, rate_factor: float = 1.0) -> None:
+        """Keep the student's state, to which steps of `rate_factor` led, as the best one, unless it is worse."""
         if psnr >= self.best_db - TIE_DB:
-            self.best_db, self.best_step, self.best = max(psnr, self.best_db), step, self.best.renewed(student, rows_changed)
+            self.best_db, self.best_step, self.best_factor = max(psnr, self.best_db), step, rate_factor
+            self.best = self.best.renewed(student, rows_changed)

@@ -64,9 +64,11 @@ def moved(grads, raw, first, second, rates):
 
 @inner
 def move(start, stop, columns, arrays, settings):
-    """Adam on the rows start..stop of one parameter. settings: 1 - beta1, 1 - beta2, 1 / sqrt(1 - beta2^t) and epsilon."""
+    """Adam on the rows start..stop of one parameter. settings: 1 - beta1, 1 - beta2, what the step
+    counts of the newest gradient besides the first moment, 1 / sqrt(1 - beta2^t) and epsilon.
+    """
     d, p, m, v, rate = arrays
-    new_first, new_second, correction, eps = settings
+    new_first, new_second, newest, correction, eps = settings
     at, count, of_rate = start * columns, (stop - start) * columns, 0
     whole = count - count % WIDTH
     for i in range(0, whole, WIDTH):
@@ -76,12 +78,13 @@ def move(start, stop, columns, arrays, settings):
         square = square + (g * g - square) * new_second
         store(m, at + i, mean)
         store(v, at + i, square)
-        store(p, at + i, load(p, at + i) - load(rate, of_rate) * mean / (sqrt(square) * correction + eps))
+        store(p, at + i, load(p, at + i) - load(rate, of_rate) * (mean + (g - mean) * newest) / (sqrt(square) * correction + eps))
         of_rate = of_rate + WIDTH if of_rate + WIDTH < WIDTH * columns else 0
     for i in range(whole, count):
         m[at + i] += (d[i] - m[at + i]) * new_first
         v[at + i] += (d[i] * d[i] - v[at + i]) * new_second
-        p[at + i] -= rate[of_rate + i - whole] * m[at + i] / (np.float32(math.sqrt(v[at + i])) * correction + eps)
+        mean = m[at + i] + (d[i] - m[at + i]) * newest
+        p[at + i] -= rate[of_rate + i - whole] * mean / (np.float32(math.sqrt(v[at + i])) * correction + eps)
 
 
 @kernel

@@ -30,7 +30,8 @@ def descend(splats: SplatArrays, views: Sequence[tuple[Drawing, np.ndarray]], st
     threads = team(count * len(views))
     raw, firsts, seconds = (_arrays(tensors) for tensors in (step.raw, step.first, step.second))
     rates = _rates(step, splats.sh.shape[1])
-    settings = tuple(np.float32(number) for number in (1 - step.betas[0], 1 - step.betas[1], step.correction, step.eps))
+    new_first, new_second = 1 - step.betas[0], 1 - step.betas[1]
+    settings = tuple(np.float32(number) for number in (new_first, new_second, new_first * step.nesterov, step.correction, step.eps))
 
     def move(start: int, stop: int) -> None:
         room = _Room(splats, min(ROWS, stop - start))
@@ -73,7 +74,7 @@ def compile_step() -> None:
     """Compile the step, of no splat."""
     rows = SplatArrays(*(np.empty((0, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3), (3, 3))))
     rates = SplatArrays(*[np.empty(0, np.float32)] * len(rows))
-    adam.step(0, 0, rows, rows, rows, rows, rows, rates, (np.float32(0),) * 4)
+    adam.step(0, 0, rows, rows, rows, rows, rows, rates, (np.float32(0),) * 5)
 
 
 def _arrays(tensors: Mapping[str, Tensor]) -> SplatArrays:
