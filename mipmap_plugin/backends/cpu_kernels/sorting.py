@@ -36,9 +36,11 @@ MAX_INSERTION = 32
 # An entry of a list during sorting: the depth's bits above, the slot below. Positive floats sort like their bits.
 SLOT_BITS = 32
 _SLOT = (1 << SLOT_BITS) - 1
+_DIGIT = (1 << DIGIT_BITS) - 1
+DIGITS = 32 // DIGIT_BITS
 
 new_block, new_spans = scratch(layout.OUTLINE_FIELDS * WIDTH, types.float32), scratch(2 * WIDTH, types.float64)
-new_many, new_slots, new_counts = scratch(WIDTH, types.int32), scratch(WIDTH, types.int64), scratch(1 << DIGIT_BITS, types.int64)
+new_many, new_slots, new_counts = scratch(WIDTH, types.int32), scratch(WIDTH, types.int64), scratch(DIGITS << DIGIT_BITS, types.int64)
 
 
 class Projected(NamedTuple):
@@ -199,24 +201,27 @@ def sort_short(entries, first, last):
 @inner
 def sort_long(entries, first, length, spare, counts):
     """Radix sort by depth of the `length` entries from `first` on; stable."""
+    for at in range(DIGITS << DIGIT_BITS):
+        counts[at] = 0
+    for n in range(first, first + length):
+        depth = entries[n] >> SLOT_BITS
+        for digit in range(DIGITS):
+            counts[(digit << DIGIT_BITS) + ((depth >> (digit * DIGIT_BITS)) & _DIGIT)] += 1
     source, target, source_first, target_first = entries, spare, first, 0
-    for shift in range(SLOT_BITS, 2 * SLOT_BITS, DIGIT_BITS):
-        for digit in range(1 << DIGIT_BITS):
-            counts[digit] = 0
-        for n in range(length):
-            counts[(source[source_first + n] >> shift) & ((1 << DIGIT_BITS) - 1)] += 1
-        if counts[(source[source_first] >> shift) & ((1 << DIGIT_BITS) - 1)] == length:
+    for digit in range(DIGITS):
+        shift, mine = SLOT_BITS + digit * DIGIT_BITS, digit << DIGIT_BITS
+        if counts[mine + ((source[source_first] >> shift) & _DIGIT)] == length:
             continue  # all entries have the same digit
         at = 0
-        for digit in range(1 << DIGIT_BITS):
-            count = counts[digit]
-            counts[digit] = at
+        for value in range(mine, mine + (1 << DIGIT_BITS)):
+            count = counts[value]
+            counts[value] = at
             at += count
         for n in range(length):
             entry = source[source_first + n]
-            digit = (entry >> shift) & ((1 << DIGIT_BITS) - 1)
-            target[target_first + counts[digit]] = entry
-            counts[digit] += 1
+            value = mine + ((entry >> shift) & _DIGIT)
+            target[target_first + counts[value]] = entry
+            counts[value] += 1
         source, target, source_first, target_first = target, source, target_first, source_first
     for n in range(length):  # after an even number of passes, onto themselves
         entries[first + n] = source[source_first + n]
