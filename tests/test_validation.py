@@ -170,15 +170,15 @@ def steering(**more) -> Steering:
 
 
 def test_boldness_rises_by_the_same_factor_in_each_step_of_the_warm_up():
-    config = recipe("default", SCALE, warm_up=0.5)
-    risen = [steering().rate_factor(progress, config) for progress in (0.0, 0.125, 0.25, 0.375, 0.5, 0.75, 1.0)]
+    config = recipe("default", SCALE, steps=16, warm_up=0.5)
+    risen = [steering().rate_factor(step, config) for step in (0, 2, 4, 6, 8, 12, 16)]
     assert risen == pytest.approx([FIRST_RATE_FACTOR, FIRST_RATE_FACTOR**0.75, FIRST_RATE_FACTOR**0.5, FIRST_RATE_FACTOR**0.25, 1, 1, 1])
-    assert steering().rate_factor(0.0, recipe("default", SCALE, warm_up=0)) == 1
+    assert steering().rate_factor(0, recipe("default", SCALE, warm_up=0)) == 1
 
 
 def test_boldness_does_not_rise_above_the_ceiling():
-    config, capped = recipe("default", SCALE, warm_up=0.5), steering(ceiling=0.25)
-    assert [capped.rate_factor(progress, config) for progress in (0.0, 0.5, 1.0)] == pytest.approx([FIRST_RATE_FACTOR, 0.25, 0.25])
+    config, capped = recipe("default", SCALE, steps=16, warm_up=0.5), steering(ceiling=0.25)
+    assert [capped.rate_factor(step, config) for step in (0, 8, 16)] == pytest.approx([FIRST_RATE_FACTOR, 0.25, 0.25])
 
 
 def test_harm_is_less_than_the_start_by_more_than_a_choice_of_views_makes():
@@ -300,6 +300,20 @@ def test_a_budget_of_nothing_returns_the_start(closed_form):
     assert [point.step for point in adapted.report.curve] == [0]
     assert same(adapted.model, model.adapt(SCALE, steps=0, **settings).model)
     assert same(adapted.model, model.model) != closed_form
+
+
+@pytest.mark.parametrize(
+    ("settings", "checks"),
+    [
+        (dict(steps=360), [*range(3, 37, 3), *range(50, 351, 50), 360]),
+        (dict(steps=40, warm_up=0.1), [1, 2, 3, 4, *range(6, 37, 6), 40]),
+        (dict(steps=12, warm_up=0), [5, 10, 12]),
+        (dict(steps=6, warm_up=0, check_every=2), [2, 4, 6]),
+    ],
+)
+def test_short_runs_are_checked_more_often_and_so_is_the_warm_up(settings, checks):
+    config = recipe("default", SCALE, **settings)
+    assert [step for step in range(1, config.steps + 1) if loop.is_checked(step, config)] == checks
 
 
 @pytest.mark.parametrize(

@@ -51,9 +51,10 @@ class Stopwatch:
         return time.perf_counter()
 
 
-def progress(step: int, seconds: float, config: AdaptConfig) -> float:
-    """Fraction (0..1) of its steps or of its time budget that a run has used, whichever is larger."""
-    return min(1.0, max(step / max(1, config.steps), seconds / (config.time_budget_s or math.inf)))
+def progress(step: int, seconds: float, config: AdaptConfig, before: float = 0.0) -> float:
+    """Fraction (0..1) of its steps that a run has taken, or of its time budget but for the seconds `before` its first step, whichever is larger."""
+    left = math.inf if config.time_budget_s is None else max(config.time_budget_s - before, 1e-9)
+    return min(1.0, max(step / max(1, config.steps), (seconds - before) / left))
 
 
 def decibel(mean_square: float) -> float:

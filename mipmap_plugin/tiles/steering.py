@@ -107,4 +107,4 @@ def next_planned(scene: TiledScene, sweep: Sweep) -> Sweep | None:
 
 def rate_factor(scene: TiledScene, step: int, ceiling: float) -> float:
     """The factor of all rates in a step."""
-    return Steering(0.0, 0.0, Snapshot({}, {}), ceiling=ceiling).rate_factor(step / scene.config.steps, scene.config)
+    return Steering(0.0, 0.0, Snapshot({}, {}), ceiling=ceiling).rate_factor(step, scene.config)

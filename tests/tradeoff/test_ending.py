@@ -83,3 +83,4 @@ def test_rates_decay_by_the_steps_or_by_the_budget_whichever_is_used_up_first():
     config = AdaptConfig(steps=100, time_budget_s=60.0)
     assert [progress(*used, config) for used in ((0, 0.0), (50, 15.0), (10, 45.0), (100, 10.0), (5, 90.0))] == [0, 0.5, 0.75, 1, 1]
     assert progress(25, 1e6, AdaptConfig(steps=100)) == 0.25
+    assert progress(0, 40.0, config, before=40.0) == 0 and progress(0, 50.0, config, before=40.0) == 0.5

@@ -27,8 +27,8 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.progress import ticking
 from mipmap_plugin.threads import side_by_side
 
-# Number of checks during the warm-up, while the rates rise.
-CHECKS_IN_WARM_UP = 10
+# Number of checks during the warm-up, while the rates rise, and of a short run, with so many steps between two: each takes as long as a step.
+CHECKS_IN_WARM_UP, CHECKS, STEPS_BETWEEN = 10, 6, 5
 
 # Steps from which truths are made ahead, for each thread: as long as views are new, most steps have one.
 STEPS_AHEAD = 2
@@ -76,9 +76,10 @@ def _budget_left(run: Run, config: AdaptConfig) -> float:
 
 
 def is_checked(step: int, config: AdaptConfig) -> bool:
-    """Whether the run is checked after this step: more often during the warm-up, while the rates rise."""
+    """Whether the run is checked after this step: more often during the warm-up, and if the run is short."""
     warm_up = config.warm_up_steps
-    every = config.check_every if step >= warm_up else max(1, min(config.check_every, warm_up // CHECKS_IN_WARM_UP))
+    every = max(1, warm_up // CHECKS_IN_WARM_UP) if step < warm_up else max(STEPS_BETWEEN, config.steps // CHECKS)
+    every = min(every, config.check_every)
     return step % every == 0 or step in (warm_up, config.steps)
 
 
@@ -90,7 +91,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
     progress = run.progress(config)
-    set_rates(run.optimizer, config, progress, run.steering.rate_factor(progress, config), frozen=frozen_parameters(run))
+    set_rates(run.optimizer, config, progress, run.steering.rate_factor(run.step, config), frozen=frozen_parameters(run))
     at_once = views_at_once(cameras[views[0]]) if run.gradients is None else 1
     run.by_rows = ByRows.of(run.student, task.render_to_step, run.by_rows) if len(views) <= at_once else None
     if run.by_rows is not None:
@@ -173,7 +174,7 @@ def _check(run: Run, task: Task, config: AdaptConfig) -> None:
     steering, steps = run.steering, run.step - run.curve[-1].step
     validation_db = run.costs.check(lambda: task.validation.steer(run.student))
     growing = run.trial is not None and run.trial.before is not None  # a growth gets some steps before it is assessed
-    factor, rising = steering.rate_factor(run.progress(config), config), run.progress(config) < 2 * config.warm_up
+    factor, rising = steering.rate_factor(run.step, config), run.step <= config.warm_up_steps
     harmful = config.returns == "best" and not growing and steering.is_harmful(validation_db, rising=rising)
     if harmful:
         steering.reduce_rates(factor, rising=rising)

@@ -117,5 +117,5 @@ class Run:
         return cls(student, optimizer, watch, ScreenGradients.of(means, config), steering, trial, curve=[first], costs=costs)
 
     def progress(self, config: AdaptConfig) -> float:
-        """Fraction (0..1) of the steps or of the time budget that is used, whichever is larger."""
-        return progress(self.step, self.watch.seconds, config)
+        """Fraction (0..1) of the steps that is over, or of what the start left of the time budget, whichever is larger."""
+        return progress(self.step, self.watch.seconds, config, self.curve[0].seconds)

@@ -152,9 +152,10 @@ class Steering:
         """The steering of a run that begins with `student`, which has this PSNR (dB) on the steering views."""
         return cls(psnr, psnr, Snapshot.of(student))
 
-    def rate_factor(self, progress: float, config: AdaptConfig) -> float:
-        """The factor of every rate: it rises geometrically to 1 during the warm-up, and is at most the ceiling."""
-        factor = FIRST_RATE_FACTOR ** (1 - progress / config.warm_up) if progress < config.warm_up else 1.0
+    def rate_factor(self, step: int, config: AdaptConfig) -> float:
+        """The factor of every rate after `step` steps: it rises geometrically to 1 during the warm-up, and is at most the ceiling."""
+        warm_up = config.warm_up_steps
+        factor = FIRST_RATE_FACTOR ** (1 - step / warm_up) if step < warm_up else 1.0
         return min(factor, self.ceiling)
 
     def is_harmful(self, psnr: float, *, rising: bool = False) -> bool:
