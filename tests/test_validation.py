@@ -192,7 +192,7 @@ def test_while_rates_rise_harm_is_the_loss_of_much_that_was_gained(gained, lost)
     run.update_best(30 + gained, 7, student)
     assert not run.is_harmful(30 + gained - lost + 1e-6, rising=True)
     assert run.is_harmful(30 + gained - lost - 1e-6, rising=True)
-    assert not run.is_harmful(30 + gained - lost - 1e-6) or gained == 0
+    assert run.is_harmful(30 + gained - lost - 1e-6) == (gained == 0)  # later only what is worse than the start
 
 
 def test_what_is_taken_back_goes_on_with_gentler_steps():
