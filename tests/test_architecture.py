@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import tiny
 
 PACKAGE = Path(__file__).parents[1] / "mipmap_plugin"
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -174,6 +175,20 @@ print([name for name in ("torch", "numpy", "numba") if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_checkpoint_is_recognized_without_torch(tmp_path):
+    """So that commands say at once what they were given, or what is wrong with it."""
+    ply = tiny.ply(tmp_path / "a.ply")
+    code = f"""
+import sys
+from mipmap_plugin.models import detect
+print(detect({str(ply)!r}).family, [name for name in ("torch", "numba") if name in sys.modules])
+from mipmap_plugin.models import Traits, load_model
+print(isinstance(load_model({str(ply)!r}).traits, Traits))
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines() == ["3dgs []", "True"]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)

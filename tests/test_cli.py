@@ -61,6 +61,13 @@ def refused(answer, *words):
     return err
 
 
+def refused_once_named(answer, *words):
+    """As `refused`, after lines on stdout that say what the file is."""
+    code, out, err = answer
+    assert [line.split(":")[0] for line in out.splitlines()] in ([], ["file", "family"])
+    return refused((code, "", err), *words)
+
+
 # inspect
 
 
@@ -73,7 +80,8 @@ def test_inspect_says_what_a_checkpoint_is(run, model_folder):
     assert (code, err) == (0, "")
     facts = "family:       3dgs", "splats:       60", "1 in use of 1", "classic, 0.3 px²", "4, 32 x 24 px", "health:"
     assert all(fact in out for fact in (*facts, "screen filter: on"))
-    assert out.startswith(f"verdict:      sound; next: mipmap-plugin adapt {model_folder} --scale 1/4\n")
+    assert [line.split(":")[0] for line in out.splitlines()[:3]] == ["file", "family", "verdict"]
+    assert f"\nverdict:      sound; next: mipmap-plugin adapt {model_folder} --scale 1/4\n" in out and out.count("family:") == 1
 
 
 def test_inspect_lists_the_effects_that_are_off_if_asked(run, model_folder):
@@ -88,7 +96,7 @@ def test_inspect_doubts_a_file_of_another_convention(run, tmp_path):
     columns = read_ply(ply).columns
     columns["opacity"][:] = 0.5
     write_ply(tmp_path / "b.ply", columns)
-    assert run("inspect", tmp_path / "b.ply")[1].startswith("verdict:      doubtful: read health before you adapt it\n")
+    assert "\nverdict:      doubtful: read health before you adapt it\n" in run("inspect", tmp_path / "b.ply")[1]
 
 
 def test_inspect_as_json(run, tmp_path):
@@ -110,7 +118,7 @@ def test_inspect_says_what_it_knows_before_it_draws(run, model_folder, monkeypat
     said = []
     monkeypatch.setattr(viewer_differences, "viewer_differences", lambda wrapped: said.append(capsys.readouterr().out) or "none")
     rest = run("inspect", model_folder)[1]
-    assert said[0].startswith("verdict:") and "health:" in said[0] and rest.startswith("viewers:      none\nnotes:")
+    assert said[0].startswith("file:") and "health:" in said[0] and rest.startswith("viewers:      none\nnotes:")
     run("inspect", model_folder, "--json")
     assert said[1] == ""
 
@@ -200,9 +208,9 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
     assert not (tmp_path / "new.ply.resume").exists()
 
 
-def test_ctrl_c_anywhere_else_says_interrupted(run, monkeypatch):
+def test_ctrl_c_anywhere_else_says_interrupted(run, model_folder, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.models.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
-    code, _, err = run("inspect", "a.ply")
+    code, _, err = run("inspect", model_folder)
     assert code == 130 and err.strip() == "mipmap-plugin: interrupted"
 
 
@@ -361,14 +369,14 @@ def malformed(folder: Path) -> dict[str, Path]:
 def test_malformed_checkpoints_end_in_one_sentence(run, tmp_path, command):
     for name, path in malformed(tmp_path).items():
         words = ["--scale", "4"] if command == "adapt" else []
-        assert name in refused(run(command, path, *words)), name
+        assert name in refused_once_named(run(command, path, *words)), name
     assert not [path for path in tmp_path.iterdir() if "_x4" in path.name]
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", "[1]", '[{"id": 0}]', '{"frames": []}', "\0"])
 def test_malformed_cameras_end_in_one_sentence(run, model_folder, content):
     (model_folder / "cameras.json").write_text(content)
-    assert "cameras.json" in refused(run("inspect", model_folder))
+    assert "cameras.json" in refused_once_named(run("inspect", model_folder))
 
 
 @pytest.mark.parametrize("content", ["", "{}", '{"frames": []}', '{"frames": [{"file_path": "a"}]}', '{"frames": [{"w": 4, "h": 4}]}'])

@@ -37,7 +37,8 @@ def tradeoff(folder, output):
 
 def stopped(words, number, cells, at_least):
     """Run a command until so many cells are kept, and send it a signal; return what it said."""
-    process = subprocess.Popen([sys.executable, "-m", "mipmap_plugin.cli", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-X", "faulthandler", "-m", "mipmap_plugin.cli", *words]  # which says where a process was that aborts
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         wait_until(lambda: len(list(cells.glob("*.pt"))) >= at_least or process.poll() is not None)
         assert process.poll() is None, process.communicate()[1]
@@ -59,7 +60,8 @@ def test_evaluate_goes_on_where_it_stopped(folder, capsys, number):
     before = {path.name: path.stat().st_mtime_ns for path in kept.glob("*.pt")}
     assert len(before) >= 3 and not (folder / "rows.json").exists()
     if number == signal.SIGINT:
-        assert code == 130 and f"interrupted with {len(before)} rows finished; run the same command again to go on" in said
+        assert code == 130, said
+        assert f"interrupted with {len(before)} rows finished; run the same command again to go on" in said
     assert main(evaluate(folder, "rows.json")) == 0
     assert f"rows.json.resume has {len(before)} rows of a command that was interrupted" in capsys.readouterr().err
     assert not kept.exists() and (folder / "rows.html").exists()

@@ -37,14 +37,19 @@ def inspect(
         json: Print JSON instead of sentences.
     """
     with announced(f"reading {checkpoint.name}"), uncollected():
-        from mipmap_plugin.models import load_model
+        from mipmap_plugin.models import detect, load_model
+
+        found = detect(checkpoint, iteration=iteration)
+        known = {"file": str(found.path), "family": found.family}
+        if not json:
+            print_facts(known, json)  # before torch is imported
         from mipmap_plugin.wrap import wrap_model
 
         model = load_model(checkpoint, iteration=iteration)
         wrapped = wrap_model(model, screen_filter=screen_filter)
     facts = _facts(checkpoint, wrapped, whole=all or json)
     if not json:
-        print_facts(facts, json)  # before pictures are drawn, which takes longer
+        print_facts({name: fact for name, fact in facts.items() if name not in known}, json)  # before pictures are drawn, which takes longer
     with announced("drawing as viewers do"):
         differences = _differences(wrapped) if viewers else "not requested"
     last = {"viewers": differences, "notes": model.notes}

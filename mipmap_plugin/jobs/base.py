@@ -41,7 +41,10 @@ class Base:
 
     def load(self, threads: int | None = None) -> Wrapped:
         """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
-        with uncollected():  # torch is imported here
+        from mipmap_plugin.models import detect
+
+        detect(self.checkpoint)  # says what is wrong with it before torch is imported
+        with uncollected():
             return self._loaded(threads)
 
     def _loaded(self, threads: int | None) -> Wrapped:

@@ -1,16 +1,19 @@
-"""Models: checkpoints of any family, recognized by their content."""
+"""Models: checkpoints of any family, recognized by their content. Recognizing one imports no torch; its contract and loading it do."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError
-from mipmap_plugin.models.base import SplatModel, TrainedScale, Traits, lacking
 from mipmap_plugin.models.detect import Checkpoint, detect
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
 from mipmap_plugin.registry import load_target
+
+if TYPE_CHECKING:
+    from mipmap_plugin.models.base import SplatModel, TrainedScale, Traits
 
 __all__ = [
     "API_VERSION",
@@ -29,6 +32,15 @@ __all__ = [
     "register_model",
 ]  # fmt: skip
 
+# Names from `base`, which is imported when one of them is first used.
+_OF_BASE = ("SplatModel", "TrainedScale", "Traits")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _OF_BASE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.base"), name)
+
 
 def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
     """Load a checkpoint: a PLY, or a model folder (its newest complete iteration, or `iteration`).
@@ -37,6 +49,8 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
     third-party loader cannot be imported, fails, or returns an object that is not a model.
     """
     checkpoint = detect(path, iteration=iteration)
+    from mipmap_plugin.models.base import lacking
+
     family = find_family(checkpoint.family)
     if family.load is None:
         raise CheckpointError(f"{checkpoint.path}: {not_loaded(checkpoint.family)}")

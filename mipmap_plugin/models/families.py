@@ -8,7 +8,7 @@ from functools import partial
 from mipmap_plugin.errors import PluginError
 from mipmap_plugin.formats.splat_transform import EXCHANGE
 from mipmap_plugin.formats.tags import render_mode
-from mipmap_plugin.models.anchors.networks import missing_networks
+from mipmap_plugin.models.anchors.companions import missing_networks
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
 from mipmap_plugin.models.places import GSPLAT, NETWORKS, SPLATFACTO, is_coarse, network_of
 from mipmap_plugin.registry import Registry

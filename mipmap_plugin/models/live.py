@@ -10,7 +10,8 @@ from torch import Tensor
 
 from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.models import splatfacto
-from mipmap_plugin.models.anchors.networks import NEEDED, Weights
+from mipmap_plugin.models.anchors.companions import NEEDED
+from mipmap_plugin.models.anchors.networks import Weights
 from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
 from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, lacking
 from mipmap_plugin.models.gsplat import model as gsplat

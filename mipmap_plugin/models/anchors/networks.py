@@ -14,28 +14,14 @@ from torch import Tensor, nn
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
+from mipmap_plugin.models.anchors.companions import FILES, NEEDED, UNITED, missing_networks
 
 Weights = dict[str, dict[str, Tensor]]  # network -> its state dict
-
-# The files of a split checkpoint; those of NEEDED are required.
-FILES = {
-    **{"opacity_mlp": "opacity_mlp.pt", "cov_mlp": "cov_mlp.pt", "color_mlp": "color_mlp.pt"},
-    **{"feature_bank_mlp": "feature_bank_mlp.pt", "appearance": "embedding_appearance.pt"},
-}
-NEEDED = ("opacity_mlp", "cov_mlp", "color_mlp")
-
-# One file with all networks, the original's other format.
-UNITED = "checkpoints.pth"
 
 LAYERS = {"0.weight", "0.bias", "2.weight", "2.bias"}
 EMBEDDING = "embedding.weight"
 
 LAST: dict[str, nn.Module] = {"opacity_mlp": nn.Tanh(), "color_mlp": nn.Sigmoid(), "feature_bank_mlp": nn.Softmax(dim=1)}
-
-
-def missing_networks(folder: Path) -> list[str]:
-    """The required network files that are missing in `folder`."""
-    return [] if (folder / UNITED).is_file() else [FILES[name] for name in NEEDED if not (folder / FILES[name]).is_file()]
 
 
 def read_networks(folder: Path) -> tuple[Weights, dict[str, bytes]]:

@@ -15,10 +15,11 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effect
 from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.decoding import Anchors
 from mipmap_plugin.models.anchors.files import AnchorFile, read_anchors
 from mipmap_plugin.models.anchors.model import AnchorModel
-from mipmap_plugin.models.anchors.networks import NEEDED, surplus
+from mipmap_plugin.models.anchors.networks import surplus
 
 # Rounding of a distance to a level, by `dist2level` of cfg_args. Progressive levels fade in.
 TO_LEVEL = {"floor": torch.floor, "round": torch.round, "ceil": torch.ceil}

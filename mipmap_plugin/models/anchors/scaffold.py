@@ -9,9 +9,10 @@ import numpy as np
 from torch import Tensor
 
 from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.files import AnchorFile, anchors_in_memory, read_anchors
 from mipmap_plugin.models.anchors.model import AnchorModel
-from mipmap_plugin.models.anchors.networks import NEEDED, Weights, surplus
+from mipmap_plugin.models.anchors.networks import Weights, surplus
 from mipmap_plugin.models.columns import NORMAL, QUATERNION
 
 
