@@ -27,7 +27,8 @@ COMMAND = "import sys; from mipmap_plugin.cli import main; sys.exit(main())"
 PHASES = ("compilation", "blend weights", "merging", "closed form", "pseudo truth", "optimization", "validation")
 INTRO = """# How long a person waits
 
-Made by `python benchmarks/wait.py DATA`: seconds of whole processes, the quickest of {runs}; the phases of the report of the same run. Two cores.
+Made by `python benchmarks/wait.py DATA`: seconds of whole processes, the quickest of {runs}, and until their first line; the phases of the report of the
+same run. Two cores.
 *before*: the version given by `--before`.
 """
 
@@ -61,7 +62,7 @@ def main(
             rows += quickest.values()
             print("\n".join(map(line, quickest.values())), flush=True)
     write_json(output / "wait.json", rows, overwrite=True)
-    head = f"| command | version | threads | seconds | {' | '.join(PHASES)} |\n|{'---|' * (4 + len(PHASES))}"
+    head = f"| command | version | threads | seconds | first line | {' | '.join(PHASES)} |\n|{'---|' * (5 + len(PHASES))}"
     (output / "wait.md").write_text("\n".join([INTRO.format(runs=runs), head, *map(line, rows), ""]))
 
 
@@ -77,22 +78,28 @@ def commands(base: Path, scales: tuple[str, ...]) -> list[tuple[str, list[str]]]
 
 
 def timed(checkout: Path, options: list[str], threads: int, *, cold: bool) -> dict[str, Any]:
-    """Seconds of one process, and of its phases where it reports any."""
+    """Seconds of one process, until its first line, and of its phases where it reports any."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(threads)}
         environment |= {"NUMBA_CACHE_DIR": folder} if cold else {}
         output = ["--output", str(Path(folder, "adapted"))] if options[0] == "adapt" else []
         command = [sys.executable, "-c", COMMAND, *options, *output]
         began = time.perf_counter()
-        done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=folder, check=True)
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment, cwd=folder) as process:
+            assert process.stdout is not None
+            first, first_line = process.stdout.readline(), time.perf_counter() - began
+            rest = process.stdout.read()
         seconds = time.perf_counter() - began
-    report = json.loads(done.stdout)[0] if options[0] == "adapt" else {}
-    return {"seconds": seconds, "phases": report.get("seconds", {}), "validation": report.get("validation", {})}
+    if process.returncode:
+        raise RuntimeError(f"{' '.join(options)} ended with exit code {process.returncode}; run it by hand to see why")
+    report = json.loads(first + rest)[0] if options[0] == "adapt" else {}
+    return {"seconds": seconds, "first_line": first_line, "phases": report.get("seconds", {}), "validation": report.get("validation", {})}
 
 
 def line(row: dict[str, Any]) -> str:
     phases = (f"{row['phases'][name]:.1f}" if name in row["phases"] else "" for name in PHASES)
-    return f"| {row['command']} | {row['version']} | {row['threads']} | {row['seconds']:.1f} | {' | '.join(phases)} |"
+    first_line = "" if row["phases"] else f"{row['first_line']:.1f}"  # JSON is printed at the end
+    return f"| {row['command']} | {row['version']} | {row['threads']} | {row['seconds']:.1f} | {first_line} | {' | '.join(phases)} |"
 
 
 if __name__ == "__main__":

@@ -49,15 +49,15 @@ def inspect(
         wrapped = wrap_model(model, screen_filter=screen_filter)
     facts = _facts(checkpoint, wrapped, whole=all or json)
     if not json:
-        print_facts({name: fact for name, fact in facts.items() if name not in known}, json)  # before pictures are drawn, which takes longer
+        print_facts(facts, json)  # before pictures are drawn, which takes longer
     with announced("drawing as viewers do"):
         differences = _differences(wrapped) if viewers else "not requested"
     last = {"viewers": differences, "notes": model.notes}
-    print_facts(facts | last if json else last, json)
+    print_facts(known | facts | last if json else last, json)
 
 
 def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]:
-    """What is known without a picture, by name; `whole`: with the effects that are off."""
+    """What is known of a loaded model without a picture, by name; `whole`: with the effects that are off."""
     from mipmap_plugin.effects import explain
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
@@ -70,8 +70,6 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
     return {
         "verdict": _verdict(checkpoint, health),
-        "file": str(model.source),
-        "family": model.family,
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
