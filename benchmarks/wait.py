@@ -27,8 +27,8 @@ COMMAND = "import sys; from mipmap_plugin.cli import main; sys.exit(main())"
 PHASES = ("compilation", "blend weights", "merging", "closed form", "pseudo truth", "optimization", "validation")
 INTRO = """# How long a person waits
 
-Made by `python benchmarks/wait.py DATA`: seconds of whole processes, the quickest of {runs}, and until their first line; the phases of the report of the
-same run. Two cores.
+Made by `python benchmarks/wait.py DATA`: seconds of whole processes, the quickest of {runs}, and until their first line; the phases of the report
+of the same run. Two cores.
 *before*: the version given by `--before`.
 """
 
