@@ -1,4 +1,5 @@
-"""The command line: thin commands over the library. Exit codes: 0 success, 2 an error, printed in one sentence, 130 interrupted."""
+"""The command line: thin commands over the library. Exit codes: 0 success, 2 an error, printed in one sentence, 130 interrupted, 141 where
+whoever read what is printed has stopped."""
 
 from __future__ import annotations
 
@@ -59,6 +60,8 @@ def _run(words: Sequence[str]) -> int:
     try:
         with _our_warnings_only():
             app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
+    except BrokenPipeError:  # as of `| head`, whose reader wants no more
+        return 141
     except (MipmapPluginError, OSError) as error:
         voice.complain(f"mipmap-plugin: {error}")
         return 2

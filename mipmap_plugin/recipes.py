@@ -120,8 +120,10 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
 
 
 def scale_of_fraction(kept: float) -> float:
-    """The scale at which a zoom-out keeps this fraction of the splats, the inverse of `_zoom_out_settings`; at most 1."""
-    return min(1.0, kept / MERGE_TO if kept < MERGE_TO**2 / 2 else (kept / 2) ** 0.5)
+    """The scale at which a zoom-out keeps this fraction of the splats, the inverse of `_zoom_out_settings`; 1 where it keeps all."""
+    if kept >= 1:
+        return 1.0
+    return kept / MERGE_TO if kept < MERGE_TO**2 / 2 else (kept / 2) ** 0.5
 
 
 def _zoom_out_settings(scale: float) -> dict[str, Any]:

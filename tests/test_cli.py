@@ -208,6 +208,12 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
     assert not (tmp_path / "new.ply.resume").exists()
 
 
+def test_adapt_to_the_bases_own_scale_gives_the_base(run, model_folder, tmp_path):
+    code, out, err = run("adapt", model_folder, "--scale", "1", "--output", tmp_path / "same.ply", "--report", "--backend", "reference")
+    assert (code, err) == (0, "") and out.startswith("x1: holds the base as it is, 60 -> 60 splats, 0.0 s\n")
+    assert read_ply(tmp_path / "same.ply").columns["x"].shape == (60,)
+
+
 def test_ctrl_c_anywhere_else_says_interrupted(run, model_folder, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.models.load_model", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     code, _, err = run("inspect", model_folder)

@@ -237,6 +237,20 @@ def test_a_real_capture_in_each_format_under_any_name(shared_data, tmp_path, kin
     assert detect(path).family == "exchange"
 
 
+def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_path, tool):
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.7.1 (b42b60c)', file=sys.stderr)\n")
+    with pytest.raises(SettingsError, match=r"splat-transform 2.7.1 is too old for it, and 3.0 or newer is needed"):
+        tiny.model().refuse_output(tmp_path / "a.sog", overwrite=False, networks_move=False)
+    tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
+
+
+def test_an_error_of_node_is_told(tmp_path, tool):
+    script = "print('TypeError [ERR_PARSE_ARGS_UNKNOWN_OPTION]: Unknown option', file=sys.stderr)\nprint('failed in 0.006s')\nsys.exit(1)\n"
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\n{script}")
+    with pytest.raises(OutputError, match=r"does not write it \(Unknown option\)"):
+        tiny.model().save(tmp_path / "a.spz", provenance={})
+
+
 needs_tool = pytest.mark.skipif(shutil.which("splat-transform") is None, reason="splat-transform is not installed")
 
 

@@ -1,5 +1,8 @@
 """Files of a chosen size: the number of splats that fits, and the zoom that suits it."""
 
+import json
+import re
+
 import pytest
 import tiny
 
@@ -29,6 +32,10 @@ def test_more_splats_than_the_bases_suit_its_own_scale():
     assert fitting_scale(200, tiny.model(60)) == 1
 
 
+def test_as_many_splats_as_the_base_has_suit_its_own_scale():
+    assert fitting_scale(60, tiny.model(60)) == 1 and fitting_scale(59, tiny.model(60)) < 1
+
+
 def test_as_many_splats_as_fit_into_a_file_do_fit(tmp_path):
     model, size = tiny.model(500), 40_000
     most = splats_within(model, size, "file.ply")
@@ -51,3 +58,17 @@ def test_the_command_makes_a_file_of_so_many_splats(tmp_path, capsys):
     assert "x0.1875" in capsys.readouterr().out  # 9 of 60 splats are those of 0.8 times this scale
     assert cli.main([*words[:-2], "--bytes", "1 parsec"]) == 2 and "such as 20MB" in capsys.readouterr().err
     assert cli.main(["adapt", str(base)]) == 2 and "--scale" in capsys.readouterr().err
+
+
+def test_a_file_of_few_splats_is_compared_with_the_base(tmp_path, capsys):
+    """Which it may not be replaced by, for that has more."""
+    base, output = tiny.folder(tmp_path / "base", tiny.cameras(4, width=16, height=12)), tmp_path / "small.ply"
+    words = ["adapt", str(base), "--splats", "5", "--scale", "1", "--output", str(output), "--steps", "1", "--backend", "reference", "--json"]
+    assert cli.main(words) == 0
+    [report] = json.loads(capsys.readouterr().out)
+    assert report["gaussians_after"] <= 5 and report["validation"]["the base as it is"] > max(
+        psnr for state, psnr in report["validation"].items() if state != "the base as it is"
+    )
+    assert cli.main([*words[:-1], "--overwrite"]) == 0
+    before, after = re.search(r"x1: ([0-9.]+) -> ([0-9.]+) dB", capsys.readouterr().out).groups()
+    assert float(before) > float(after)

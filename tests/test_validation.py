@@ -162,6 +162,12 @@ def test_of_equals_the_later_is_chosen(worse_db, chosen):
     assert judge(0.0).choose({"earlier": shows(0.1, 0.1), "later": shows(later, later)})[0] == chosen
 
 
+def test_only_what_is_allowed_is_chosen_and_the_others_are_told_too():
+    states = {"base": shows(0.01, 0.01), "start": shows(0.1, 0.1), "last": shows(0.2, 0.2)}
+    name, found = judge(0.0).choose(states, ["start", "last"])
+    assert name == "start" and found["base"] == pytest.approx(40.0, abs=1e-3)
+
+
 # Steering
 
 

@@ -345,6 +345,13 @@ def test_only_a_model_folder_is_replaced_and_only_with_the_option(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "photos"]
 
 
+def test_a_trained_model_is_not_replaced_even_with_the_option(tmp_path):
+    folder = write_model_folder(tmp_path / "trained")
+    with pytest.raises(OutputExists, match="holds a trained model, which --overwrite would delete"):
+        raw_model().save(folder, provenance={}, overwrite=True)
+    assert load_model(folder).source.exists()
+
+
 def test_the_base_folder_is_never_replaced(tmp_path):
     folder = write_model_folder(tmp_path / "m")
     model = load_model(folder)

@@ -2,7 +2,9 @@
 
 import contextlib
 import re
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import tiny
@@ -79,3 +81,34 @@ def test_a_log_needs_a_file(words):
 
 def test_the_two_options_are_taken_from_anywhere():
     assert options(["--log", "a", "adapt", "x", "--quiet", "--seed", "1"])[0] == ["adapt", "x", "--seed", "1"]
+
+
+@pytest.mark.parametrize("content", [b"ply\nformat binary_little_endian 1.0\n", b"{}", b"2026-11-25 notes of mine\n"])
+def test_a_log_is_not_appended_to_what_is_none(base, tmp_path, capsys, content):
+    """As to a checkpoint, where the file after --log was forgotten."""
+    (tmp_path / "mine").write_bytes(content)
+    assert main(["inspect", base, "--no-viewers", "--log", str(tmp_path / "mine")]) == 2
+    assert "holds something else than a log" in capsys.readouterr().err and (tmp_path / "mine").read_bytes() == content
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
+def test_a_log_that_can_be_written_no_more_does_not_end_the_command(base, capsys):
+    assert main(["inspect", base, "--no-viewers", "--log", "/dev/full"]) == 0
+    said = capsys.readouterr()
+    assert "verdict:" in said.out and said.err.count("\n") == 1 and "the log ends here" in said.err
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
+def test_what_cannot_be_printed_is_one_sentence(base):
+    command = [sys.executable, "-m", "mipmap_plugin.cli", "inspect", base, "--no-viewers"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "standard output cannot be written (No space left" in done.stderr
+
+
+def test_whoever_stops_reading_ends_the_command_in_silence(base):
+    command = [sys.executable, "-m", "mipmap_plugin.cli", "inspect", base, "--no-viewers"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 141

@@ -114,6 +114,7 @@ class Session:
         few = _rows(self.base) <= (self.config.most_splats or sys.maxsize)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             reason = "scale 1, at which the base is right as it is"
+            self.seconds["total"] = 0.0
             return Adapted(self.copy_of_base(), self._report(self.copy_of_base(), [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         began = time.perf_counter()
         with self.phase("compilation"):
@@ -153,14 +154,14 @@ class Session:
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
         began, most = time.perf_counter(), self.config.most_splats or sys.maxsize
-        states = {name: model for name, model in states.items() if _rows(model) <= most}
-        last = next(reversed(states))
+        allowed = [name for name, model in states.items() if _rows(model) <= most]
+        last = allowed[-1]
         with self.phase("validation"):
-            best, psnrs = self.validation.choose(states)
+            best, psnrs = self.validation.choose(states, allowed)
         self.seconds["total"] += time.perf_counter() - began
         if self.config.returns == "last":
             best = last
-        elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in list(states)[:2]) - HARM_DB:
+        elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed[:2]) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
         curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=psnrs[last], gaussians=_rows(states[last]))]

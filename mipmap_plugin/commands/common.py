@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.types import Background, ScreenFilter
-from mipmap_plugin.commands.voice import say
+from mipmap_plugin.commands.voice import put, say
 from mipmap_plugin.formats.atomic import json_text
 from mipmap_plugin.progress import announced
 
@@ -60,7 +60,7 @@ def summary(cameras: Sequence[Camera]) -> str:
 def print_facts(facts: Any, as_json: bool) -> None:
     """Print facts by name, or as JSON, which is printed quiet or not."""
     if as_json:
-        print(json_text(facts))
+        put(json_text(facts))
         return
     for name, value in facts.items():
         lines = value if isinstance(value, list) else [value]

@@ -30,11 +30,13 @@ class Exports:
     title: str | None = None  # of the report page; None: no page
 
     def check(self, output: Path) -> None:
-        """Raise SettingsError for an impossible canvas, or if splat-transform is needed and not installed."""
+        """Raise SettingsError for an impossible canvas, or if splat-transform is needed and not installed, or too old."""
         if self.canvas < 1:
             raise SettingsError(f"canvas: must be at least 1 px, got {self.canvas}")
         if self.streamed_sog or self.tiles:
-            refuse_exchange(output)
+            from mipmap_plugin.levels.streamed import META
+
+            refuse_exchange(output / META if self.streamed_sog else output)
 
     def write(self, ladder: Path, contents: ZoomContents | DistanceContents) -> list[Path]:
         """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""

@@ -6,7 +6,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, TextIO
 
-from mipmap_plugin.commands.voice import VOICE, say
+from mipmap_plugin.commands.voice import VOICE, put, say
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,7 +29,7 @@ def show_before_and_after(base: Wrapped, adapted: Adapted) -> None:
 
     view = shown_view(adapted)
     say(f"before and after{f', view {view.name}' if view.name else ''}:")
-    print(encoded(before_and_after(base, adapted, view), protocol))
+    put(encoded(before_and_after(base, adapted, view), protocol))
 
 
 def protocol_here() -> Protocol | None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any, TextIO, cast
 
+from mipmap_plugin.commands.log import Log
 from mipmap_plugin.errors import OutputError, SettingsError
 
 
@@ -19,15 +20,12 @@ class Voice:
     """Where words go."""
 
     quiet: bool = False
-    log: TextIO | None = None
+    log: Log | None = None
 
     def write(self, text: str) -> None:
-        """Write lines to the log, each with the time of day; nothing without a log."""
-        if self.log is None:
-            return
-        now = datetime.now().isoformat(sep=" ", timespec="seconds")
-        self.log.writelines(f"{now} {line}\n" for line in text.splitlines())
-        self.log.flush()  # a killed run leaves all that it said
+        """Write lines to the log; nothing without a log."""
+        if self.log is not None:
+            self.log.write(text)
 
 
 VOICE: ContextVar[Voice] = ContextVar("VOICE", default=Voice())  # noqa: B039  a voice never changes
@@ -38,7 +36,21 @@ def say(text: str) -> None:
     voice = VOICE.get()
     voice.write(text)
     if not voice.quiet:
-        print(text, flush=True)  # at once, for whoever reads it from a pipe, as the address of a live view
+        put(text)
+
+
+def put(text: str) -> None:
+    """Print `text` at once, for whoever reads it from a pipe, as the address of a live view.
+
+    Raises OutputError where it cannot be printed, and BrokenPipeError where nobody reads it any more; then what is printed later is lost.
+    """
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains again at its end
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise OutputError(f"the standard output cannot be written ({error.strerror}); print to another place") from error
 
 
 def detail(text: str) -> None:
@@ -73,10 +85,7 @@ def options(words: Sequence[str]) -> tuple[list[str], bool, Path | None]:
 def speaking(quiet: bool, log: Path | None) -> Iterator[None]:
     """Speak like this inside the block. A log is appended to, line by line. Raises OutputError."""
     with contextlib.ExitStack() as stack:
-        try:
-            file = None if log is None else stack.enter_context(log.open("a", encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise OutputError(f"{log} cannot be written ({error}); give --log another file") from error
+        file = None if log is None else stack.enter_context(contextlib.closing(Log(log)))
         if quiet:
             stack.enter_context(contextlib.redirect_stderr(cast(TextIO, _NoTerminal(sys.stderr))))
         token = VOICE.set(Voice(quiet, file))

@@ -31,6 +31,9 @@ EXCHANGE = {
 WRITTEN = (".spz", ".sog", ".compressed.ply")
 READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
+# SOG, by itself or as a ladder with a lod-meta.json, and the oldest version of splat-transform that knows the options of `table_options`.
+WITH_TABLES, OLDEST_WITH_TABLES = (".sog", ".json"), 3
+
 TOOL = "splat-transform"
 INSTALL = "npm install -g @playcanvas/splat-transform"
 
@@ -47,11 +50,24 @@ def is_written(path: Path) -> bool:
 
 
 def refuse_exchange(path: Path) -> list[str]:
-    """The command of splat-transform. Raises SettingsError, naming the output `path`, if it is not installed."""
+    """The command of splat-transform. Raises SettingsError, naming the output `path`, if it is not installed, or too old for this format."""
     tool = find_tool()
     if tool is None:
         raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}; or give a .ply")
+    if path.suffix.lower() in WITH_TABLES and (version := _version(tool)) and int(version.split(".")[0]) < OLDEST_WITH_TABLES:
+        newer = f"{TOOL} {version} is too old for it, and {OLDEST_WITH_TABLES}.0 or newer is needed, which needs Node.js 22"
+        raise SettingsError(f"{path}: {newer}; run: {INSTALL}@latest; or give a .spz or a .ply")
     return tool
+
+
+def _version(tool: Sequence[str]) -> str:
+    """The version of splat-transform, such as 3.7.0; empty if it does not say."""
+    try:
+        told = subprocess.run([*tool, "--version"], capture_output=True, text=True, errors="replace", timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    found = re.search(r"\d+(\.\d+)+", told.stdout + told.stderr)
+    return found[0] if found else ""
 
 
 def refuse_as_folder(path: Path) -> None:
@@ -153,5 +169,5 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
 def _reason(said: str) -> str:
     """What splat-transform says went wrong: its line with the error, before a trace and a summary, or else its last one."""
     lines = [line.strip() for line in said.splitlines() if line.strip()]
-    errors = [line.partition("Error: ")[2] for line in lines if "Error: " in line]
+    errors = [found[1] for line in lines if (found := re.search(r"Error(?: \[\w+\])?: (.*)", line))]
     return (errors[0] if errors else lines[-1] if lines else "")[:160]

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.jobs.job import Job, Outcome
 
 COLUMNS = ("checkpoint", "scale", "viewer", "outcome", "splats", "dB", "seconds", "file, or what is wrong")
@@ -33,10 +34,10 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
 
 
 def _psnr(report: dict[str, Any]) -> str:
-    """dB before (the base as it is) and after, on views that nothing was adapted to."""
+    """dB before (the base as it is) and after, on views that nothing was adapted to; empty where one of them was not measured."""
     psnrs = report.get("validation") or {}
     after = next((psnr for name, psnr in psnrs.items() if str(report.get("returned", "")).startswith(name)), None)
-    before = next(iter(psnrs.values()), None)
+    before = psnrs.get(AS_IT_IS)
     return "" if before is None or after is None else f"{before:.2f} -> {after:.2f}"
 
 

@@ -9,9 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_to_lose
+from mipmap_plugin.formats.magic import kind_of
+from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import refuse_as_folder
+from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 
 # Subfolders in which the supported projects keep parts of a checkpoint.
@@ -46,6 +49,13 @@ def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path 
     if holds is not None:
         refuse_as_folder(path)
         refuse_to_lose(path, source if folder is None else folder, holds)
+        if not is_adapted(path) and any(map(_is_of_a_training, path.glob("point_cloud/*/point_cloud.ply"))):
+            raise OutputExists(f"{path} holds a trained model, which --overwrite would delete; choose another folder")
+
+
+def _is_of_a_training(ply: Path) -> bool:
+    """Whether a PLY has no provenance of this package."""
+    return kind_of(ply) == "ply" and provenance_of(read_header(ply).comments) is None
 
 
 def refuse_own_filter(path: Path, trained: TrainedScale) -> None:

@@ -6,7 +6,7 @@ The other half is used once, at the end, to choose among the base as it is, the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -91,11 +91,12 @@ class Validation:
         """
         return decibel(fmean(10 ** (-psnr / 10) for psnr in self.viewer_psnrs(model, self.steering)))
 
-    def choose(self, states: dict[str, SplatModel]) -> tuple[str, dict[str, float]]:
-        """Return the name of the best state (of equals the last), and the PSNR of each state in its worst viewer."""
+    def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float]]:
+        """Return the name of the best state (of equals the last), of those that are `allowed`, and the PSNR of each state in its worst viewer."""
         psnrs = {name: min(self.viewer_psnrs(model, self.choosing)) for name, model in states.items()}
-        best = max(psnrs.values())
-        return [name for name, psnr in psnrs.items() if psnr >= best - TIE_DB][-1], psnrs
+        among = [name for name in states if allowed is None or name in allowed]
+        best = max(psnrs[name] for name in among)
+        return [name for name in among if psnrs[name] >= best - TIE_DB][-1], psnrs
 
 
 def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians, Camera], Tensor]) -> Validation:
