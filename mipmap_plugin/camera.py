@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -38,8 +39,8 @@ class Camera:
     index: int | None = None  # number of the training view, for models with one appearance embedding per view
 
     def __post_init__(self) -> None:
-        if tuple(self.viewmat.shape) != (4, 4):
-            raise ShapeError(f"viewmat: expected shape [4, 4], got {list(self.viewmat.shape)}")
+        if not isinstance(self.viewmat, Tensor) or tuple(self.viewmat.shape) != (4, 4):
+            raise ShapeError(f"viewmat: expected shape [4, 4], got {list(getattr(self.viewmat, 'shape', ())) or type(self.viewmat).__name__}")
         valid = min(self.fx, self.fy) > 0 and all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy)))
         if min(self.width, self.height) < 1 or not valid:
             got = f"{self.width}x{self.height} px, fx {self.fx}, fy {self.fy}, cx {self.cx}, cy {self.cy}"
@@ -74,7 +75,7 @@ class Camera:
         Width and height are rounded, and each focal length is scaled by its axis' actual ratio, which keeps the field of
         view exactly. Raises SettingsError if `factor` is out of range.
         """
-        check_scale(factor)
+        factor = check_scale(factor)
         resized = self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
         return replace(resized, zoom=self.zoom * factor)
 
@@ -111,6 +112,15 @@ def evenly(views: Sequence[Item], most: int | None) -> list[Item]:
 def every_nth(views: Sequence[Item], most: int) -> Sequence[Item]:
     """Every n-th view, starting with the first, for the smallest n that gives at most `most` views."""
     return views[:: -(-len(views) // most)]
+
+
+def checked(cameras: Any) -> list[Camera]:
+    """Cameras as a list. Raises SettingsError for anything else."""
+    found = list(cameras) if isinstance(cameras, Iterable) and not isinstance(cameras, (str, bytes)) else [cameras]
+    if wrong := [each for each in found if not isinstance(each, Camera)]:
+        advice = "those of a file are load_scene(path).cameras" if isinstance(wrong[0], (str, Path)) else "give a sequence of them"
+        raise SettingsError(f"cameras must be of the type mipmap_plugin.Camera, got {type(wrong[0]).__name__}; {advice}")
+    return found
 
 
 def digest_of(cameras: Sequence[Camera]) -> str:

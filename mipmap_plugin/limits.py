@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.errors import SettingsError
 
@@ -23,11 +23,16 @@ MAX_SEED = 2**63 - 1
 BYTES_PER_PIXEL = 32
 
 
-def check_scale(scale: float) -> float:
-    """Return the scale. Raises SettingsError if it is out of range."""
-    if not MIN_SCALE <= scale <= MAX_SCALE:  # also for NaN
-        raise SettingsError(f"scale must be from {MIN_SCALE:g} to {MAX_SCALE:g}, such as 0.25 or 4, got {scale:g}")
-    return scale
+def check_scale(scale: Any) -> float:
+    """Return a number of any type as a scale. Raises SettingsError for what is no number, or out of range."""
+    try:
+        number = math.nan if isinstance(scale, str) else float(scale)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not MIN_SCALE <= number <= MAX_SCALE:  # also for NaN
+        got = f"{scale:g}" if isinstance(scale, float) else repr(scale)[:40]
+        raise SettingsError(f"scale must be from {MIN_SCALE:g} to {MAX_SCALE:g}, such as 0.25 or 4, got {got}")
+    return number
 
 
 def derived_seed(seed: int, number: int) -> int:

@@ -18,7 +18,9 @@ PATIENCE, PERIOD = 1.0, 0.5
 
 def counted(items: Iterable[Item], total: int, what: str, unit: str) -> Iterator[Item]:
     """Yield the items, and show on a terminal how many of them there were."""
-    yield from tqdm(items, total=total, desc=what, unit=unit, disable=None)
+    bar = tqdm(items, total=total, desc=what, unit=unit, disable=None)
+    with ticking(bar):
+        yield from bar
 
 
 @contextmanager

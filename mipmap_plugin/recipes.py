@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from typing import Any
 
 from pydantic import ValidationError
@@ -98,7 +99,7 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
 
     Raises SettingsError for an unknown name or a value out of range, PluginError for a third-party recipe that fails.
     """
-    check_scale(scale)
+    scale = check_scale(scale)
     if name not in RECIPES.names():
         raise SettingsError(f"there is no recipe {name!r}; choose from {', '.join(RECIPES.names())}")
     function = RECIPES.get(name)
@@ -113,10 +114,20 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     try:
         config = AdaptConfig(**{"recipe": name, **settings, **overrides})
     except ValidationError as error:
-        raise SettingsError("; ".join(f"setting {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())) from None
+        raise SettingsError("; ".join(map(_told, error.errors()))) from None
     if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
         raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
     return config
+
+
+def _told(error: Any) -> str:
+    """One error of pydantic's, in a sentence."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] == "extra_forbidden":
+        known = LearningRates.model_fields if len(error["loc"]) > 1 else AdaptConfig.model_fields
+        meant = get_close_matches(str(error["loc"][-1]), known, 1)
+        return f"there is no setting {name}{f'; did you mean {meant[0]}?' if meant else ''} mipmap_plugin.config has all of them"
+    return f"setting {name}: {error['msg']}" if name else error["msg"].removeprefix("Value error, ")
 
 
 def scale_of_fraction(kept: float) -> float:

@@ -26,7 +26,9 @@ class Registry:
         self._targets: dict[str, Any] = dict(builtins)
 
     def add(self, name: str, target: Any, *, replace: bool = False) -> None:
-        """Register `target` under `name`. Raises SettingsError if another target has the name already."""
+        """Register `target` under `name`. Raises SettingsError if another target has the name already, or it is no text."""
+        if not isinstance(name, str):
+            raise SettingsError(f"{self.group}: a name is a text, got {name!r}")
         if not replace and self._targets.get(name, target) != target:
             raise SettingsError(f"{self.group}: the name {name!r} is taken; pass replace=True to override it")
         self._targets[name] = target
@@ -46,7 +48,7 @@ class Registry:
 
     def get(self, name: str) -> Any:
         """Return the object of that name. Raises SettingsError for an unknown name, PluginError for a broken target."""
-        if name not in self._targets and name not in self._installed():
+        if not isinstance(name, str) or (name not in self._targets and name not in self._installed()):
             raise SettingsError(f"{self.group}: there is no {name!r}; choose from {', '.join(self.names())}")
         target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target
@@ -77,5 +79,5 @@ def load_target(name: str, target: str) -> Any:
     module, _, attribute = target.partition(":")
     try:
         return getattr(importlib.import_module(module), attribute)
-    except Exception as error:  # a third-party module may fail in any way; one broken plug-in must not break the others
+    except (Exception, SystemExit) as error:  # a third-party module may fail in any way; one broken plug-in must not break the others
         raise PluginError(f"{name!r} ({target}) cannot be loaded: {type(error).__name__}: {error}") from error

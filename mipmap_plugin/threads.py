@@ -22,6 +22,9 @@ from mipmap_plugin.errors import SettingsError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+# Threads that may be asked for, for each core; more than one are of use only to tests.
+MOST_PER_CORE = 16
+
 # The number of threads that kernels and parallel views share; None: they are not shared, and torch has its own.
 _shared: ContextVar[int | None] = ContextVar("_shared", default=None)
 
@@ -48,10 +51,11 @@ def for_views() -> int:
 def limited(threads: int | None, *, shared: bool) -> Iterator[None]:
     """Use `threads` threads inside, or as many as torch has. `shared`: by kernels and parallel views, with one for torch; else by torch.
 
-    Raises SettingsError for less than one.
+    Raises SettingsError for less than one, and for far more than the processor has.
     """
-    if threads is not None and threads < 1:
-        raise SettingsError(f"threads must be at least 1, got {threads}")
+    most = MOST_PER_CORE * (os.cpu_count() or 1)
+    if threads is not None and not (isinstance(threads, int) and 1 <= threads <= most):
+        raise SettingsError(f"threads must be at least 1, got {threads!r}; more than {most} are of no use on this machine")
     count = threads or for_kernels()
     token = _shared.set(count if shared else None)
     try:

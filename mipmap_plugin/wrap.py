@@ -13,7 +13,7 @@ from typing import Any
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.backends import device_for
-from mipmap_plugin.camera import Camera, digest_of
+from mipmap_plugin.camera import Camera, checked, digest_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_background
 from mipmap_plugin.models import load_model
@@ -53,10 +53,10 @@ def wrap_model(
     loading_s = time.perf_counter() - began
     trained = replace(model.trained, background=color or model.trained.background)
     if screen_filter is not None:
-        if screen_filter not in USUAL_EPS2D:
+        if not isinstance(screen_filter, str) or screen_filter not in USUAL_EPS2D:
             raise SettingsError(f"there is no screen filter {screen_filter!r}; choose from {', '.join(USUAL_EPS2D)}")
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
-    given = own_cameras(model) if cameras is None else cameras.cameras if isinstance(cameras, Scene) else cameras
+    given = own_cameras(model) if cameras is None else cameras.cameras if isinstance(cameras, Scene) else checked(cameras)
     wrapped = Wrapped(model, placed(model, cameras).cameras if isinstance(cameras, Scene) else given, backend, trained, threads)
     wrapped.loading_s, wrapped.asked = loading_s, asked_for(model.folder, given, color, screen_filter)
     return wrapped

@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
-from mipmap_plugin.camera import Camera, digest_of
+from mipmap_plugin.camera import Camera, checked, digest_of
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
@@ -125,9 +125,9 @@ class Wrapped:
         if unknown := options.keys() - RenderOptions.__annotations__.keys():
             raise TypeError(f"render() got unknown options: {', '.join(sorted(unknown))}; there are {', '.join(RenderOptions.__annotations__)}")
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
-        check_scale(scale)
-        if supersampling < 1:
-            raise SettingsError(f"supersampling: must be at least 1 sample per pixel along each axis, got {supersampling}")
+        scale = check_scale(scale)
+        if not isinstance(supersampling, int) or supersampling < 1:
+            raise SettingsError(f"supersampling: must be at least 1 sample per pixel along each axis, got {supersampling!r}")
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
         effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(options.get("outputs", ())), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
@@ -159,20 +159,20 @@ class Wrapped:
         """Return a new model for `scale` (target focal length in px over base focal length in px); the base does not change.
 
         `viewer`: the viewer that the file will be opened in (`splatting.viewers`), or "portable" for all built-in ones at once; by
-        default any viewer that renders as the training did, but without compensation.
+        default renderers that draw as the training did; for a base trained with compensation, the classic ones.
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override those of the recipe, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to continue from if it exists; Ctrl-C writes it
-        and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe` is called with the model
-        before the first step and after each step; the run ends where it returns True.
+        and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe(step, seconds, render)` is
+        called before the first step and after each; `render(camera)` is the current image, and the run ends where it returns True.
         `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
         `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
         Raises SettingsError and BackendUnavailable.
         """
-        check_scale(scale)
+        scale, cameras = check_scale(scale), None if cameras is None else checked(cameras)
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         if not model.traits.same_for_all_views and (settings.setdefault("merge_to", 1.0) < 1 or settings.get("most_splats")):
             reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
-            raise SettingsError(f"{model.family}: {reason}; leave merge_to and most_splats out")
+            raise SettingsError(f"{model.family}: {reason}; leave merge_to and most_splats (--splats, --bytes) out")
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         config, targets = make_config(recipe, scale, **settings), self.targets(viewer)

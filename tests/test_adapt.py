@@ -6,6 +6,8 @@ import math
 import signal
 import threading
 from dataclasses import replace
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -394,7 +396,7 @@ def test_a_scale_that_is_no_zoom_is_refused(scale):
     ("settings", "sentence"),
     [
         (dict(recipe="best"), "there is no recipe 'best'; choose from default, instant, paper, thorough"),
-        (dict(stepz=3), "setting stepz: Extra inputs are not permitted"),
+        (dict(stepz=3), "there is no setting stepz; did you mean steps?"),
         (dict(steps=-1), "setting steps: Input should be greater than or equal to 0"),
         (dict(resize="nearest"), "setting resize: Input should be 'box'"),
         (dict(views="some"), "setting views: Input should be 'given'"),
@@ -490,3 +492,31 @@ def test_memory_is_counted_on_a_gpu_and_from_its_beginning(monkeypatch):
     assert peak.mib() == 3
     assert PeakMemory(torch.device("cpu")).mib() is None
     assert wrapped().adapt(1 / 4, recipe="instant").report.peak_memory_mib is None
+
+
+@pytest.mark.parametrize("scale", ["1/4", None, [0.25], 1j, 10**400])
+def test_what_is_no_scale_is_refused(scale):
+    with pytest.raises(SettingsError, match="scale must be from"):
+        wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="reference").adapt(scale, steps=0)
+
+
+@pytest.mark.parametrize("scale", [Fraction(1, 2), np.float32(0.5), torch.tensor(0.5), Decimal("0.5")])
+def test_a_scale_is_a_number_of_any_type(scale):
+    report = wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="reference").adapt(scale, steps=0).report
+    assert type(report.scale) is float and report.scale == 0.5
+
+
+@pytest.mark.parametrize("cameras", ["cameras.json", [3], 7])
+def test_what_are_no_cameras_is_refused(cameras):
+    with pytest.raises(SettingsError, match=r"cameras must be of the type mipmap_plugin.Camera"):
+        wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="reference").adapt(0.5, cameras=cameras, steps=0)
+    with pytest.raises(SettingsError, match=r"cameras must be of the type mipmap_plugin.Camera"):
+        wrap_model(tiny.model(), cameras=cameras)
+
+
+def test_cameras_that_show_nothing_are_warned_of():
+    behind = torch.eye(4)
+    behind[2, 3] = -1000.0  # all splats lie behind it
+    away = replace(tiny.cameras(1)[0], viewmat=behind)
+    with pytest.warns(UserWarning, match="none of the 1 views shows a splat"):
+        wrap_model(tiny.model(), cameras=[away], backend="reference").adapt(0.5, steps=0, views="given")

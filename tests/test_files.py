@@ -10,7 +10,7 @@ import pytest
 
 from mipmap_plugin.errors import OutputError, OutputExists
 from mipmap_plugin.formats import staging
-from mipmap_plugin.formats.atomic import json_text, new_file, new_folder, refuse_output, refuse_unwritable, together, write_json
+from mipmap_plugin.formats.atomic import json_text, new_file, new_folder, refuse_output, refuse_to_lose, refuse_unwritable, together, write_json
 from mipmap_plugin.formats.staging import settle
 
 FACTS = {"psnr_db": math.inf, "rows": [{"gain": -math.inf}, (1.5, math.nan)], "name": "Infinity", "count": 3, "known": True, "none": None}
@@ -193,3 +193,17 @@ def test_without_locks_only_what_is_long_untouched_counts_as_dead(tmp_path, monk
         os.utime(left, (time.time() - age,) * 2)
         text(tmp_path / name)
     assert sorted(path.name for path in tmp_path.iterdir()) == [".young.0.tmp", "old", "young"]
+
+
+@pytest.mark.parametrize("below", ["there.ply", "folder", ""])
+def test_a_detour_through_a_folder_that_is_missing_does_not_hide_what_is_there(tmp_path, below):
+    """The system does not find `missing/../there`, but that is where a file is written to."""
+    (tmp_path / "there.ply").write_text("mine")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "letter.txt").write_text("mine")
+    target = tmp_path / "missing" / ".." / below
+    with pytest.raises(OutputExists, match="exists already"):
+        refuse_output(target, overwrite=False)
+    with pytest.raises(OutputExists, match=r"holds the base|is the base|other things|is a file"):
+        refuse_output(target, overwrite=True, base=[tmp_path / "there.ply"], is_file=False)
+        refuse_to_lose(target, None, "point_cloud")

@@ -14,7 +14,7 @@ from mipmap_plugin.backends.base import API_VERSION, Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import BackendUnavailable, PluginError, SettingsError
 from mipmap_plugin.evaluation.backends import check, listing, listing_table
-from mipmap_plugin.registry import Registry
+from mipmap_plugin.registry import Registry, load_target
 
 NEEDS = Needs("cpu", torch.float32, gradients=True, sh_degree=1, screen_filter="classic")
 
@@ -213,3 +213,47 @@ def test_installed_packages_are_read_again_only_when_a_folder_of_them_changes(mo
     (tmp_path / "stranger-1.0.dist-info" / "entry_points.txt").write_text("[mipmap_plugin.nothing]\nstrange = stranger:Strange\n")
     os.utime(tmp_path, (1, 1))
     assert (plug_ins.names(), plug_ins.names(), len(asked)) == (["strange"], ["strange"], 2)
+
+
+class Speechless:
+    """A backend that fails when it is asked what it lacks."""
+
+    name, api_version, speed = "speechless", API_VERSION, 99
+
+    def lacking(self, needs):
+        raise KeyError("device")
+
+    def render(self, gaussians, camera, effects):
+        raise AssertionError("it is never chosen")
+
+
+class Slow:
+    """A backend that does not say how fast it is."""
+
+    name, api_version = "slow", API_VERSION
+    lacking, render = Speechless.lacking, Speechless.render
+
+
+def test_a_backend_that_breaks_its_contract_breaks_no_other():
+    needs = Needs("cpu", torch.float32, gradients=False, sh_degree=0, screen_filter="classic")
+    with BACKENDS.temporarily(speechless=Speechless, slow=Slow):
+        backend, why = choose_backend("auto", needs)
+        assert backend.name in ("cpu", "reference")
+        assert "'speechless' cannot say what it lacks: KeyError: 'device'" in why and "'slow' lacks speed" in why
+        with pytest.raises(PluginError, match="'slow' lacks speed"):
+            choose_backend("slow", needs)
+
+
+def test_a_module_that_ends_the_process_is_a_broken_target(tmp_path, monkeypatch):
+    (tmp_path / "leaves.py").write_text("import sys\nsys.exit(3)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(PluginError, match="cannot be loaded: SystemExit: 3"):
+        load_target("leaves", "leaves:Backend")
+
+
+@pytest.mark.parametrize("name", [3, None, ["spark"]])
+def test_a_name_is_a_text(name):
+    with pytest.raises(SettingsError, match="a name is a text"):
+        BACKENDS.add(name, Slow)
+    with pytest.raises(SettingsError, match="there is no"):
+        BACKENDS.get(name)

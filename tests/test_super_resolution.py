@@ -11,7 +11,7 @@ from mipmap_plugin.adaptation.target import super_resolution
 from mipmap_plugin.adaptation.target.disk_cache import cache_folder, cached, fingerprint
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.super_resolution import Network
-from mipmap_plugin.adaptation.target.upsamplers import find_upsampler
+from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, find_upsampler
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.torchvision_absent import torchvision_optional
@@ -246,3 +246,17 @@ def test_a_torchvision_that_works_is_used(monkeypatch):
     with torchvision_optional(models={"alexnet": None}):
         import torchvision
     assert torchvision is works and sys.modules["torchvision"] is works
+
+
+@pytest.mark.parametrize(
+    ("upsampler", "said"),
+    [
+        (lambda image, size: 1 / 0, "failed: ZeroDivisionError"),
+        (lambda image, size: None, "returned a NoneType"),
+        (lambda image, size: image, r"returned \[24, 32, 3\], all finite"),
+        (lambda image, size: torch.full((*size, 3), torch.nan), "not all finite"),
+    ],
+)
+def test_an_upsampler_that_breaks_its_contract_is_told(upsampler, said):
+    with UPSAMPLERS.temporarily(odd=upsampler), pytest.raises(PluginError, match=said):
+        find_upsampler("odd")(torch.zeros(24, 32, 3), (48, 64))

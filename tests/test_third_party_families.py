@@ -14,7 +14,7 @@ from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, detect
 from mipmap_plugin.models.conformance import ModelSuite
-from mipmap_plugin.models.families import BUILT_IN, find_family
+from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 
 EXAMPLE = runpy.run_path(str(Path(__file__).parents[1] / "examples/register_family.py"))
@@ -172,3 +172,23 @@ def test_wrong_names_of_parameters_are_one_sentence(renamed, message):
 
     with pytest.raises(SettingsError, match=message):
         wrap_model(Renamed(tiny.model(4).parameters()))
+
+
+@pytest.mark.parametrize("sure", ["high", 2.0, -1, float("nan")])
+def test_a_certainty_out_of_range_is_a_failure_of_its_family_alone(tmp_path, sure):
+    ply = tiny.ply(tmp_path / "a.ply")
+    with FAMILIES.temporarily(bold=Family("bold", "Bold", lambda files: Match(sure, "I say so"), API_VERSION)):
+        found = detect(ply)
+    assert found.family == "3dgs" and "'bold' failed: sure must be a number from 0 to 1" in found.notes[0]
+
+
+def test_a_loader_that_finds_no_file_is_a_broken_plug_in(tmp_path):
+    def load(path, *, iteration=None):
+        raise FileNotFoundError("its network")
+
+    ply = tiny.ply(tmp_path / "a.ply")
+    with (
+        FAMILIES.temporarily(bold=Family("bold", "Bold", lambda files: Match(CERTAIN, "all"), API_VERSION, load)),
+        pytest.raises(PluginError, match=r"family 'bold' cannot load .* FileNotFoundError: its network"),
+    ):
+        load_model(ply)

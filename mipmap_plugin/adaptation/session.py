@@ -33,7 +33,7 @@ from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.views import choose_views, over_band, with_times
+from mipmap_plugin.adaptation.views import choose_views, over_band, warn_if_blind, with_times
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
@@ -75,7 +75,7 @@ class Session:
         self.asked_steps, config = config.steps, self._affordable(config, cameras)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs = request.finer, dict(request.inputs)
-        self.seconds, self.peak = {"optimization": 0.0}, PeakMemory(self.base.parameters()["means"].device)
+        self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.base.parameters()["means"].device)
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.views = over_band(self.base_views, config)
         self.views_note += f", {len(real.cameras)} of them real images" if real else ""
@@ -114,8 +114,8 @@ class Session:
         few = _rows(self.base) <= (self.config.most_splats or sys.maxsize)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             reason = "scale 1, at which the base is right as it is"
-            self.seconds["total"] = 0.0
             return Adapted(self.copy_of_base(), self._report(self.copy_of_base(), [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
+        warn_if_blind(self.base_views, self.base.parameters()["means"], self.truth)
         began = time.perf_counter()
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import accumulate
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.spreading import places, spread
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
@@ -22,6 +23,9 @@ from mipmap_plugin.scenes.trajectories import ORBIT_FOV, jittered, orbit
 ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
 
+
+# Views that are looked at to see whether they show anything.
+LOOKED_AT = 16
 
 # Views take their places in a band at multiples of the golden ratio, so that any number of consecutive ones is spread evenly.
 GOLDEN = (math.sqrt(5) - 1) / 2
@@ -127,6 +131,24 @@ def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: A
         extra = jittered(views, config.extra_views, generator)
         return views + extra, f"{len(views)} train views and {len(extra)} around them"
     return views, f"the {len(views)} {split} views"
+
+
+@torch.no_grad()
+def warn_if_blind(views: Sequence[Camera], means: Tensor, image_of: Callable[[Camera], Tensor]) -> None:
+    """Warn of views that show nothing: of cameras of another scene, for example. `image_of`: a view's image [h, w, 3]."""
+    some = evenly(views, LOOKED_AT)
+    if any(_sees(view, means.detach()) for view in some):
+        return
+    if all(torch.equal(image, image[:1, :1].expand_as(image)) for image in map(image_of, some)):  # not even a splat whose center lies outside
+        wrong = "the cameras seem to be of another scene, or in other coordinates"
+        warnings.warn(f"none of the {len(views)} views shows a splat, so nothing is adapted: {wrong}; give those of this scene", stacklevel=2)
+
+
+def _sees(view: Camera, means: Tensor) -> bool:
+    """Whether a view shows one of the `means` [N, 3]."""
+    x, y, z = view.to_camera(means).unbind(-1)
+    u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
+    return bool(((z > 0) & (u > 0) & (u < view.width) & (v > 0) & (v < view.height)).any())
 
 
 def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:

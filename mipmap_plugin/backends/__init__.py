@@ -39,6 +39,10 @@ def get_backend(name: str) -> Backend:
     if getattr(backend, "api_version", None) != API_VERSION:
         version = getattr(backend, "api_version", "unknown")
         raise PluginError(f"backend {name!r} is written for API version {version}, but this package has API version {API_VERSION}")
+    missing = [part for part in ("lacking", "render") if not callable(getattr(backend, part, None))]
+    missing += [part for part, kind in (("name", str), ("speed", (int, float))) if not isinstance(getattr(backend, part, None), kind)]
+    if missing:
+        raise PluginError(f"backend {name!r} lacks {', '.join(missing)}; see mipmap_plugin.backends.base.Backend")
     return backend
 
 
@@ -47,7 +51,7 @@ def survey(*needs: Needs) -> dict[str, list[str]]:
     reasons = {}
     for name in BACKENDS.names():
         try:
-            reasons[name] = _lacking(get_backend(name), needs)
+            reasons[name] = _lacking(name, get_backend(name), needs)
         except PluginError as error:
             reasons[name] = [str(error)]
     return reasons
@@ -62,7 +66,7 @@ def device_for(name: str) -> str:
     if name == "auto":
         return "cuda" if any(not reasons for other, reasons in survey(usual).items() if other != "reference") else "cpu"
     backend = get_backend(name)
-    return "cuda" if backend.lacking(replace(usual, device="cpu")) and not backend.lacking(usual) else "cpu"
+    return "cuda" if _lacking(name, backend, [replace(usual, device="cpu")]) and not _lacking(name, backend, [usual]) else "cpu"
 
 
 def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
@@ -72,7 +76,7 @@ def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
     """
     if name != "auto":
         backend = get_backend(name)
-        reasons = _lacking(backend, needs)
+        reasons = _lacking(name, backend, needs)
         if reasons:
             raise BackendUnavailable(f"backend {name!r} cannot do this: {'; '.join(reasons)}")
         return backend, f"{name}: requested{_note_in_brackets(backend)}"
@@ -85,8 +89,12 @@ def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
     return best, f"{best.name}: the fastest that can serve the request{_note_in_brackets(best)}" + "".join(f"; {reason}" for reason in others)
 
 
-def _lacking(backend: Backend, needs: Sequence[Needs]) -> list[str]:
-    return list(dict.fromkeys(reason for need in needs for reason in backend.lacking(need)))
+def _lacking(name: str, backend: Backend, needs: Sequence[Needs]) -> list[str]:
+    """The reasons why a backend cannot serve all of `needs`. Raises PluginError."""
+    try:
+        return list(dict.fromkeys(str(reason) for need in needs for reason in backend.lacking(need)))
+    except Exception as error:  # as in `get_backend`
+        raise PluginError(f"backend {name!r} cannot say what it lacks: {type(error).__name__}: {error}") from error
 
 
 def note_of(name: str) -> str:

@@ -217,7 +217,7 @@ def _gain(report: Report) -> str:
     if before is None or after is None:
         return f"holds {report.returned}"
     if report.returned.startswith(AS_IT_IS):
-        return f"holds {report.returned}, for nothing was better ({before:.2f} dB on views that nothing was adapted to)"
+        return f"holds {AS_IT_IS}, for nothing was better: {before:.2f} dB on views that nothing was adapted to"
     return f"{before:.2f} -> {after:.2f} dB on views that nothing was adapted to"
 
 

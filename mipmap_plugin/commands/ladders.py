@@ -12,6 +12,7 @@ from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.splat_transform import refuse_exchange
+from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
     from mipmap_plugin.levels.contents import Contents as ZoomContents
@@ -40,7 +41,10 @@ class Exports:
 
     def write(self, ladder: Path, contents: ZoomContents | DistanceContents) -> list[Path]:
         """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""
-        page = [write_levels_page(ladder, contents, self.title)] if self.title is not None else []
+        page = []
+        if self.title is not None:
+            with announced("drawing the page"):
+                page = [write_levels_page(ladder, contents, self.title)]
         return self._for_viewers(ladder) + page
 
     def _for_viewers(self, ladder: Path) -> list[Path]:
@@ -90,10 +94,18 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
         print_facts(manifest, json)
         return
     lines = _distances(folder, manifest) if manifest.get("by") == "distance" else _zooms(folder, manifest)
+    if missed := _below(manifest):
+        lines.append(f"  {', '.join(missed)}: below the {manifest['least_db']:g} dB that were asked for, in the narrowest band that is tried")
     base = min(point["base_db"] for point in manifest["curve"])
     lines.append(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
     lines.append(f"  {manifest['measured']}")
     say("\n".join([*lines, *(look_at(path) if path.name == LEVELS_PAGE else f"  {path}" for path in exports)]))
+
+
+def _below(manifest: dict[str, Any]) -> list[str]:
+    """The levels that are shown with fewer dB than were asked for, which a ladder by distance is not asked for."""
+    least = manifest.get("least_db")
+    return [] if least is None else [level["file"] for level in manifest["levels"] if min(level["psnr_db"].values(), default=least) < least]
 
 
 def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:

@@ -14,6 +14,7 @@ from mipmap_plugin.commands.types import Background, Checkpoint, Scale
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+from mipmap_plugin.progress import counted
 from mipmap_plugin.screen_filters import Name
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def render(
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
         screen_filter: trained: the filter of the checkpoint's training; scaled: the training-free filter for this scale.
         viewer: Render as this viewer does: classic, spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown name lists all viewers.
-        supersampling: N for N x N samples per pixel.
+        supersampling: N for N x N samples per pixel. The screen filter keeps its size: the exact picture of a zoom-out needs scaled, too.
         filter_3d: Smooth every splat to the finest detail that the cameras could resolve, as Mip-Splatting's 3D filter does.
         depth: Also write NAME_depth.npy, [height, width] float32: world units along the optical axis, 0 where there is nothing.
         normals: Also write NAME_normals.npy, [height, width, 3] float32: unit vectors in world axes, 0 where there is nothing.
@@ -70,7 +71,7 @@ def render(
         for camera in views:
             wrapped.model.traits.exposures.of(camera)  # raises before anything is written
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
-    for camera, picture in zip(views, pictures, strict=True):
+    for camera, picture in counted(zip(views, pictures, strict=True), len(views), "rendering", "view"):
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
     say(f"{len(views)} pictures in {output}{f', at x{zoom:g}, which the file was adapted to' if scale is None and zoom != 1 else ''}")
 

@@ -108,8 +108,9 @@ def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_
     link, a hard link, another case), nor a folder around one. What killed runs left at `path` is completed or removed first.
     """
     with _as_output_error(path):
-        settle(absolute(path))
-        status = _stat(path)
+        place = absolute(path)  # where it is written to: the system does not find `missing/..`, which this resolves
+        settle(place)
+        status = _stat(place)
     if status is None:
         return
     if not stat.S_ISREG(status.st_mode) and not stat.S_ISDIR(status.st_mode):
@@ -213,9 +214,10 @@ def refuse_to_lose(target: Path, source: Path | None, holds: str) -> None:
 
     Replacing a folder deletes its contents.
     """
-    if source is not None and target.is_dir() and any(os.path.samestat(target.stat(), each) for each in _around(source / "x", folders=True)):
+    place = absolute(target)
+    if source is not None and place.is_dir() and any(os.path.samestat(place.stat(), each) for each in _around(source / "x", folders=True)):
         raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
-    if target.is_dir() and any(target.iterdir()) and not (target / holds).is_dir():
+    if place.is_dir() and any(place.iterdir()) and not (place / holds).is_dir():
         raise OutputExists(f"{target} is a folder with other things in it, which --overwrite would delete; choose another folder")
-    if target.is_file():
+    if place.is_file():
         raise OutputExists(f"{target} is a file; choose another folder, or the path of a file")

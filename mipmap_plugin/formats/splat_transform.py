@@ -53,8 +53,10 @@ def refuse_exchange(path: Path) -> list[str]:
     """The command of splat-transform. Raises SettingsError, naming the output `path`, if it is not installed, or too old for this format."""
     tool = find_tool()
     if tool is None:
-        raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}; or give a .ply")
-    if path.suffix.lower() in WITH_TABLES and (version := _version(tool)) and int(version.split(".")[0]) < OLDEST_WITH_TABLES:
+        instead = "; or give a .ply" if path.suffix else ""  # of a file
+        raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}{instead}")
+    version = _version(tool) if path.suffix.lower() in WITH_TABLES else ""
+    if version and int(version.split(".")[0]) < OLDEST_WITH_TABLES:
         newer = f"{TOOL} {version} is too old for it, and {OLDEST_WITH_TABLES}.0 or newer is needed, which needs Node.js 22"
         raise SettingsError(f"{path}: {newer}; run: {INSTALL}@latest; or give a .spz or a .ply")
     return tool

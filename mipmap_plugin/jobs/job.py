@@ -53,4 +53,5 @@ class Outcome:
     warnings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return f"{self.job}: {self.status}{f', {self.reason}' if self.reason else ''}"
+        said = self.reason if self.reason.startswith(self.status) else ", ".join(filter(None, (self.status, self.reason)))
+        return f"{self.job}: {said}"

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.jobs.job import Job, Outcome
 
 COLUMNS = ("checkpoint", "scale", "viewer", "outcome", "splats", "dB", "seconds", "file, or what is wrong")
@@ -35,6 +34,8 @@ def _row(outcome: Outcome) -> tuple[str, ...]:
 
 def _psnr(report: dict[str, Any]) -> str:
     """dB before (the base as it is) and after, on views that nothing was adapted to; empty where one of them was not measured."""
+    from mipmap_plugin.adaptation.report import AS_IT_IS  # which imports torch
+
     psnrs = report.get("validation") or {}
     after = next((psnr for name, psnr in psnrs.items() if str(report.get("returned", "")).startswith(name)), None)
     before = psnrs.get(AS_IT_IS)

@@ -52,6 +52,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "viewer": ladder.request.viewer,
+        "least_db": ladder.request.least_db,
         "base": first.base,
         "base_pixel": base_pixel(ladder.base),
         "levels": [_entry(ladder, number, file) for number, file in enumerate(files)],

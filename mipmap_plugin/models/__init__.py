@@ -57,7 +57,7 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
     load = load_target(family.name, family.load) if isinstance(family.load, str) else family.load
     try:
         model: SplatModel = load(path, iteration=iteration)
-    except (MipmapPluginError, OSError, MemoryError):
+    except (MipmapPluginError, MemoryError):
         raise
     except Exception as error:  # third-party code may fail in any way
         if family in BUILT_IN:

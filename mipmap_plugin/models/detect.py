@@ -30,6 +30,8 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     In a folder, the newest `iteration_<N>` whose PLY is complete is used, or `iteration`.
     Raises CheckpointError for a path that is missing, damaged, or not a checkpoint.
     """
+    if path == "":
+        raise CheckpointError("no path was given; give a PLY file or a model folder")
     path = settled(Path(path))
     if path.is_dir():
         return _detect_folder(path, iteration)

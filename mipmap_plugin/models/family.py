@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.formats.magic import kind_of, pickle_of
 from mipmap_plugin.formats.ply import Header, read_header
@@ -32,6 +33,10 @@ class Match:
     why: str  # the feature by which it was recognized
     trouble: str = ""  # a sentence: why it cannot be loaded nevertheless
     lacks: tuple[str, ...] = ()  # files missing beside it; of a model folder, an older iteration that has them is loaded instead
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.sure, (int, float)) or not 0 <= self.sure <= 1:
+            raise SettingsError(f"sure must be a number from 0 to 1, got {self.sure!r}")
 
 
 class Files:

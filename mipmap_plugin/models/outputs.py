@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import OutputExists, SettingsError
-from mipmap_plugin.formats.atomic import named, refuse_output, refuse_to_lose
+from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import refuse_as_folder
@@ -49,7 +49,8 @@ def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path 
     if holds is not None:
         refuse_as_folder(path)
         refuse_to_lose(path, source if folder is None else folder, holds)
-        if not is_adapted(path) and any(map(_is_of_a_training, path.glob("point_cloud/*/point_cloud.ply"))):
+        place = absolute(path)
+        if not is_adapted(place) and any(map(_is_of_a_training, place.glob("point_cloud/*/point_cloud.ply"))):
             raise OutputExists(f"{path} holds a trained model, which --overwrite would delete; choose another folder")
 
 

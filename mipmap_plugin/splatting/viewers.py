@@ -30,6 +30,10 @@ class Viewer:
     filter_3d: bool = False  # whether the viewer reads the column filter_3D of a PLY and smooths splats by it
     unlike: str = ""  # known differences between the viewer and this record
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.eps2d, (int, float)) or not 0 <= self.eps2d < math.inf:
+            raise SettingsError(f"viewer {self.name!r}: eps2d, the dilation in px², must be a number of at least 0, got {self.eps2d!r}")
+
     def effects(self, effects: Effects) -> Effects:
         """`effects` under this viewer's convention. The near plane changes only if the viewer has one."""
         near = effects.near_plane if self.near_plane is None else self.near_plane

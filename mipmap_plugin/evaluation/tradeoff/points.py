@@ -35,6 +35,7 @@ from mipmap_plugin.evaluation.measure import (
 )  # fmt: skip
 from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.progress import ticking
 from mipmap_plugin.splatting.filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Wrapped
 
@@ -132,7 +133,7 @@ def measure(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan, cells:
         shown = _renderers(model, adapted[runs[0]] if runs else None, scale)
         return [_measured(point, show, truth, plan.repeats) for point, show in shown]
 
-    with bar:
+    with bar, ticking(bar):
         for baseline in free:
             yield from kept({"baseline": baseline.name, "backend": baseline.backend}, partial(shown, baseline))
             bar.update()
