@@ -235,7 +235,7 @@ def test_render_writes_the_test_views_at_the_scale(run, model_folder, tmp_path):
 def test_render_of_one_view_is_the_view(run, model_folder, tmp_path):
     words = ["--view", "view_1", "--screen-filter", "scaled", "--supersampling", "2", "--background", "white", "--backend", "reference"]
     code, out, _ = run("render", model_folder, "--output", tmp_path / "out", *words)
-    assert code == 0 and out.startswith("1 pictures")
+    assert code == 0 and out.startswith("1 picture in")
     [picture] = (tmp_path / "out").iterdir()
     assert picture.name == "train_view_1.png" and Image.open(picture).getpixel((0, 0)) == (255, 255, 255)
 

@@ -73,7 +73,8 @@ def render(
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
     for camera, picture in counted(zip(views, pictures, strict=True), len(views), "rendering", "view"):
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
-    say(f"{len(views)} pictures in {output}{f', at x{zoom:g}, which the file was adapted to' if scale is None and zoom != 1 else ''}")
+    count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
+    say(f"{count} in {output}{f', at x{zoom:g}, which the file was adapted to' if scale is None and zoom != 1 else ''}")
 
 
 def _zoom(wrapped: Wrapped, scale: float | None) -> float:

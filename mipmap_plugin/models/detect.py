@@ -126,7 +126,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         clouds = [folder / "point_cloud.ply"]
     if len(clouds) == 1:
         return detect(clouds[0])
-    content = f"{len(clouds)} PLY files ({', '.join(c.name for c in clouds[:5])})" if clouds else "no point_cloud folder and no PLY file"
+    some = ", ".join([*(cloud.name for cloud in clouds[:5]), *["..."] * (len(clouds) > 5)])
+    content = f"{len(clouds)} PLY files ({some})" if clouds else "no point_cloud folder and no PLY file"
     raise CheckpointError(f"{folder} holds {content}; give one PLY file, or a model folder with point_cloud/iteration_<N>")
 
 
