@@ -17,6 +17,7 @@ from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.eigen import eigh3
 from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.splatting.rotations import rotations
 
@@ -48,8 +49,8 @@ def facing(gaussians: Gaussians, camera: Camera) -> Tensor:
         shortest = gaussians.scales.abs().argmin(1)
         axes = rotations(gaussians.quats).mT[torch.arange(len(shortest), device=shortest.device), shortest]
     else:
-        finite = gaussians.covariances.isfinite().all(-1).all(-1)[:, None, None]  # the others are not drawn, but eigh would raise
-        axes = torch.linalg.eigh(torch.where(finite, gaussians.covariances, 0.0)).eigenvectors[..., 0]
+        finite = gaussians.covariances.isfinite().all(-1).all(-1)[:, None, None]  # the others are not drawn
+        axes = eigh3(torch.where(finite, gaussians.covariances, 0.0))[1][..., 0]
     away = (axes * (gaussians.means - camera.center.to(axes))).sum(-1, keepdim=True) > 0
     return torch.where(away, -axes, axes)
 

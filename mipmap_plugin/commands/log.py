@@ -23,8 +23,7 @@ class Log:
         self._path = path
         self._file: TextIO | None
         try:
-            holds = path.open("rb").read(20) if path.is_file() else b""
-            self._file = None if holds and not BEGINNING.match(holds) else path.open("a", encoding="utf-8")
+            self._file = path.open("a", encoding="utf-8") if _may_be_a_log(path) else None
         except (OSError, ValueError) as error:
             raise OutputError(f"{path} cannot be written ({error}); give --log another file") from error
         if self._file is None:
@@ -48,3 +47,12 @@ class Log:
             with contextlib.suppress(OSError):  # the disk is full, which was said
                 self._file.close()
             self._file = None
+
+
+def _may_be_a_log(path: Path) -> bool:
+    """Whether a path is new, an empty file, a log, or a device."""
+    if not path.is_file():
+        return True
+    with path.open("rb") as file:
+        line = file.read(20)
+    return not line or BEGINNING.match(line) is not None
