@@ -358,6 +358,19 @@ def test_every_view_can_be_gone_to_again_and_again_whatever_its_name(page, base,
     assert poses == [tuple(base.cameras[number].center.tolist()) for number in (0, 3, 0)]
 
 
+def test_the_slider_goes_on_from_where_it_moved_the_camera_to(page, screen, monkeypatch):
+    """A browser reports a movement later, when the slider may have been moved again."""
+    reported, browser, begun = pose_of(screen, 2.0), MagicMock(client=MagicMock(client_id=7)), []
+    monkeypatch.setattr(live_page, "_view", lambda _: (reported, 64, 48))
+    monkeypatch.setattr(live_page, "zoomed", lambda pose, zoom, *_: begun.append(pose) or replace(pose, fov=pose.fov / 2))
+    page._zoom(browser)
+    page._zoom(browser)
+    assert begun == [reported, replace(reported, fov=reported.fov / 2)]
+    monkeypatch.setattr(live_page, "HANDS_OFF_S", 0.0)
+    page._zoom(browser)
+    assert begun[2] == reported
+
+
 @pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("can't allocate memory")])
 def test_a_picture_that_does_not_fit_into_the_memory_does_not_end_the_page(page, screen, monkeypatch, error):
     monkeypatch.setattr(page._stage, "draw", MagicMock(side_effect=error))

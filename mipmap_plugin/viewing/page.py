@@ -69,6 +69,7 @@ class Page:
         self._stage, self._settings, self._pace = stage, settings, Pace()
         self._changed, self._version = threading.Event(), 0
         self._sliding, self._slid = threading.Lock(), 0.0  # one movement of the slider after the other; when the last one was
+        self._slid_to: dict[int, Pose] = {}  # where it moved the camera of each browser, which reports that later
         self._seen: dict[int, _Seen] = {}
         self.adapter = Adapter(stage.base, stage.reference, self._progressed)
         self._live = stage.add(Live(self.adapter, base))
@@ -165,12 +166,15 @@ class Page:
         if event.client is None:
             return
         with self._sliding:
-            self._slid = time.monotonic()
+            number, now = event.client.client_id, time.monotonic()
             pose, width, height = _view(event.client)
+            if now - self._slid < HANDS_OFF_S:  # the browser may not have reported the last movement yet
+                pose = self._slid_to.get(number, pose)
             look, zoom = self._controls.look(), 2.0**self._controls.zoom.value
             screen = smaller(pose.camera(width, height), 1 / look.pixel)
             change = by_distance if self._controls.by.value == DISTANCE else by_lens
-            _move(event.client, zoomed(pose, zoom, self._stage.sampling, screen.size, change))
+            self._slid, self._slid_to[number] = now, zoomed(pose, zoom, self._stage.sampling, screen.size, change)
+            _move(event.client, self._slid_to[number])
 
     def _go(self, event: Any) -> None:
         """Move the camera to a view of the scene. The list is a menu: viser tells of no choice that stands there already."""
