@@ -371,6 +371,19 @@ def test_the_slider_goes_on_from_where_it_moved_the_camera_to(page, screen, monk
     assert begun[2] == reported
 
 
+def test_a_camera_that_missed_the_sliders_zoom_is_moved_once_more_and_then_the_slider_follows(page, screen, monkeypatch):
+    moved = []
+    monkeypatch.setattr(live_page, "_view", lambda _: (pose_of(screen, 2.0), 64, 48))
+    monkeypatch.setattr(live_page, "zoomed", lambda pose, zoom, *_: moved.append(zoom) or pose)
+    page._controls.zoom.value = 1.0
+    page._zoom(MagicMock())
+    page._controls._stops = 0.7, 1.0  # the picture's zoom, and where the slider was then
+    page._settle()
+    assert moved == [2.0, 2.0] and page._controls.zoom.value == 1.0
+    page._settle()
+    assert len(moved) == 2 and page._controls.zoom.value == 0.7
+
+
 @pytest.mark.parametrize("error", [MemoryError(), torch.OutOfMemoryError("CUDA out of memory"), RuntimeError("can't allocate memory")])
 def test_a_picture_that_does_not_fit_into_the_memory_does_not_end_the_page(page, screen, monkeypatch, error):
     monkeypatch.setattr(page._stage, "draw", MagicMock(side_effect=error))

@@ -83,9 +83,13 @@ class Controls:
 
     def follow(self) -> None:
         """Set the slider to the zoom of the last picture, unless a hand has moved it since; then there will be another picture."""
+        if self.is_missed():
+            self.zoom.value = self._stops[0]
+
+    def is_missed(self) -> bool:
+        """Whether the last picture has another zoom than the slider, which no hand has moved since."""
         stop, then = self._stops
-        if self.zoom.value == then and abs(stop - then) > STOPS[2] / 2:
-            self.zoom.value = stop
+        return self.zoom.value == then and abs(stop - then) > STOPS[2] / 2
 
     def tell_progress(self, progress: Progress) -> None:
         """Show how far a run is, with its curve."""

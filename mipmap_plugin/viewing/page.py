@@ -70,6 +70,7 @@ class Page:
         self._changed, self._version = threading.Event(), 0
         self._sliding, self._slid = threading.Lock(), 0.0  # one movement of the slider after the other; when the last one was
         self._slid_to: dict[int, Pose] = {}  # where it moved the camera of each browser, which reports that later
+        self._slider_of: Any = None  # the browser in which it was moved, until its camera is where the slider says
         self._seen: dict[int, _Seen] = {}
         self.adapter = Adapter(stage.base, stage.reference, self._progressed)
         self._live = stage.add(Live(self.adapter, base))
@@ -90,7 +91,7 @@ class Page:
             self._changed.clear()
             still = [self._serve(number, client) for number, client in self._server.get_clients().items()]
             if all(still) and time.monotonic() - self._slid > HANDS_OFF_S:
-                self._controls.follow()
+                self._settle()
 
     def close(self) -> None:
         """End a run that is adapting, and the server."""
@@ -163,23 +164,34 @@ class Page:
 
     def _zoom(self, event: Any) -> None:
         """Move the camera whose slider was moved by hand."""
-        if event.client is None:
-            return
+        if event.client is not None:
+            self._slider_of = event.client
+            self._slide(event.client)
+
+    def _settle(self) -> None:
+        """Once no hand is on the slider: move the camera again if it missed the slider's zoom, or else let the slider follow the picture."""
+        client, self._slider_of = self._slider_of, None
+        missed = client is not None and self._controls.is_missed()
+        self._slide(client) if missed else self._controls.follow()
+
+    def _slide(self, client: Any) -> None:
+        """Move a browser's camera to the zoom of the slider."""
         with self._sliding:
-            number, now = event.client.client_id, time.monotonic()
-            pose, width, height = _view(event.client)
+            number, now = client.client_id, time.monotonic()
+            pose, width, height = _view(client)
             if now - self._slid < HANDS_OFF_S:  # the browser may not have reported the last movement yet
                 pose = self._slid_to.get(number, pose)
             look, zoom = self._controls.look(), 2.0**self._controls.zoom.value
             screen = smaller(pose.camera(width, height), 1 / look.pixel)
             change = by_distance if self._controls.by.value == DISTANCE else by_lens
             self._slid, self._slid_to[number] = now, zoomed(pose, zoom, self._stage.sampling, screen.size, change)
-            _move(event.client, self._slid_to[number])
+            _move(client, self._slid_to[number])
 
     def _go(self, event: Any) -> None:
         """Move the camera to a view of the scene. The list is a menu: viser tells of no choice that stands there already."""
         view = self._views.get(self._controls.view.value)
         if event.client is not None and view is not None:
+            self._slider_of = None  # the new view has a zoom of its own
             _move(event.client, self._pose(view))
             self._controls.view.value = NOWHERE
 
