@@ -18,10 +18,11 @@ from running import saving_often, wait_until
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists, SettingsError
+from mipmap_plugin.jobs import summary
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.engines import longest_first
 from mipmap_plugin.jobs.finished import finished
-from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
 from mipmap_plugin.jobs.parcel import do_parcel, pack, unpack
 from mipmap_plugin.jobs.run import run as run_job
@@ -461,3 +462,14 @@ def test_ctrl_c_saves_the_state_of_every_running_job(run, scenes, tmp_path, engi
     assert "mipmap-plugin: interrupted; run the same command again to go on where it stopped" in err and "Traceback" not in err
     assert out.strip().endswith("4 jobs: 4 interrupted" if "--dask" in engine else "4 jobs: 2 interrupted, 2 not begun")
     assert len(list(scenes.glob("*.resume"))) == 2 and not list(scenes.glob(".*.lock"))
+
+
+def test_the_db_before_are_the_bases_and_of_no_other_state():
+    told = {"the base as it is": 38.7, "the start": 21.9, "the last state": 25.0}
+    assert summary._psnr({"validation": told, "returned": "the last state"}) == "38.70 -> 25.00"
+    assert summary._psnr({"validation": {"the start": 21.9}, "returned": "the start"}) == ""
+
+
+def test_an_interruption_is_told_once(tmp_path):
+    outcome = Outcome(job_of(tmp_path), "interrupted", reason="interrupted at step 132")
+    assert str(outcome).count("interrupted") == 1 and str(replace(outcome, reason="")).endswith(": interrupted")

@@ -9,6 +9,7 @@ import pytest
 import tiny
 
 from mipmap_plugin import cli
+from mipmap_plugin.commands.ladders import _below
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks
@@ -216,3 +217,9 @@ def test_without_splat_transform_the_command_says_so_before_any_work(tmp_path, m
         assert cli.main(["levels", str(base), "--viewer", "spark", "--output", str(tmp_path / "ladder"), option]) == 2
         assert "npm install -g @playcanvas/splat-transform" in capsys.readouterr().err
     assert not (tmp_path / "ladder").exists() and not (tmp_path / "ladder.resume").exists()
+
+
+def test_levels_below_the_db_that_were_asked_for_are_named():
+    levels = [{"file": "level_0.ply", "psnr_db": {"1": 40.0}}, {"file": "level_1.ply", "psnr_db": {"0.5": 31.0, "0.7": 35.0}}]
+    assert _below({"least_db": 33.0, "levels": levels}) == ["level_1.ply"]
+    assert _below({"least_db": None, "levels": levels}) == [] == _below({"levels": levels})

@@ -171,8 +171,9 @@ class Page:
     def _settle(self) -> None:
         """Once no hand is on the slider: move the camera again if it missed the slider's zoom, or else let the slider follow the picture."""
         client, self._slider_of = self._slider_of, None
-        missed = client is not None and self._controls.is_missed()
-        self._slide(client) if missed else self._controls.follow()
+        if client is None or not self._controls.is_missed():
+            return self._controls.follow()
+        self._slide(client)
 
     def _slide(self, client: Any) -> None:
         """Move a browser's camera to the zoom of the slider."""
