@@ -14,7 +14,7 @@ from mipmap_plugin.camera import Camera
 Result = TypeVar("Result")
 
 # Rows that a processor computes together, in bounded memory.
-CHUNK = 1 << 16
+CHUNK = 1 << 14
 
 # Splats plus pixels of a view. Larger views are rendered one after the other: the kernels' own threads are as fast there, and only one view
 # needs memory at a time.

@@ -30,8 +30,9 @@ from mipmap_plugin.threads import side_by_side
 # Number of checks during the warm-up, while the rates rise, and of a short run, with so many steps between two: each takes as long as a step.
 CHECKS_IN_WARM_UP, CHECKS, STEPS_BETWEEN = 10, 6, 5
 
-# Steps from which truths are made ahead, for each thread: as long as views are new, most steps have one.
-STEPS_AHEAD = 2
+# Truths that each of several threads makes at a time, since all wait for the last one; and steps that are searched for each: as long as views
+# are new, most steps have one.
+TRUTHS_AT_ONCE, STEPS_AHEAD = 4, 2
 
 # What ends a run whose observer returns True.
 STOPPED = "its observer"
@@ -157,13 +158,14 @@ def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, targe
 
 
 def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule, views: Sequence[Camera]) -> None:
-    """Make the truths of the views of a step that none used yet, and of some that are next to be used, so that each thread makes one."""
+    """Make the truths of the views of a step that none used yet, and of some that are next to be used, so that every thread makes some."""
     known, new = run.costs.truths, [view for view in views if view not in run.costs.truths]
     if not new:
         return
     at_once = max_threads(run.student.parameters()["means"], new[0].zoomed(task.scale))
-    for step in range(run.step + 1, min(run.step + 1 + STEPS_AHEAD * at_once, config.steps)):
-        if len(new) >= at_once:
+    wanted = TRUTHS_AT_ONCE * at_once if at_once > 1 else 1
+    for step in range(run.step + 1, min(run.step + 1 + STEPS_AHEAD * wanted, config.steps)):
+        if len(new) >= wanted:
             break
         new += [view for view in order(step, run.progress(config)) if view not in known and view not in new]
     list(side_by_side(lambda view: run.costs.truth(view, task.truth), new, at_once))
