@@ -17,6 +17,7 @@ import tiny
 from running import saving_often, wait_until
 
 from mipmap_plugin.cli import main
+from mipmap_plugin.camera import digest_of
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.jobs import summary
 from mipmap_plugin.jobs.base import Base
@@ -288,6 +289,17 @@ def test_a_model_folder_travels(tmp_path, suffix, given):
     assert unpack(do_parcel(pack(away), run_job), away).status == "done"
     here, there = (path.read_bytes() if suffix else next(path.rglob("*.ply")).read_bytes() for path in (job.target, away.target))
     assert here == there and finished(away) is not None
+
+
+@pytest.mark.parametrize("given", ["", "point_cloud/iteration_30000/point_cloud.ply"])
+def test_given_cameras_have_the_image_size_of_the_training(tmp_path, given):
+    """Its options lie in the model folder, whether that or a file in it is named."""
+    folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
+    (folder / "cfg_args").write_text("Namespace(sh_degree=1, resolution=2)")
+    base = Base(folder / given, cameras=folder / "cameras.json", backend="reference")
+    views = base.load().cameras
+    assert {view.size for view in views} == {(tiny.HEIGHT // 2, tiny.WIDTH // 2)}
+    assert base.asked()["cameras"] == digest_of(views)
 
 
 def test_options_beside_an_exchange_format_are_not_of_its_training(tmp_path):

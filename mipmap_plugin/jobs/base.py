@@ -26,28 +26,31 @@ class Base:
 
     def asked(self) -> dict[str, str]:
         """What is given beside the checkpoint, as its adaptations record it, without loading it. Raises CheckpointError, SceneError."""
-        from mipmap_plugin.models import detect
         from mipmap_plugin.models.inria_folder import read_options
         from mipmap_plugin.scenes import load_scene, model_cameras
         from mipmap_plugin.wrap import asked_for
 
-        found = detect(self.checkpoint)
-        folder = None if found.family == "exchange" else found.folder  # which is not of an exchange format's training
+        folder = self._model_folder()
         if self.cameras is not None:
-            cameras = load_scene(self.cameras, read_options(self.checkpoint)[0]).cameras
+            cameras = load_scene(self.cameras, read_options(folder)[0]).cameras
         else:
             cameras = tuple(model_cameras(folder, read_options(folder)[0]))
         return asked_for(folder, cameras, COLORS[self.background], self.screen_filter)
 
     def load(self, threads: int | None = None) -> Wrapped:
         """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""
+        folder = self._model_folder()  # says what is wrong with the checkpoint before torch is imported
+        with uncollected():
+            return self._loaded(folder, threads)
+
+    def _model_folder(self) -> Path | None:
+        """The folder of the training, also where the checkpoint is a file in it; None if there is none, or the format is not of a training."""
         from mipmap_plugin.models import detect
 
-        detect(self.checkpoint)  # says what is wrong with it before torch is imported
-        with uncollected():
-            return self._loaded(threads)
+        found = detect(self.checkpoint)
+        return None if found.family == "exchange" else found.folder
 
-    def _loaded(self, threads: int | None) -> Wrapped:
+    def _loaded(self, folder: Path | None, threads: int | None) -> Wrapped:
         from mipmap_plugin.backends import BACKENDS
         from mipmap_plugin.models.inria_folder import read_options
         from mipmap_plugin.scenes import load_scene
@@ -55,7 +58,7 @@ class Base:
 
         if self.backend != "auto":
             BACKENDS.get(self.backend)
-        scene = None if self.cameras is None else load_scene(self.cameras, read_options(self.checkpoint)[0])
+        scene = None if self.cameras is None else load_scene(self.cameras, read_options(folder)[0])
         color = COLORS[self.background]
         return wrap_model(
             self.checkpoint, cameras=scene, backend=self.backend, background=color, screen_filter=self.screen_filter, threads=threads

@@ -24,8 +24,11 @@ function tradeoffSection() {
   return section("tradeoff", "Accuracy and time", ...scales.flat());
 }
 
+// At scale 1 the base is returned as it is, so that there is no curve.
+const optimized = record.adaptations.filter((report) => report.curve.some((each) => each.validation_db != null));
+
 function curveSection() {
-  return section("curve", "While it adapted", make("div", { class: "charts" }, ...record.adaptations.map(curveChart)));
+  return section("curve", "While it adapted", make("div", { class: "charts" }, ...optimized.map(curveChart)));
 }
 
 function effectsSection() {
@@ -73,7 +76,7 @@ page.append(
   ...(record.ladder ? [ladderSection()] : []),
   ...(record.tradeoffs.length ? [tradeoffSection()] : []),
   ...(record.rows.length ? [rowsSection()] : []),
-  ...(record.adaptations.length ? [curveSection()] : []),
+  ...(optimized.length ? [curveSection()] : []),
   ...(record.notes.length ? [section("notes", "Notes", make("ul", {}, ...record.notes.map((note) => make("li", {}, note))))] : []),
   ...(record.effects.length ? [effectsSection()] : []),
   ...(record.commands.length ? [commandSection()] : []),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -119,7 +120,7 @@ def coarser(effects: Effects, factor: float) -> Effects:
 
 
 def open_source(path: Path, base: Wrapped, backend: str) -> Source:
-    """An adapted file, or the folder of a ladder of levels. Raises CheckpointError, and SceneError for a damaged ladder."""
+    """An adapted file, or the folder of a ladder of levels. Raises CheckpointError, and SceneError for a ladder that is damaged or by distance."""
     if not (path / MANIFEST).is_file():
         return File(path.resolve().name, _wrapped(path, base, backend))
     name = path.resolve().name
@@ -128,10 +129,13 @@ def open_source(path: Path, base: Wrapped, backend: str) -> Source:
 
 def _levels(folder: Path) -> list[tuple[float, str]]:
     """The zoom down to which each level of a ladder is shown, and its file."""
-    try:
-        found = [(float(entry["shown_from"] or 0.0), str(entry["file"])) for entry in read_manifest(folder)["levels"]]
-    except (KeyError, TypeError, ValueError, AttributeError):
-        found = []
+    by = found = None
+    with suppress(KeyError, TypeError, ValueError, AttributeError):
+        manifest = read_manifest(folder)
+        by = manifest.get("by")
+        found = [(float(entry["shown_from"] or 0.0), str(entry["file"])) for entry in manifest["levels"]]
+    if by == "distance":
+        raise SceneError(f"{folder} holds levels by distance, several of which are in one picture; give a file of it, or make a ladder with --by zoom")
     if not found:
         raise SceneError(f"{folder / MANIFEST}: lists no levels, or is damaged; make the ladder again with `mipmap-plugin levels`")
     return found

@@ -250,6 +250,13 @@ def test_the_curve_has_a_mark_for_every_check_and_the_start(open_page: Open, tmp
     assert f"{report['curve'][0]['validation_db']:.2f} dB" in page.text_content("#curve .readout")
 
 
+def test_the_page_of_a_base_that_is_returned_as_it_is_has_no_curve(open_page: Open, tmp_path: Path) -> None:
+    base = tiny.folder(tmp_path / "base")
+    assert main(["adapt", str(base), "--scale", "1", "--output", str(tmp_path / "a.ply"), "--report"]) == 0
+    page = open_page(tmp_path / "a.ply.report.html")
+    assert page.locator("#provenance").count() == 1 and page.locator("#curve").count() == 0
+
+
 @pytest.mark.slow
 def test_the_page_of_the_demo_works(open_page: Open, tmp_path: Path) -> None:
     run_demo(tmp_path, (0.125, 0.25), report=True)
