@@ -64,6 +64,13 @@ class Camera:
         """
         return (points - self.center.to(points)) @ self.viewmat[:3, :3].to(points).T
 
+    def in_picture(self, points: Tensor, near: float = 0.0) -> Tensor:
+        """Which points [N, 3] in camera space lie inside the picture, and farther than `near` (world units): [N] bool."""
+        x, y, z = points.unbind(-1)
+        u, v = self.fx * x / z + self.cx, self.fy * y / z + self.cy
+        inside: Tensor = (z > near) & (u > 0) & (u < self.width) & (v > 0) & (v < self.height)
+        return inside
+
     @property
     def size(self) -> tuple[int, int]:
         """(height, width), as images are indexed."""

@@ -9,6 +9,8 @@ from collections import deque
 
 import numpy as np
 
+from mipmap_plugin.freed_memory import return_freed_memory
+
 # Bytes of a cache line. Arrays whose rows are cache lines begin at one, unlike numpy's own, and so do large ones.
 CACHE_LINE = 64
 
@@ -86,6 +88,12 @@ _pool = Pool()
 def release() -> None:
     """Free the spare memory of this process's pool, before work that needs memory of other sizes."""
     _pool.release()
+
+
+def release_to_system() -> None:
+    """`release`, and give the system all that was freed: what one phase needed and the next one does not."""
+    release()
+    return_freed_memory()
 
 
 def empty(*shape: int, dtype: type = np.float32) -> np.ndarray:

@@ -125,10 +125,10 @@ def team(work: Callable[[int], None], threads: int) -> None:
     helpers = [_pool(most - 1, os.getpid()).submit(copy_context().run, work, thread) for thread in range(1, threads)]
     try:
         work(0)
-    finally:
-        for helper in helpers:
-            if not helper.cancel():  # a helper that has not begun has nothing left to do
-                helper.result()
+    finally:  # all have ended before an error of one of them is raised, since they write to what is the caller's
+        errors = [helper.exception() for helper in helpers if not helper.cancel()]  # one that has not begun has nothing left to do
+    for error in filter(None, errors):
+        raise error
 
 
 @cache

@@ -71,7 +71,8 @@ def visible(one, anchor, camera):
     u, v = np.clip([x / z, y / z], -limit, limit)
     jacobian = np.array([[camera.fx / z, 0, -camera.fx * u / z], [0, camera.fy / z, -camera.fy * v / z]])
     flat = jacobian @ view[:3, :3] @ covariance @ view[:3, :3].T @ jacobian.T + 0.3 * np.eye(2)
-    radius = math.ceil(3 * math.sqrt(np.linalg.eigvalsh(flat)[1]))
+    middle = np.trace(flat) / 2
+    radius = math.ceil(3 * math.sqrt(middle + math.sqrt(max(0.1, middle**2 - np.linalg.det(flat)))))  # (forward.cu)
     for center, side in ((camera.fx * x / z + camera.cx - 0.5, camera.width), (camera.fy * y / z + camera.cy - 0.5, camera.height)):
         tiles = (side + 15) // 16
         first, last = (min(tiles, max(0, int(edge / 16))) for edge in (center - radius, center + radius + 15))

@@ -13,8 +13,8 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # From the ground up; a module imports only what lies below its own storey, or in its own package.
 STOREYS = [
-    {"errors"},
-    {"limits", "pool", "freed_memory", "garbage"},
+    {"errors", "freed_memory", "garbage"},
+    {"limits", "pool"},
     {"registry", "config", "torchvision_absent", "threads", "progress", "screen_filters"},
     {"gaussians", "camera"},
     {"formats"},

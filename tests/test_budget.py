@@ -64,7 +64,7 @@ def test_what_needs_no_change_has_none(settings, seconds):
 def test_the_pace_is_measured_in_images_and_truths(monkeypatch):
     monkeypatch.undo()
     seconds = iter([0.3, 0.1, 0.5, 0.7])
-    monkeypatch.setattr(budget, "_seconds", lambda function, camera: (function(camera), next(seconds))[1])
+    monkeypatch.setattr(budget, "_seconds", lambda function, camera, device: (function(camera), next(seconds))[1])
     task = a_task(3)
     pace = Pace.of(tiny.model(5), task)
     assert pace.a_view == pytest.approx(budget.STEP_OVER_IMAGE * 0.1)

@@ -148,6 +148,13 @@ def test_a_pixel_is_that_of_the_closest_view_that_sees_the_splat():
     torch.testing.assert_close(pixel_size(means, [VIEW, closer]), torch.tensor([2.0, 1.0, 2.0]) / FOCAL)
 
 
+def test_a_pixel_has_a_size_in_the_plane_of_the_camera_too():
+    """Else weights over it are infinite, and merged colors NaN."""
+    size = pixel_size(torch.tensor([[1.0, 0.0, 0.0]]), [VIEW])
+    assert size.item() > 0
+    assert (size**-2).isfinite().all()
+
+
 @pytest.mark.parametrize("scale", [2, 4])
 def test_zoom_in_of_a_mip_base_for_any_viewer(scale):
     base = Effects(0, "mip", 0.1)

@@ -34,6 +34,11 @@ def test_family_by_columns(tmp_path, family):
     assert detect(write(tmp_path / "a.ply", FAMILY_COLUMNS[family])).family == family
 
 
+def test_a_file_of_no_splats_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match="holds no splats: its header declares none"):
+        detect(write_splats(tmp_path / "a.ply", count=0))
+
+
 def test_family_by_header_tag(tmp_path):
     assert detect(write(tmp_path / "a.ply", SPLAT, comments=("SplatRenderMode: 2dgs",))).family == "2dgs"
 

@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import anchor_checkpoints
 import corpus
@@ -16,12 +17,12 @@ import pytest
 import tiny
 from running import saving_often, wait_until
 
-from mipmap_plugin.cli import main
 from mipmap_plugin.camera import digest_of
+from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.jobs import summary
 from mipmap_plugin.jobs.base import Base
-from mipmap_plugin.jobs.engines import longest_first
+from mipmap_plugin.jobs.engines import in_workers, longest_first
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, read_list, shard, without_outputs
@@ -389,6 +390,13 @@ def test_out_of_memory_is_one_sentence(tmp_path, monkeypatch):
 
 
 # Workers
+
+
+def test_workers_share_all_threads_where_jobs_are_few(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr("mipmap_plugin.jobs.engines.Worker", lambda threads: made.append(threads) or SimpleNamespace(stop=list, close=list))
+    monkeypatch.setattr("mipmap_plugin.jobs.engines.do", lambda job, worker: Outcome(job, "done"))
+    assert len(list(in_workers([job_of(tmp_path)] * 2, count=8, threads=16))) == 2 and made == [8, 8]
 
 
 def test_workers_begin_with_what_takes_longest(tmp_path):

@@ -14,7 +14,7 @@ from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks
 from mipmap_plugin.levels.manifest import MANIFEST
-from mipmap_plugin.levels.streamed import distances, nearer, progression, viewer_settings, write_streamed
+from mipmap_plugin.levels.streamed import EXTENT, distances, nearer, progression, viewer_settings, write_streamed
 from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tiles
 
 # A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file of no bytes.
@@ -107,6 +107,13 @@ def test_levels_by_distance_are_shown_at_the_distances_that_they_were_made_for()
     assert (settings["lodBaseDistance"], settings["lodMultiplier"]) == (6.0, 1.7)
 
 
+def test_chunks_of_a_scene_in_small_units_have_an_extent(ladder, tool):
+    write_json(ladder / MANIFEST, LADDER | {"base_pixel": 0.001}, overwrite=True)
+    assert EXTENT * distances(LADDER | {"base_pixel": 0.001}, 1000)[0] < 0.5
+    words = json.loads(write_streamed(ladder, 1000).read_text())["asked"]
+    assert words[words.index("--lod-chunk-extent") + 1] == "1"
+
+
 def test_a_ladder_of_one_level_is_not_streamed(ladder, tool):
     write_json(ladder / MANIFEST, LADDER | {"switches": []}, overwrite=True)
     with pytest.raises(SettingsError, match="a single level"):
@@ -144,7 +151,7 @@ def test_streamed_sog_is_written_with_its_levels_and_settings(ladder, tool):
     made = write_streamed(ladder, 1000)
     words = json.loads(made.read_text())["asked"]
     assert words[-9:] == [word for number in range(3) for word in (str(ladder / f"level_{number}.ply"), "--tag-lod", str(number))]
-    assert words[words.index("--lod-chunk-extent") + 1] == str(int(distances(LADDER, 1000)[0] / 4))
+    assert words[words.index("--lod-chunk-extent") + 1] == str(round(EXTENT * distances(LADDER, 1000)[0]))
     assert read_chunks(made) == CHUNKS
     assert json.loads((made.parent / "playcanvas.json").read_text()) == viewer_settings(LADDER, CHUNKS, 1000)
     with pytest.raises(OutputExists):

@@ -79,6 +79,13 @@ def test_images_that_cannot_take_part_are_refused(scene):
         wrap_model(tiny.model(), backend="reference").adapt(2, images=scene)
 
 
+def test_images_of_which_none_is_adapted_to_are_refused(scene):
+    """The report would count them all the same."""
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    with pytest.raises(SettingsError, match="none of the views that are adapted to has a photograph"):
+        model.adapt(2, images=scene, steps=1, views="orbit")
+
+
 def test_a_scene_without_training_images_is_refused(tmp_path):
     model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
     with pytest.raises(SettingsError, match="there are no training images to adapt to"):

@@ -93,6 +93,22 @@ def test_what_fails_in_a_thread_fails_for_the_caller():
         list(threads.side_by_side(fail, range(4), 2))
 
 
+def test_all_threads_have_ended_when_one_fails():
+    """They write to what is the caller's."""
+    begun, ended = threading.Barrier(3), []
+
+    def work(thread):
+        begun.wait(10)
+        if thread == 1:
+            raise SettingsError("no")
+        time.sleep(0.1)
+        ended.append(thread)
+
+    with pytest.raises(SettingsError, match="no"):
+        threads.team(work, 3)
+    assert sorted(ended) == [0, 2]
+
+
 def test_torch_keeps_to_one_thread_and_gets_its_own_back():
     before = torch.get_num_threads()
     torch.set_num_threads(3)

@@ -192,7 +192,7 @@ def test_a_ladder_shows_the_level_of_the_zoom(tmp_path, base, screen):
 def test_a_ladder_by_distance_is_refused(tmp_path, base):
     """A picture of it has a level for each distance."""
     (tmp_path / "levels.json").write_text('{"by": "distance", "levels": [{"file": "level_0.ply", "distance_from": 0}]}')
-    with pytest.raises(SceneError, match="by distance.* give a file of it"):
+    with pytest.raises(SceneError, match=r"by distance.* give a file of it"):
         open_source(tmp_path, base, "reference")
 
 

@@ -34,11 +34,10 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.views import choose_views, over_band, warn_if_blind, with_times
-from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
-from mipmap_plugin.freed_memory import return_freed_memory
-from mipmap_plugin.models.base import SplatModel, effects_of
+from mipmap_plugin.models.base import SplatModel, digest_of_parameters, effects_of
 from mipmap_plugin.progress import announced
 
 # (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> True to end the run with this
@@ -78,7 +77,7 @@ class Session:
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.base.parameters()["means"].device)
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.views = over_band(self.base_views, config)
-        self.views_note += f", {len(real.cameras)} of them real images" if real else ""
+        self.views_note += f", {real.note(self.base_views)}" if real else ""
         steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
         request.images.keep_only([*self.views, *steering, *choosing])
         self.truth = PseudoTruth(request.images, scale, config, real)
@@ -113,8 +112,8 @@ class Session:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
         few = _rows(self.base) <= (self.config.most_splats or sys.maxsize)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
-            reason = "scale 1, at which the base is right as it is"
-            return Adapted(self.copy_of_base(), self._report(self.copy_of_base(), [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
+            copy, reason = self.copy_of_base(), "scale 1, at which the base is right as it is"
+            return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         warn_if_blind(self.base_views, self.base.parameters()["means"], self.truth)
         began = time.perf_counter()
         with self.phase("compilation"):
@@ -127,11 +126,11 @@ class Session:
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps"
-        _free_memory()
+        pool.release_to_system()
         self.seconds["total"] = time.perf_counter() - began
         if self.config.steps:
             run, ended_by = self._optimize(initial.copy(), resume, observe)
-            curve, states = run.curve, states | self._run_states(run, initial)
+            curve, states = run.curve, states | run.states(initial)
         return self._select(states, curve, ended_by)
 
     def _start_problem(self) -> StartProblem:
@@ -141,15 +140,6 @@ class Session:
         )  # fmt: skip
         finer = self.finer
         return from_base if finer is None else from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
-
-    def _run_states(self, run: Run, initial: SplatModel) -> dict[str, SplatModel]:
-        """The best and the last state of a run, where they differ from the start (the `initial` model) and from each other."""
-        step, states = run.steering.best_step, {}
-        if 0 < step < run.step:
-            states[f"the state after step {step}"] = run.steering.best.over(initial)
-        if not run.curve[-1].taken_back:  # otherwise the last state is the best one
-            states["the last state"] = run.student
-        return states
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
@@ -196,7 +186,7 @@ class Session:
 
         ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
         run.optimizer.state.clear()
-        _free_memory()
+        pool.release_to_system()
         self.state = keeper.remaining_file()
         self.seconds["pseudo truth"] = sum(run.costs.truths.values())
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
@@ -237,11 +227,11 @@ class Session:
 
     def _fingerprint(self) -> str:
         """A hash of everything that a run depends on, so that a state is never resumed as another run."""
-        poses = [[view.width, view.height, view.fx, view.fy, view.time, *view.viewmat.flatten().tolist()] for view in self.views]
-        base = self.base.digest or _digest(self.base)
+        base = self.base.digest or digest_of_parameters(self.base)
         targets = [asdict(target) for target in self.targets.values()]
-        base += "" if self.finer is None else _digest(self.finer.model)
-        facts = [base, self.inputs, self.scale, self.config.model_dump(), self.backend.name, asdict(self.base_effects), targets, poses]
+        base += "" if self.finer is None else digest_of_parameters(self.finer.model)
+        settings, views = self.config.model_dump(), digest_of(self.views)
+        facts = [base, self.inputs, self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
     def _psnr_per_viewer(self, model: SplatModel) -> dict[str, float]:
@@ -261,7 +251,7 @@ class Session:
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         return Report(
             scale=self.scale,
-            base=self.base.digest or _digest(self.base),
+            base=self.base.digest or digest_of_parameters(self.base),
             settings=self.config,
             backend=self.backend_note,
             views=self.views_note,
@@ -282,19 +272,5 @@ class Session:
         )
 
 
-def _free_memory() -> None:
-    """Give the system what one phase needed and the next one does not."""
-    pool.release()
-    return_freed_memory()
-
-
 def _rows(model: SplatModel) -> int:
     return len(model.parameters()["means"])
-
-
-def _digest(model: SplatModel) -> str:
-    """The sha256 of the parameters of a model that was made in memory."""
-    digest = hashlib.sha256()
-    for tensor in {**model.parameters(), **model.shared_parameters()}.values():
-        digest.update(tensor.detach().cpu().numpy().tobytes())
-    return digest.hexdigest()

@@ -136,18 +136,11 @@ def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: A
 def warn_if_blind(views: Sequence[Camera], means: Tensor, image_of: Callable[[Camera], Tensor]) -> None:
     """Warn of views that show nothing: of cameras of another scene, for example. `image_of`: a view's image [h, w, 3]."""
     some = evenly(views, LOOKED_AT)
-    if any(_sees(view, means.detach()) for view in some):
+    if any(view.in_picture(view.to_camera(means.detach())).any() for view in some):
         return
     if all(torch.equal(image, image[:1, :1].expand_as(image)) for image in map(image_of, some)):  # nor a splat whose center lies outside
         wrong = "the cameras seem to be of another scene, or in other coordinates"
         warnings.warn(f"none of the {len(views)} views shows a splat, so nothing is adapted: {wrong}; give those of this scene", stacklevel=2)
-
-
-def _sees(view: Camera, means: Tensor) -> bool:
-    """Whether a view shows one of the `means` [N, 3]."""
-    x, y, z = view.to_camera(means).unbind(-1)
-    u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
-    return bool(((z > 0) & (u > 0) & (u < view.width) & (v > 0) & (v < view.height)).any())
 
 
 def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:

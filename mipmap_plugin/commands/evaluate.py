@@ -154,14 +154,14 @@ def _scene(folder: Path, appearance: str) -> Scene:
 
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
+    if len(checkpoint) != len(images):
+        raise SettingsError(f"there are {len(checkpoint)} of CHECKPOINT and {len(images)} of --images; give one folder of images for each checkpoint")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
     read = [part for path in checkpoint for part in _parts(path)] + [file for folder in images for file in folder.glob("transforms*.json")]
     for output in outputs:
         refuse_output(output, overwrite, read, is_file=True)
         refuse_unwritable(output)
-    if len(checkpoint) != len(images):
-        raise SettingsError(f"{len(checkpoint)} checkpoints and {len(images)} folders of images; give one folder for each checkpoint")
 
 
 def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str) -> str:

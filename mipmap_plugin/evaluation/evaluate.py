@@ -203,7 +203,7 @@ def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Seque
     """The rows of each recipe, adapted to the training poses and to the evaluated ones."""
     warm = False
 
-    def adapted(name: str, on: str, judge: Evaluator) -> Row:
+    def row(name: str, on: str, judge: Evaluator) -> Row:
         nonlocal warm
         if not warm:
             warm_up(model, scale, model.cameras)
@@ -212,7 +212,7 @@ def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Seque
         return adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge)
 
     each = product(recipes, ("train", "scored"))
-    return [judge.cell({"recipe": name, "on": on, "scale": scale}, partial(adapted, name, on)) for name, on in each]
+    return [judge.cell({"recipe": name, "on": on, "scale": scale}, partial(row, name, on)) for name, on in each]
 
 
 def _views(config: AdaptConfig, on: str, judged: Sequence[TruthView]) -> dict[str, Any]:

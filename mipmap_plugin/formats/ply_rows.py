@@ -36,7 +36,8 @@ class PlyRows:
 
     def release(self) -> None:
         """Give the memory of what was read back to the system; later reads find it in the system's cache, or on the disk."""
-        self._rows._mmap.madvise(mmap.MADV_DONTNEED)
+        if hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
+            self._rows._mmap.madvise(mmap.MADV_DONTNEED)
 
 
 def body_of(path: Path, header: Header) -> int:

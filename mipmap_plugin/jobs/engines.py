@@ -26,13 +26,14 @@ def in_this_process(jobs: Sequence[Job], threads: int | None = None) -> Generato
 
 
 def in_workers(jobs: Sequence[Job], count: int, threads: int | None = None) -> Generator[Outcome, None, None]:
-    """Do the jobs in `count` processes that share `threads` threads (None: all); yield each outcome when it is there.
+    """Do the jobs in at most `count` processes that share `threads` threads (None: all); yield each outcome when it is there.
 
     Ctrl-C lets every running job save its state, and begins no other; a second one ends them at once. What was registered in this
     process at run time is unknown in others; register it by an entry point.
     """
     jobs = longest_first(jobs)
-    workers = [Worker(max(1, (threads or usable_threads()) // count)) for _ in range(min(count, len(jobs)))]
+    count = min(count, len(jobs))
+    workers = [Worker(max(1, (threads or usable_threads()) // count)) for _ in range(count)]
     free: queue.SimpleQueue[Worker] = queue.SimpleQueue()
     for worker in workers:
         free.put(worker)

@@ -99,7 +99,7 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
         raise SettingsError(SINGLE_LEVEL)
     with new_folder(folder / STREAMED, overwrite) as temporary:
         made = temporary / META
-        extent = manifest.get("chunk_extent", int(EXTENT * rising[0]))
+        extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         write_streamed_sog([folder / level["file"] for level in manifest["levels"]], made, extent)
         write_json(temporary / SETTINGS, viewer_settings(manifest, read_chunks(made), canvas), overwrite=False)
     return folder / STREAMED / META

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -161,6 +162,14 @@ def why_no_viewer(model: SplatModel) -> str:
     if not traits.same_for_all_views:
         return "its splats differ from view to view or in time, and a viewer's file holds them once and for all"
     return "it says that its files are for its own project alone" if model.trained.keeps_filter else ""
+
+
+def digest_of_parameters(model: SplatModel) -> str:
+    """The sha256 of the parameters of a model, hexadecimal: for one that was made in memory, or changed there."""
+    digest = sha256()
+    for tensor in {**model.parameters(), **model.shared_parameters()}.values():
+        digest.update(tensor.detach().cpu().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def effects_of(model: SplatModel) -> list[Effect]:

@@ -72,10 +72,10 @@ def to_columns(parameters: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
 
 
 def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Copies of the columns that 3DGS does not define, such as a confidence or a segment id."""
+    """Copies of the columns that 3DGS does not define, such as a confidence or a segment id, in this machine's byte order."""
     known = {*POSITION, *NORMAL, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
     known |= set() if DC[0] in columns else set(RGB)
-    return {name: column.copy() for name, column in columns.items() if name not in known}
+    return {name: column.astype(column.dtype.newbyteorder("=")) for name, column in columns.items() if name not in known}
 
 
 def rest_names(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:

@@ -59,6 +59,8 @@ def _recognize(path: Path) -> tuple[Checkpoint, Match]:
     family, match = _most_certain(files, claims, notes)
     if match.trouble:
         raise CheckpointError(match.trouble)
+    if files.header and not files.header.vertex.count:
+        raise CheckpointError(f"{path} holds no splats: its header declares none; export it again")
     return Checkpoint(family.name, path, files.folder, files.iteration, tuple(notes)), match
 
 

@@ -139,7 +139,7 @@ class MipModel:
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
         """Write a PLY or a model folder as `VanillaModel.save` does, with filter_3D as the last column. Raises OutputExists."""
-        finite({**self.splats.parameters(), CARRIED: self.filter_3d}, LARGEST)
+        finite({**self.splats.parameters(), CARRIED: self.filter_3d}, LARGEST)  # raises for the filter too
         filter_3d = self.filter_3d.detach().to("cpu", torch.float32).numpy()
         provenance = {**provenance, "family": self.family, "kernel_size": self.trained.eps2d}  # a bare PLY has no cfg_args
         return self.splats.with_extras({**self.splats.extras, COLUMN: filter_3d}).save(path, provenance=provenance, overwrite=overwrite)

@@ -74,7 +74,7 @@ class Scene:
             return None
         for name in (f"images_{factor}_png", f"images_{factor}"):
             within = folder.with_name(name) / first.relative_to(folder)
-            for copy in (within, within.with_suffix(".png"), within.with_name(first.name)):
+            for copy in (within, within.with_suffix(".png")):
                 if is_file(copy):
                     return _undistorted_size(image_size(copy), first, camera) if first in self.lenses else image_size(copy)
         return None

@@ -38,7 +38,8 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
     path, cfg = Path(path), cfg or {}
     entries = read_json(path)
     if not isinstance(entries, list) or not entries:
-        raise SceneError(f"{path}: is not a list of cameras; give the cameras.json that lies beside the checkpoint")
+        lacks = "lists no cameras" if entries == [] else "is not a list of cameras"
+        raise SceneError(f"{path}: {lacks}; give the cameras.json that lies beside the checkpoint")
     names = [_name(entry, f"{path}, entry {index}") for index, entry in enumerate(entries)]
     tests = count_test_cameras(names) if cfg.get("eval") else 0
     cameras = []

@@ -93,7 +93,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
     data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise SceneError(f"{file}: has no list of 'frames'; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
+        lacks = "has no list of 'frames'" if frames != [] else "lists no frames"
+        raise SceneError(f"{file}: {lacks}; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
     views: list[tuple[Camera, Path | None, Lens | None]] = []
     absent = 0
     for index, frame in enumerate(frames):

@@ -10,7 +10,6 @@ from mipmap_plugin import pool
 from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.formats.atomic import together, write_json
 from mipmap_plugin.formats.torch_file import save_torch
-from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.tiles.folder import work_folder
 
@@ -40,8 +39,7 @@ class TileJob(Job):
         scene = opened(self.base, self.scale, self.viewer, self.config(), self.target.parent)
         with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
             self._do(scene, self.target.parent)
-        pool.release()
-        return_freed_memory()
+        pool.release_to_system()
         return Outcome(self, "done", self.target, _facts(self.target))
 
     def _do(self, scene: Any, folder: Path) -> None:

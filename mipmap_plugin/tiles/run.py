@@ -28,7 +28,7 @@ from mipmap_plugin.tiles.job import TileJob, Work
 from mipmap_plugin.tiles.judge import JOINED, judged
 from mipmap_plugin.tiles.plan import claim, cut_for, refuse
 from mipmap_plugin.tiles.report import make_report
-from mipmap_plugin.tiles.scene import TiledScene, opened
+from mipmap_plugin.tiles.scene import TiledScene, close_opened, opened
 from mipmap_plugin.tiles.steering import Steered, open_state, result, sweep_of
 from mipmap_plugin.tiles.sweeps import Sweep
 from mipmap_plugin.tiles.truth import parts
@@ -94,6 +94,7 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
     files = _write_parts(scene, folder, returned)
     report = make_report(scene, files, stages.seconds, validation, returned)
     saved = _save(scene, job, files, Joined(job.target, report, facts))
+    close_opened()
     shutil.rmtree(folder)
     return saved
 

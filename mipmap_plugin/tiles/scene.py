@@ -220,6 +220,11 @@ def opened(base: Base, scale: float, viewer: str | None, config: AdaptConfig, fo
     return _opened(base, scale, viewer, config.model_dump_json(), folder, (status.st_mtime_ns, status.st_ino))
 
 
+def close_opened() -> None:
+    """Let go of the scene that is kept open, whose files are to be deleted."""
+    _opened.cache_clear()
+
+
 @lru_cache(maxsize=1)
 def _opened(base: Base, scale: float, viewer: str | None, config: str, folder: Path, _: tuple[int, int]) -> TiledScene:
     return TiledScene(base, scale, viewer, AdaptConfig.model_validate_json(config), folder)

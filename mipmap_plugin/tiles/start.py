@@ -18,7 +18,6 @@ from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.torch_file import save_torch
-from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.tiles.folder import START, start_file
@@ -45,7 +44,7 @@ class StartSearch:
         """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
         scene, config = self.scene, self.scene.config
         weights = scene.painter(scene.base_effects).blend_weights(scene.base, self.views) * scene.scale**2
-        _free_memory()
+        pool.release_to_system()
         if not (config.closed_form or config.merge_to < 1):
             return self._take_base(self.steer(scene.base))
         self._candidate("formed", weights, 1.0)
@@ -71,10 +70,10 @@ class StartSearch:
         """Write the closed form of the base after merging each core down to a fraction."""
         cores = range(len(self.scene.cores))
         wanted = torch.cat([self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores])
-        _free_memory()
+        pool.release_to_system()
         if self.matches:
             self._match(name, wanted)
-            _free_memory()
+            pool.release_to_system()
 
     def _merged(self, file: Path, core: Tensor, weights: Tensor, fraction: float) -> Tensor:
         scene = self.scene
@@ -125,12 +124,6 @@ class StartSearch:
         for number in range(len(self.scene.cores)):
             self._file(name, number).replace(start_file(self.folder, number))
         save_torch(self.folder / START, {"name": title, "psnr": psnr}, overwrite=True)
-
-
-def _free_memory() -> None:
-    """Give the system what one step needed and the next one does not."""
-    pool.release()
-    return_freed_memory()
 
 
 def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:

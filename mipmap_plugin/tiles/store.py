@@ -59,7 +59,8 @@ class Store:
 
     def release(self) -> None:
         """Give the memory of what was read back to the system; later reads find it in the system's cache, or on the disk."""
-        self._map.madvise(mmap.MADV_DONTNEED)
+        if hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
+            self._map.madvise(mmap.MADV_DONTNEED)
 
 
 def as_parameters(shapes: Tensor, sh: Tensor) -> dict[str, Tensor]:

@@ -88,7 +88,8 @@ class Adapter:
             if self.progress.running:
                 raise SettingsError("an adaptation is running; stop it first")
             self._stopping.clear()
-            self._answer, self._stepping = None, False
+            with self._talk:
+                self._answer, self._stepping = None, False
             self.progress = Progress(wish, running=True)
         self._thread = threading.Thread(target=self._run, args=(wish, then), name="adapting", daemon=True)
         self._thread.start()
@@ -158,7 +159,8 @@ class Adapter:
         return observe
 
     def _answer_with(self, render: Callable[[Camera], Tensor]) -> None:
-        camera, self._stepping = self._asked, True
+        with self._talk:
+            camera, self._stepping = self._asked, True
         if camera is None:
             return
         answer = camera, render(camera)

@@ -58,7 +58,7 @@ class Sampling:
 
     def __init__(self, means: Tensor, views: Sequence[Camera]) -> None:
         """`means`: [N, 3] world units; `views`: of the training, at its scale."""
-        self.means = means.detach()[:: max(1, len(means) // MOST_SPLATS)]
+        self.means = means.detach()[:: max(1, -(-len(means) // MOST_SPLATS))]
         self._pixels = pixel_size(self.means, views)  # in the closest view, so that most views sample more coarsely
         typical = torch.tensor([self.of(view).zoom for view in evenly(views, MOST_VIEWS)]).median()
         self._pixels = self._pixels / typical
@@ -75,10 +75,7 @@ class Sampling:
 
 def inside(means: Tensor, camera: Camera) -> Tensor:
     """Which centers [N, 3] lie inside the picture, [N] bool."""
-    x, y, z = camera.to_camera(means).unbind(-1)
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    seen: Tensor = (z > NEAR_PLANE) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
-    return seen
+    return camera.in_picture(camera.to_camera(means), NEAR_PLANE)
 
 
 def pose_of(camera: Camera, depth: float) -> Pose:

@@ -135,7 +135,7 @@ def _levels(folder: Path) -> list[tuple[float, str]]:
         by = manifest.get("by")
         found = [(float(entry["shown_from"] or 0.0), str(entry["file"])) for entry in manifest["levels"]]
     if by == "distance":
-        raise SceneError(f"{folder} holds levels by distance, several of which are in one picture; give a file of it, or make a ladder with --by zoom")
+        raise SceneError(f"{folder} holds levels by distance, several of which are in one picture; give a file of it, or make it with --by zoom")
     if not found:
         raise SceneError(f"{folder / MANIFEST}: lists no levels, or is damaged; make the ladder again with `mipmap-plugin levels`")
     return found

@@ -23,16 +23,9 @@ OVERSAMPLING = 3
 @torch.no_grad()
 def splats_in_view(means: torch.Tensor, views: Sequence[Camera], near: float) -> float:
     """The number of splats whose `means` [N, 3] lie in a view, mean of some views."""
-    some = means[:: max(1, len(means) // SPLATS)]
-    shares = [_in_frame(some, view, near) for view in evenly(views, VIEWS)]
+    some = means[:: max(1, -(-len(means) // SPLATS))]
+    shares = [float(view.in_picture(view.to_camera(some), near).float().mean()) for view in evenly(views, VIEWS)]
     return len(means) * sum(shares) / max(1, len(shares))
-
-
-def _in_frame(means: torch.Tensor, view: Camera, near: float) -> float:
-    x, y, z = view.to_camera(means).unbind(1)
-    u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
-    inside = (z > near) & (u > 0) & (u < view.width) & (v > 0) & (v < view.height)
-    return float(inside.float().mean())
 
 
 def affordable_for(config: AdaptConfig, means: torch.Tensor, views: Sequence[Camera], near: float) -> AdaptConfig:

@@ -6,12 +6,12 @@ Without it a short run spends its time on the truths of views that it hardly use
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 
+from mipmap_plugin.adaptation.curve import Stopwatch
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -45,8 +45,9 @@ class Pace:
         """The pace of a run over `student`. The truths that are made for it are used later."""
         views = task.views[:REPEATS]
         cameras = [view.zoomed(task.scale) for view in views]
-        images = [_seconds(lambda camera: task.render(student.gaussians(camera), camera), camera) for camera in cameras]
-        truths = [_seconds(task.truth, view) for view in views]
+        device = student.parameters()["means"].device
+        images = [_seconds(lambda camera: task.render(student.gaussians(camera), camera), camera, device) for camera in cameras]
+        truths = [_seconds(task.truth, view, device) for view in views]
         return cls(STEP_OVER_IMAGE * min(images), min(truths), min(images) * len(task.validation.steering))
 
     def steps(self, config: AdaptConfig, seconds: float) -> int:
@@ -69,7 +70,7 @@ def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, Adap
     return replace(task, views=evenly(task.views, views)), config.model_copy(update={"steps": steps})
 
 
-def _seconds(function: Callable[[Camera], object], camera: Camera) -> float:
-    began = time.perf_counter()
-    function(camera)
-    return time.perf_counter() - began
+def _seconds(function: Callable[[Camera], object], camera: Camera, device: torch.device) -> float:
+    with Stopwatch(device) as watch:
+        function(camera)
+    return watch.seconds

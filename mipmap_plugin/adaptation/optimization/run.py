@@ -119,3 +119,12 @@ class Run:
     def progress(self, config: AdaptConfig) -> float:
         """Fraction (0..1) of the steps that is over, or of what the start left of the time budget, whichever is larger."""
         return progress(self.step, self.watch.seconds, config, self.curve[0].seconds)
+
+    def states(self, initial: SplatModel) -> dict[str, SplatModel]:
+        """The best and the last state, where they differ from the start (the `initial` model) and from each other, by what reports call them."""
+        best, states = self.steering.best_step, {}
+        if 0 < best < self.step:
+            states[f"the state after step {best}"] = self.steering.best.over(initial)
+        if not self.curve[-1].taken_back:  # otherwise the last state is the best one
+            states["the last state"] = self.student
+        return states

@@ -153,11 +153,10 @@ def _pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
     """`pixel_size` of some of the means, in all views."""
     finest, anywhere = (torch.full_like(means[:, 0], torch.inf) for _ in range(2))
     for view in views:
-        x, y, z = view.to_camera(means).unbind(-1)
-        size = z.abs() / (view.fx * view.fy) ** 0.5
-        u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
-        inside = (z > 0) & (u > 0) & (u < view.width) & (v > 0) & (v < view.height)
-        finest = torch.where(inside, torch.minimum(finest, size), finest)
+        points = view.to_camera(means)
+        # A mean in the camera's own plane would have pixels of size 0.
+        size = points[:, 2].abs().clamp_min(torch.finfo(points.dtype).eps) / (view.fx * view.fy) ** 0.5
+        finest = torch.where(view.in_picture(points), torch.minimum(finest, size), finest)
         anywhere = torch.minimum(anywhere, size)
     return torch.where(finest.isfinite(), finest, anywhere)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
@@ -22,6 +24,13 @@ class Photographs:
         if not self._originals:
             raise SettingsError(f"{scene.source}: there are no training images to adapt to; leave them out, or give the folder that has them")
         self.cameras = list(self._originals)
+
+    def note(self, views: Sequence[Camera]) -> str:
+        """How many of the views have a photograph. Raises SettingsError if none has."""
+        count = sum(view in self._originals for view in views)
+        if not count:
+            raise SettingsError("none of the views that are adapted to has a photograph: take the train views, or leave the images out")
+        return f"{count} of them real images"
 
     def __call__(self, view: Camera) -> Tensor | None:
         """Return the image [H, W, 3] of one of `cameras`, shrunk as Pillow does; None for any other view."""

@@ -40,13 +40,13 @@ functions that it calls per splat (`memory`). Those are always inlined, because 
 from contextlib import suppress
 from pathlib import Path
 
-from mipmap_plugin.backends.cpu_kernels.compiling import inner, kernel
+from mipmap_plugin.backends.cpu_kernels.compiling import IS_KNOWN, inner, kernel
 
 __all__ = ["inner", "kernel"]
 
 
 def _forget_stale() -> None:
-    """Delete cached machine code older than any source here: numba checks only a kernel's own file, not those of the functions it calls."""
+    """Delete cached machine code older than any source here: numba itself checks only a kernel's own file, not those of the functions it calls."""
     folder = Path(__file__).parent
     newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
     for compiled in folder.glob("__pycache__/*.nb[ci]"):
@@ -55,4 +55,5 @@ def _forget_stale() -> None:
                 compiled.unlink()
 
 
-_forget_stale()
+if not IS_KNOWN:  # otherwise `compiling` sees to it
+    _forget_stale()

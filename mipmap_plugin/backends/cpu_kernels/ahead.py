@@ -9,6 +9,7 @@ import os
 import pickle
 import subprocess
 import sys
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def start(has_covariances: bool, effects: Effects) -> subprocess.Popen[bytes] | 
         return None
     process = subprocess.Popen([sys.executable, "-c", COMMAND], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     assert process.stdin is not None
-    with process.stdin as pipe:
+    with suppress(BrokenPipeError), process.stdin as pipe:  # it has failed already
         pipe.write(pickle.dumps((has_covariances, effects)))
     return process
 

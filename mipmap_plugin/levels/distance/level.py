@@ -19,7 +19,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
-from mipmap_plugin.adaptation.optimization.run import Run, Task
+from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import Validation, split_validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
@@ -30,7 +30,7 @@ from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.views import GOLDEN, choose_views
 from mipmap_plugin.backends.base import Backend
-from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.gaussians import Gaussians
@@ -40,7 +40,7 @@ from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, foreground
 from mipmap_plugin.levels.request import MERGING_COSTS, LadderRequest
-from mipmap_plugin.models.base import Rebuilt, SplatModel, effects_of
+from mipmap_plugin.models.base import Rebuilt, SplatModel, digest_of_parameters, effects_of
 from mipmap_plugin.progress import announced
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.wrap import Wrapped
@@ -178,7 +178,7 @@ class LevelRun:
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
             ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due)
-            states |= _states(run, initial)
+            states |= run.states(initial)
             curve, state, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
             self.seconds["optimization"] = run.watch.seconds - run.costs.seconds()
         best, psnrs = self.validation.choose(states)
@@ -217,17 +217,17 @@ class LevelRun:
 
     def _fingerprint(self) -> str:
         scene = self.scene
-        poses = [[view.width, view.height, view.fx, view.fy, *view.viewmat.flatten().tolist()] for view in self.views]
         finer = [float(tensor.detach().double().sum()) for model in self.finer for tensor in model.parameters().values()]
-        facts = [scene.base.model.digest, self.number, self.config.model_dump(), scene.backend.name, asdict(scene.target), asdict(scene.rule)]
-        return hashlib.sha256(json.dumps([*facts, finer, poses]).encode()).hexdigest()
+        base = scene.base.model.digest or digest_of_parameters(scene.base.model)
+        facts = [base, self.number, self.config.model_dump(), scene.backend.name, asdict(scene.target), asdict(scene.rule)]
+        return hashlib.sha256(json.dumps([*facts, finer, digest_of(self.views)]).encode()).hexdigest()
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, best: str, psnrs: dict[str, float]) -> Report:
         scene, any_camera = self.scene, self.scene.base.any_camera()
         effects = scene.base.effects()
         return Report(
             scale=scene.rule.ratio ** (0.5 - self.number),
-            base=scene.base.model.digest,
+            base=scene.base.model.digest or digest_of_parameters(scene.base.model),
             settings=self.config,
             backend=scene.note,
             views=self.views_note,
@@ -248,13 +248,3 @@ class LevelRun:
 def _most_views(config: AdaptConfig) -> int:
     """How many views are worth their truth."""
     return max(config.validation_views, config.steps * config.views_per_step // USES)
-
-
-def _states(run: Run, initial: SplatModel) -> dict[str, SplatModel]:
-    """The best and the last state of a run."""
-    step, states = run.steering.best_step, {}
-    if 0 < step < run.step:
-        states[f"the state after step {step}"] = run.steering.best.over(initial)
-    if not run.curve[-1].taken_back:
-        states["the last state"] = run.student
-    return states

@@ -42,9 +42,8 @@ def backed(view: Camera, way: float) -> Camera:
 
 def foreground(view: Camera, means: Tensor, near: float) -> float:
     """The depth of the nearest parts of a view, in world units; infinity where it sees nothing. `means` [N, 3]."""
-    x, y, z = view.to_camera(means).unbind(-1)
-    u, v = view.fx * x / z + view.cx, view.fy * y / z + view.cy
-    depths = z[(z > near) & (u > 0) & (u < view.width) & (v > 0) & (v < view.height)]
+    points = view.to_camera(means)
+    depths = points[view.in_picture(points, near), 2]
     return float(depths.kthvalue(1 + int(FOREGROUND * (len(depths) - 1))).values) if len(depths) else torch.inf
 
 

@@ -10,6 +10,8 @@ from mipmap_plugin.effects import DILATION, FRUSTUM_MARGIN, NEAR_PLANE
 
 TILE = 16  # px: the original renders in tiles of this size, and an anchor that touches the outermost tile is in view
 
+LEAST_ROOT = 0.1  # px⁴: the least value of the root's square in the original, by which nearly round anchors count as a little larger
+
 
 @torch.no_grad()
 def in_view(means: Tensor, scales: Tensor, quats: Tensor, camera: Camera) -> Tensor:
@@ -45,7 +47,7 @@ def _radius(axes: Tensor, u: Tensor, v: Tensor, depth: Tensor, camera: Camera) -
     along = camera.fy / depth[:, None] * (axes[..., 1] - v[:, None] * axes[..., 2])
     xx, yy = across.square().sum(1) + DILATION, along.square().sum(1) + DILATION
     xy = (across * along).sum(1)
-    longest = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).sqrt()
+    longest = (xx + yy) / 2 + (((xx - yy) / 2).square() + xy.square()).clamp_min(LEAST_ROOT).sqrt()
     return (3 * longest.sqrt()).ceil()
 
 
