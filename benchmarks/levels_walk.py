@@ -41,7 +41,7 @@ from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.streamed import CANVAS, distances, progression
-from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.wrap import Wrapped, state_path
 

@@ -39,6 +39,7 @@ for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backen
 def main(arguments: Sequence[str] | None = None) -> int:
     """The entry point; returns the exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
+    voice.take_any_text()
     if words == ["--version"]:
         print(f"mipmap-plugin {version('mipmap-plugin')}")
         return 0
@@ -83,6 +84,7 @@ def _our_warnings_only() -> Iterator[None]:
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
             warnings.filterwarnings("default", module=r"mipmap_plugin(\.|$)")
+        warnings.showwarning = lambda message, *_: voice.complain(f"mipmap-plugin: {message}")  # without a place in the source
         yield
 
 

@@ -34,7 +34,8 @@ from mipmap_plugin.limits import check_image, check_scale
 from mipmap_plugin.models.base import Filtered, Placed, SplatModel, TrainedScale, why_no_viewer
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
-from mipmap_plugin.models.outputs import REPORT, parts_of
+from mipmap_plugin.models.outputs import parts_of
+from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.filters import INTEGRALS, USUAL_EPS2D

@@ -142,7 +142,7 @@ def _spz(path: Path) -> Path:
 
 
 def _folder(path: Path) -> Path:
-    tiny.folder(path, tiny.cameras(3), count=20)
+    tiny.folder(path.with_name("made"), tiny.cameras(3), count=20).rename(path)  # no model is saved to the name of another file
     (path / "cfg_args").write_text("Namespace(sh_degree=1, resolution=2, white_background=True, images='images_2', kernel_size=0.1, eval=True)")
     identity = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.0]]
     (path / "exposure.json").write_text(json.dumps({"view_0": identity, "view_1": identity}))

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -97,6 +98,39 @@ def test_inspect_doubts_a_file_of_another_convention(run, tmp_path):
     columns["opacity"][:] = 0.5
     write_ply(tmp_path / "b.ply", columns)
     assert "\nverdict:      doubtful: read health before you adapt it\n" in run("inspect", tmp_path / "b.ply")[1]
+
+
+def test_splats_that_are_left_out_are_told_of(run, tmp_path):
+    """Whatever the command, and in the log: what is drawn is not all of the file."""
+    columns = read_ply(tiny.ply(tmp_path / "a.ply", count=20)).columns
+    columns["x"][:3] = np.nan
+    write_ply(tmp_path / "b.ply", columns)
+    said = f"mipmap-plugin: {tmp_path / 'b.ply'}: 3 of 20 splats were dropped: 3 of 20 splats hold a NaN in means\n"
+    assert "\nverdict:      doubtful: 3 of 20 splats were dropped" in run("inspect", tmp_path / "b.ply", "--no-viewers")[1]
+    words = ["adapt", tmp_path / "b.ply", "--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--log", tmp_path / "log"]
+    assert said in run(*words)[2]
+    assert "3 of 20 splats were dropped" in (tmp_path / "log").read_text()
+
+
+@pytest.mark.parametrize("option", ["--scale", "--output"])
+def test_an_output_that_names_a_file_becomes_no_folder(run, tmp_path, option):
+    ply = tiny.ply(tmp_path / "a.ply")
+    if option == "--scale":  # several files
+        refused(run("adapt", ply, "--scale", "1/2", "--scale", "1/4", "--output", tmp_path / "b.ply"), "several files are written there")
+    else:
+        refused(run("adapt", ply, "--scale", "1/2", "--output", tmp_path / "b.pt"), "not written as .pt; give a .ply, or the path of a folder")
+    assert not [*tmp_path.glob("b*")]
+
+
+def test_a_wrong_scale_of_render_is_named(run, model_folder):
+    code, _, err = run("render", model_folder, "--output", "out", "--scale", "0")
+    assert code == 2 and "scale must be from 1e-09 to 10000" in err and "Annotated" not in err
+
+
+def test_a_folder_of_a_base_and_its_adaptations_is_the_base(run, tmp_path):
+    ply = tiny.ply(tmp_path / "a.ply")
+    assert run("adapt", ply, "--scale", "1/2", "--recipe", "instant", "--backend", "reference")[0] == 0
+    assert f"file:         {ply}\n" in run("inspect", tmp_path, "--no-viewers")[1]
 
 
 def test_inspect_as_json(run, tmp_path):
@@ -250,9 +284,9 @@ def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, mode
 
 
 def test_picture_names_are_unique_and_stay_in_their_folder():
-    given = [("a", "train"), ("a", "train"), ("a", "test"), ("../../b", "test"), ("c\\d", "train")]
+    given = [("a", "train"), ("a", "train"), ("a", "test"), ("../../b", "test"), ("c\\d", "train"), ("a_2", "train")]
     named = [replace(tiny.cameras(1)[0], name=name, split=split) for name, split in given]
-    assert picture_names(named) == ["train_a_1.png", "train_a_2.png", "test_a.png", "test_.._.._b.png", "train_c_d.png"]
+    assert picture_names(named) == ["train_a_1.png", "train_a_3.png", "test_a.png", "test_.._.._b.png", "train_c_d.png", "train_a_2.png"]
 
 
 # evaluate

@@ -97,6 +97,15 @@ def test_compressed_ply_is_recognized_by_its_columns(tmp_path, tool):
     assert tool_request(tool)[1].endswith(".compressed.ply")
 
 
+def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        archive.writestr("meta.json", json.dumps({"version": 2, "means": {"files": ["means_l.webp"]}}))
+        archive.writestr("means_l.webp", b"abcd")
+    (tmp_path / "a.sog").write_bytes((tmp_path / "a.sog").read_bytes().replace(b"abcd", b"abce"))
+    with pytest.raises(CheckpointError, match=r"is damaged \(the checksum of means_l.webp is wrong\)"):
+        load_model(tmp_path / "a.sog")
+
+
 @pytest.mark.parametrize("where", ["a.sog", "room", "room/meta.json"])
 def test_sog_as_a_file_and_as_a_folder(tmp_path, tool, where):
     meta = json.dumps({"version": 2, "means": {"files": ["means_l.webp", "means_u.webp"]}})

@@ -206,4 +206,4 @@ def test_a_detour_through_a_folder_that_is_missing_does_not_hide_what_is_there(t
         refuse_output(target, overwrite=False)
     with pytest.raises(OutputExists, match=r"holds the base|is the base|other things|is a file"):
         refuse_output(target, overwrite=True, base=[tmp_path / "there.ply"], is_file=False)
-        refuse_to_lose(target, None, "point_cloud")
+        refuse_to_lose(target, None, "point_cloud", ["point_cloud/*"])

@@ -63,8 +63,7 @@ def test_poison_in_one_row_is_dropped_at_load_with_a_note(tmp_path, field, value
     if (field == "opacities" and not math.isnan(value)) or (field == "scales" and value == -math.inf):  # opacity 0 or 1, length 0
         assert len(model) == 8 and not model.notes
         return
-    assert model.notes[0] == "1 of 8 splats were dropped"
-    assert f"1 of 8 splats hold {'a NaN' if math.isnan(value) else 'an infinity'} in {field}" in model.notes[1]
+    assert model.notes[0] == f"1 of 8 splats was dropped: 1 of 8 splats hold {'a NaN' if math.isnan(value) else 'an infinity'} in {field}"
     rows = [i for i in range(8) if i != 3]
     np.testing.assert_array_equal(model.parameters()["means"], np.stack([columns[axis][rows] for axis in "xyz"], 1))
 
@@ -104,10 +103,11 @@ def test_nearly_empty_models(count):
 
 def test_drop_takes_rows_of_every_field_and_of_extra_columns(tmp_path):
     model = load_vanilla(write(tmp_path / "a.ply", {**splat_columns(4), "segment": np.arange(4, dtype=np.int32)}))
-    left = drop(model, torch.tensor([False, True, False, True]))
+    with pytest.warns(UserWarning, match="here: 2 of 4 splats were dropped: too dark"):
+        left = drop(model, torch.tensor([False, True, False, True]), "too dark", "here")
     saved = load_vanilla(left.save(tmp_path / "b.ply", provenance={}))
     assert len(model) == 4 and model.notes == ["extra columns are carried along: segment"]
-    assert left.notes[-1] == "2 of 4 splats were dropped"
+    assert left.notes[-1] == "2 of 4 splats were dropped: too dark"
     assert saved._origin.extras["segment"].tolist() == [0, 2]
     assert torch.equal(left.parameters()["shN"], model.parameters()["shN"][[0, 2]])
 

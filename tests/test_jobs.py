@@ -392,6 +392,14 @@ def test_out_of_memory_is_one_sentence(tmp_path, monkeypatch):
 # Workers
 
 
+def test_a_list_of_another_editor_is_read_and_an_empty_one_is_named(tmp_path):
+    (tmp_path / "list").write_bytes(b"\xef\xbb\xbfa.ply\r\n")
+    assert read_list(tmp_path / "list") == [Path("a.ply")]
+    (tmp_path / "list").write_text("# nothing yet\n")
+    with pytest.raises(SettingsError, match="list lists no checkpoint"):
+        read_list(tmp_path / "list")
+
+
 def test_workers_share_all_threads_where_jobs_are_few(tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr("mipmap_plugin.jobs.engines.Worker", lambda threads: made.append(threads) or SimpleNamespace(stop=list, close=list))

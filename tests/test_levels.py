@@ -269,6 +269,9 @@ def test_a_saved_ladder_says_what_it_is(tmp_path):
     assert [point["zoom"] for point in manifest["curve"]] == sorted((point["zoom"] for point in manifest["curve"]), reverse=True)
     with pytest.raises(OutputExists, match="exists already"):
         write_ladder(Contents(request(), base, [], [], []), saved, overwrite=False)
+    (saved / "notes.txt").write_text("mine")
+    with pytest.raises(OutputExists, match=r"has other things in it, such as notes.txt"):
+        write_ladder(Contents(request(), base, [], [], []), saved, overwrite=True)
 
 
 def test_a_folder_that_is_no_ladder_is_never_replaced(tmp_path, capsys):

@@ -22,6 +22,8 @@ STAND_IN = """#!{python}
 import json, pathlib, sys
 if sys.argv[1:] == ["--list-gpus"]:
     sys.exit(print({cards!r}))
+if sys.argv[1:] == ["--version"]:
+    sys.exit(print("3.7.0"))
 *words, target = sys.argv[1:]
 print("splat-transform v3.7.0\\n    ▸ [1/2] 0_0\\n    ▸ [2/2] 1_0", file=sys.stderr)
 if any(word.endswith(".ply") and not pathlib.Path(word).stat().st_size for word in words):

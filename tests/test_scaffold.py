@@ -371,7 +371,7 @@ def test_anchors_that_are_not_finite_are_dropped_and_counted(tmp_path):
     columns["f_anchor_feat_2"][5], columns["scale_4"][7] = np.nan, 200
     model = load(tmp_path, f_anchor_feat_2=columns["f_anchor_feat_2"], scale_4=columns["scale_4"])
     assert len(model) == 38
-    assert "2 of 40 anchors are not finite and were dropped" in model.notes
+    assert "2 of 40 anchors were dropped: not finite" in model.notes
     assert all(bool(held.isfinite().all()) for held in (model.gaussians(VIEWS[0]).means, model.gaussians(VIEWS[0]).scales))
 
 

@@ -336,6 +336,10 @@ def test_only_a_model_folder_is_replaced_and_only_with_the_option(tmp_path):
     assert len(load_model(tmp_path / "out")) == 2
     new.save(tmp_path / "out", provenance={}, overwrite=True)
     assert len(load_model(tmp_path / "out")) == 3
+    (tmp_path / "out/notes").mkdir()
+    (tmp_path / "out/notes/mine.txt").touch()
+    with pytest.raises(OutputExists, match=r"has other things in it, such as notes/mine.txt"):
+        new.save(tmp_path / "out", provenance={}, overwrite=True)
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/1.jpg").touch()
     with pytest.raises(OutputExists, match="other things in it"):

@@ -1,7 +1,9 @@
 """What commands say: quiet or not, and in a log."""
 
 import contextlib
+import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -112,3 +114,15 @@ def test_whoever_stops_reading_ends_the_command_in_silence(base):
         process.stdout.close()
         assert process.stderr.read() == ""
     assert process.returncode == 141
+
+
+@pytest.mark.parametrize("closed", ["", "2>&-", ">&- 2>&- <&-"])
+def test_any_name_and_any_closed_stream_are_coped_with(tmp_path, closed):
+    """In an encoding that lacks what a sentence has, and a name that is no text."""
+    file = os.fsencode(tmp_path) + b"/\xff\xc3.ply"
+    os.rename(tiny.ply(tmp_path / "a.ply"), file)
+    line = b"exec " + shlex.quote(sys.executable).encode() + b" -m mipmap_plugin.cli inspect " + file + b" --no-viewers --log log " + closed.encode()
+    settings = {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
+    done = subprocess.run(["sh", "-c", line], cwd=tmp_path, env={**os.environ, **settings}, capture_output=True, check=False)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr
+    assert "verdict:" in (tmp_path / "log").read_text()

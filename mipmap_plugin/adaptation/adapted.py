@@ -21,7 +21,7 @@ from mipmap_plugin.formats.atomic import together, write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.models.exposure import exposed
-from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.models.places import REPORT
 
 
 @dataclass(frozen=True, eq=False, repr=False)

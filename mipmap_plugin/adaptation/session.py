@@ -33,7 +33,7 @@ from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
-from mipmap_plugin.adaptation.views import choose_views, over_band, warn_if_blind, with_times
+from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, with_times
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
@@ -114,7 +114,7 @@ class Session:
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self.copy_of_base(), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        warn_if_blind(self.base_views, self.base.parameters()["means"], self.truth)
+        refuse_blind(self.base_views, self.base.parameters()["means"], self.truth)
         began = time.perf_counter()
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())

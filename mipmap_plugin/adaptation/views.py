@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import accumulate
@@ -133,14 +132,14 @@ def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: A
     return views, f"the {len(views)} {split} views"
 
 
-def warn_if_blind(views: Sequence[Camera], means: Tensor, image_of: Callable[[Camera], Tensor]) -> None:
-    """Warn of views that show nothing: of cameras of another scene, for example. `image_of`: a view's image [h, w, 3]."""
+def refuse_blind(views: Sequence[Camera], means: Tensor, image_of: Callable[[Camera], Tensor]) -> None:
+    """Raise SettingsError for views that show nothing: of cameras of another scene, for example. `image_of`: a view's image [h, w, 3]."""
     some = evenly(views, LOOKED_AT)
     if any(view.in_picture(view.to_camera(means.detach())).any() for view in some):
         return
     if all(torch.equal(image, image[:1, :1].expand_as(image)) for image in map(image_of, some)):  # nor a splat whose center lies outside
         wrong = "the cameras seem to be of another scene, or in other coordinates"
-        warnings.warn(f"none of the {len(views)} views shows a splat, so nothing is adapted: {wrong}; give those of this scene", stacklevel=2)
+        raise SettingsError(f"none of the {len(views)} views shows a splat: {wrong}; give those of this scene")
 
 
 def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:

@@ -69,7 +69,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
     return {
-        "verdict": _verdict(checkpoint, health),
+        "verdict": _verdict(checkpoint, health, model.notes),
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
@@ -85,8 +85,12 @@ def _differences(wrapped: Wrapped) -> str:
     return viewer_differences(wrapped)
 
 
-def _verdict(checkpoint: Path, health: Health) -> str:
-    """Whether the checkpoint is sound, and what to do with it."""
+def _verdict(checkpoint: Path, health: Health, notes: Sequence[str]) -> str:
+    """Whether the checkpoint is sound, and what to do with it. `notes`: on loading it."""
+    from mipmap_plugin.models.health import DROPPED
+
+    if lost := next((note for note in notes if DROPPED in note), None):
+        return f"doubtful: {lost}; train or export it again, or adapt what is left"
     advice = f"mipmap-plugin adapt {shlex.quote(str(checkpoint))} --scale 1/4"
     remarks = len(health.sentences())
     noted = f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""

@@ -23,7 +23,7 @@ class Log:
         self._path = path
         self._file: TextIO | None
         try:
-            self._file = path.open("a", encoding="utf-8") if _may_be_a_log(path) else None
+            self._file = path.open("a", encoding="utf-8", errors="backslashreplace") if _may_be_a_log(path) else None
         except (OSError, ValueError) as error:
             raise OutputError(f"{path} cannot be written ({error}); give --log another file") from error
         if self._file is None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from itertools import count as count_from
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.splat_transform import READ_ONLY, WRITTEN
 
 if TYPE_CHECKING:
@@ -15,7 +18,7 @@ if TYPE_CHECKING:
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:
     """The path of an adapted model: beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark, or `output`; a folder for all if `several`.
 
-    Exchange formats that can only be read are written as a PLY.
+    Exchange formats that can only be read are written as a PLY. Raises SettingsError for a folder with the name of a file.
     """
     checkpoint_name = checkpoint.resolve().name
     known = (*WRITTEN, ".ply", *READ_ONLY) if checkpoint.is_file() or checkpoint.suffix == ".ply" else ()
@@ -24,11 +27,18 @@ def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: st
     name = f"{checkpoint_name[: len(checkpoint_name) - len(suffix)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
     if output is None:
         return checkpoint.resolve().parent / name
+    if several and output.name.lower().endswith((".ply", *WRITTEN)):
+        raise SettingsError(f"{output}: several files are written there; give the path of a folder")
     return output / name if several else output
 
 
 def picture_names(views: Sequence[Camera]) -> list[str]:
     """The name of a PNG file for each view, unique and without a folder; views of the same name are numbered."""
     names = [f"{view.split}_{view.name}".replace("/", "_").replace("\\", "_") for view in views]
-    numbers = [f"_{names[:i].count(name) + 1}" if names.count(name) > 1 else "" for i, name in enumerate(names)]
-    return [f"{name}{number}.png" for name, number in zip(names, numbers, strict=True)]
+    counts = Counter(names)
+    taken = set(counts)
+    for i, name in enumerate(names):
+        if counts[name] > 1:
+            names[i] = next(numbered for number in count_from(1) if (numbered := f"{name}_{number}") not in taken)
+            taken.add(names[i])
+    return [f"{name}.png" for name in names]

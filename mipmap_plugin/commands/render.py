@@ -10,7 +10,7 @@ import tyro
 
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.commands.outputs import picture_names
-from mipmap_plugin.commands.types import Background, Checkpoint, Scale
+from mipmap_plugin.commands.types import Background, Checkpoint, OwnScale
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def render(
     checkpoint: Checkpoint,
     output: Path,
-    scale: Scale | None = None,
+    scale: OwnScale = None,
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     screen_filter: Literal["trained", "scaled"] | Name = "trained",
     viewer: str | None = None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -32,16 +32,15 @@ def unique_scales(scales: Sequence[float]) -> list[float]:
     return list(dict.fromkeys(scales))
 
 
-Scale = Annotated[
-    float,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="1/4|4",
-        instance_from_str=lambda words: read_scale(words[0]),
-        is_instance=lambda value: isinstance(value, float),
-        str_from_instance=lambda value: [f"{value:g}"],
-    ),
-]
+_SCALE = tyro.constructors.PrimitiveConstructorSpec[Any](
+    nargs=1,
+    metavar="1/4|4",
+    instance_from_str=lambda words: read_scale(words[0]),
+    is_instance=lambda value: value is None or isinstance(value, float),
+    str_from_instance=lambda value: [f"{value:g}" if value else "its own"],
+)
+Scale = Annotated[float, _SCALE]
+OwnScale = Annotated[float | None, _SCALE]  # None: that of the file
 Scales = tyro.conf.UseAppendAction[list[Scale]]
 Background = Literal["white", "black"]
 ScreenFilter = TrainedName

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -61,7 +62,17 @@ def detail(text: str) -> None:
 def complain(text: str) -> None:
     """Print what went wrong on standard error, quiet or not; also write it to the log."""
     VOICE.get().write(text.strip())
-    print(text, file=sys.stderr)
+    with contextlib.suppress(OSError):  # the exit code says it too
+        print(text, file=sys.stderr)
+
+
+def take_any_text() -> None:
+    """Print also what the terminal's encoding lacks, such as names of files that are no text; and nothing where a stream is closed."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8", errors="replace"))  # noqa: SIM115  for as long as the process lives
+        elif isinstance(stream := getattr(sys, name), io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def options(words: Sequence[str]) -> tuple[list[str], bool, Path | None]:

@@ -12,6 +12,7 @@ import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -209,15 +210,18 @@ def sha256(*paths: Path) -> str:
     return digest.hexdigest()
 
 
-def refuse_to_lose(target: Path, source: Path | None, holds: str) -> None:
-    """Raise OutputExists if the folder `target` holds the base checkpoint, or is not a model folder, which has a subfolder `holds`.
+def refuse_to_lose(target: Path, source: Path | None, holds: str, ours: Iterable[str]) -> None:
+    """Raise OutputExists if the folder `target` holds the base checkpoint, is of another kind, or has other things in it.
 
-    Replacing a folder deletes its contents.
+    Replacing a folder deletes its contents. `holds`: what a folder of this kind has. `ours`: patterns (fnmatch) of its files' paths in it.
     """
     place = absolute(target)
     if source is not None and place.is_dir() and any(os.path.samestat(place.stat(), each) for each in _around(source / "x", folders=True)):
         raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
-    if place.is_dir() and any(place.iterdir()) and not (place / holds).is_dir():
+    if place.is_dir() and any(place.iterdir()) and not (place / holds).exists():
         raise OutputExists(f"{target} is a folder with other things in it, which --overwrite would delete; choose another folder")
+    files = (file.relative_to(place).as_posix() for file in place.rglob("*") if file.is_symlink() or not file.is_dir())
+    if other := next((name for name in files if not any(fnmatchcase(name, pattern) for pattern in ours)), None):
+        raise OutputExists(f"{target} has other things in it, such as {other}, which --overwrite would delete; move them, or choose another folder")
     if place.is_file():
         raise OutputExists(f"{target} is a file; choose another folder, or the path of a file")

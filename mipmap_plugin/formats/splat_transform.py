@@ -10,6 +10,8 @@ import re
 import shutil
 import subprocess
 import tempfile
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,6 +35,9 @@ READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRI
 
 # SOG, by itself or as a ladder with a lod-meta.json, and the oldest version of splat-transform that knows the options of `table_options`.
 WITH_TABLES, OLDEST_WITH_TABLES = (".sog", ".json"), 3
+
+# Suffixes of other files: who asks for one does not expect a folder of that name.
+OF_FILES = (".pt", ".pth", ".ckpt", ".npz", ".npy", ".glb", ".gltf", ".obj", ".usd", ".usdz", ".html", ".json", ".csv", ".txt", ".zip", ".png")
 
 TOOL = "splat-transform"
 INSTALL = "npm install -g @playcanvas/splat-transform"
@@ -73,10 +78,11 @@ def _version(tool: Sequence[str]) -> str:
 
 
 def refuse_as_folder(path: Path) -> None:
-    """Raise SettingsError for a folder whose name has the suffix of an exchange format."""
-    for name, ending in EXCHANGE.values():
+    """Raise SettingsError for a folder whose name has the suffix of an exchange format, or of another file."""
+    names = {ending: name for name, ending in EXCHANGE.values()}
+    for ending in (*names, *OF_FILES):
         if path.name.lower().endswith(ending):
-            raise SettingsError(f"{path}: this model is not written as {name}; give a .ply, or the path of a folder")
+            raise SettingsError(f"{path}: this model is not written as {names.get(ending, ending)}; give a .ply, or the path of a folder")
 
 
 @contextmanager
@@ -89,6 +95,8 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
     tool = find_tool()
     if tool is None:
         raise CheckpointError(f"{path} is {name}, an exchange format, which {TOOL} reads, but {TOOL} is not installed; run: {INSTALL}")
+    if reason := _damage(path):
+        raise CheckpointError(f"{path} is damaged ({reason}); download or export it again")
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
         source = path.absolute()
         if not (path.suffix == ".json" or path.name.lower().endswith(ending)):  # an unpacked SOG is recognized by the name of its meta.json
@@ -98,6 +106,18 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
         if reason := _run(tool, [source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
         yield plain
+
+
+def _damage(path: Path) -> str:
+    """What is wrong with a file that is a zip archive, as a SOG is; "" if nothing. The tool does not look at its checksums."""
+    if not zipfile.is_zipfile(path):
+        return ""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            wrong = archive.testzip()
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError) as error:
+        return str(error)
+    return f"the checksum of {wrong} is wrong" if wrong else ""
 
 
 def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool) -> Path:

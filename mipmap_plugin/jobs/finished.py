@@ -19,7 +19,7 @@ from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.jobs.job import Job
 from mipmap_plugin.models import detect
-from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.splatting.viewers import viewers_for

@@ -15,11 +15,14 @@ Item = TypeVar("Item")
 def read_list(path: Path) -> list[Path]:
     """The checkpoints or patterns in a text file, one a line; what follows a # is a comment. Raises SettingsError."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise SettingsError(f"{path}: {reason}; --list takes a text file with a checkpoint on each line") from None
-    return [Path(text) for line in lines if (text := line.partition("#")[0].strip())]
+    found = [Path(text) for line in lines if (text := line.partition("#")[0].strip())]
+    if not found:
+        raise SettingsError(f"{path} lists no checkpoint; write one on each line")
+    return found
 
 
 def find_checkpoints(given: Iterable[Path]) -> list[Path]:

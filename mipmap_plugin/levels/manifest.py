@@ -12,10 +12,14 @@ from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lo
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.yardstick import TRUTH
+from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.wrap import Wrapped
 
 MANIFEST = "levels.json"
 FORMAT = "mipmap_plugin levels 1"
+
+# What is written into the folder of a ladder, also by what converts one.
+WRITTEN = (MANIFEST, "level_*.ply", f"level_*.ply{REPORT}", "report.html", "streamed/*", "tiles/*")
 
 
 def level_name(number: int) -> str:
@@ -24,11 +28,10 @@ def level_name(number: int) -> str:
 
 
 def refuse_ladder(folder: Path, base: Wrapped, *, overwrite: bool) -> None:
-    """Raise what writing a ladder to `folder` would raise. A folder that is no ladder is never replaced. Raises OutputExists, OutputError."""
+    """Raise what writing a ladder to `folder` would raise. A folder with other things in it is never replaced. Raises OutputExists, OutputError."""
     source = base.model.source
     refuse_output(folder, overwrite, [] if source is None else [source])
-    if not (folder / MANIFEST).is_file():
-        refuse_to_lose(folder, base.model.folder, MANIFEST)
+    refuse_to_lose(folder, base.model.folder, MANIFEST, WRITTEN)
 
 
 def write_ladder(ladder: Contents, folder: Path, overwrite: bool) -> Path:

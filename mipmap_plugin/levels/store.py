@@ -18,7 +18,7 @@ from mipmap_plugin.formats.atomic import json_text, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.wrap import Wrapped, state_path
 
 REQUEST = "request.json"

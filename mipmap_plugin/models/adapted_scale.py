@@ -8,7 +8,7 @@ from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.tags import provenance_of
-from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.models.places import REPORT
 
 
 def adapted_scale(source: Path | None) -> float | None:

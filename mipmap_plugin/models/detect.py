@@ -11,6 +11,7 @@ from mipmap_plugin.errors import CheckpointError, PluginError
 from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.models.families import FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import Family, Files, Match
+from mipmap_plugin.models.places import REPORT
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,7 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
     clouds = sorted(folder.glob("*.ply"))
+    clouds = [cloud for cloud in clouds if not cloud.with_name(cloud.name + REPORT).exists()] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
     if len(clouds) == 1:

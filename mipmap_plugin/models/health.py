@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, TypeVar
 
 import torch
@@ -37,6 +39,9 @@ LARGEST = 1e12
 
 # Rows that are examined together, so that there is no second copy of all.
 CHUNK = 1 << 17
+
+# The word in notes on rows that are left out.
+DROPPED = "dropped"
 
 # With fewer splats than this, the distribution of a parameter is not judged.
 MIN_DISTRIBUTION = 100
@@ -109,11 +114,19 @@ def examine(model: SplatModel) -> Health:
     )
 
 
-def drop(model: Model, mask: Tensor) -> Model:
-    """A new model without the rows where `mask` [N] is True, with a note of their number."""
+def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Model:
+    """A new model without the rows where `mask` [N] is True, with a note and a warning of their number. `source`: where they come from."""
     kept = model.keep_rows(~mask)
-    kept.notes.append(f"{int(mask.sum()):,} of {len(mask):,} splats were dropped")
+    kept.notes.append(dropped(mask, "splats", why, source))
     return kept
+
+
+def dropped(mask: Tensor, rows: str, why: str, source: Path | str | None) -> str:
+    """The note that the `rows` where `mask` [N] is True are left out, which is also a warning: what is drawn is not all of the file."""
+    count = int(mask.sum())
+    note = f"{count:,} of {len(mask):,} {rows} {'was' if count == 1 else 'were'} {DROPPED}: {why}"
+    warnings.warn(f"{source or 'this model'}: {note}", stacklevel=2)
+    return note
 
 
 def _invalid(raw: dict[str, Tensor], scales: Tensor, opacities: Tensor) -> Tensor:

@@ -160,8 +160,7 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
     if invalid.all():
         raise CheckpointError(f"{checkpoint.path}: none of its {len(splats):,} splats has a valid {COLUMN}; export it again")
     if invalid.any():
-        splats = drop(splats, invalid)
-        splats.notes.append(f"these had an invalid {COLUMN}")
+        splats = drop(splats, invalid, f"an invalid {COLUMN}", checkpoint.path)
     filter_3d = torch.from_numpy(splats.extras[COLUMN]).float()
     splats = splats.with_extras({name: column for name, column in splats.extras.items() if name != COLUMN})
     splats.trained = _trained(checkpoint.family, splats.trained)

@@ -16,11 +16,16 @@ from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import refuse_as_folder
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.places import REPORT
 
 # Subfolders in which the supported projects keep parts of a checkpoint.
 PARTS = ("point_cloud", "deform", "ckpts", "nerfstudio_models")
 
-REPORT = ".adaptation.json"
+# What is written into a model folder, of all families.
+WRITTEN = (
+    "cfg_args", "cameras.json", "input.ply", "exposure.json", "cfg.yml", "config.yml", "dataparser_transforms.json", "ckpts/*.pt",
+    "nerfstudio_models/*.ckpt", "deform/*/deform.pth", "point_cloud/*/point_cloud.ply", "point_cloud/*/*.pt", "point_cloud/*/*.pth", f"*{REPORT}",
+)  # fmt: skip
 
 # Rows that are checked together, so that there is no second copy of all.
 CHUNK = 1 << 17
@@ -48,7 +53,7 @@ def refuse_parts(path: Path, overwrite: bool, source: Path | None, folder: Path 
     refuse_output(path, overwrite, parts_of(source, folder), is_file=holds is None)
     if holds is not None:
         refuse_as_folder(path)
-        refuse_to_lose(path, source if folder is None else folder, holds)
+        refuse_to_lose(path, source if folder is None else folder, holds, WRITTEN)
         place = absolute(path)
         if not is_adapted(place) and any(map(_is_of_a_training, place.glob("point_cloud/*/point_cloud.ply"))):
             raise OutputExists(f"{path} holds a trained model, which --overwrite would delete; choose another folder")

@@ -9,6 +9,9 @@ from pathlib import Path
 GSPLAT = ("ckpts", r"ckpt_(?P<step>\d+)(?:_rank(?P<rank>\d+))?\.pt")
 SPLATFACTO = ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")
 
+# What is appended to the name of an adapted file, for the report that lies beside it.
+REPORT = ".adaptation.json"
+
 # Which files of a model folder are the networks of a moving scene.
 NETWORKS = {"4dgs": "point_cloud/*iteration_*/deformation.pth", "deformable": "deform/iteration_*/deform.pth"}
 

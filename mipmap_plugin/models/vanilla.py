@@ -281,8 +281,7 @@ def without_invalid(model: Model) -> Model:
     if not health.invalid.any():
         return model
     if health.invalid.all():
-        raise CheckpointError(f"{model.source or 'this model'}: none of its {health.splats:,} splats is finite; the training or the export failed")
-    model = drop(model, health.invalid)
-    reasons = health.non_finite() or [f"they were not finite once activated, or above {LARGEST:g}"]
-    model.notes.append("found while loading: " + "; ".join(reasons))
-    return model
+        what = f"none of its {health.splats:,} splats is finite once activated, and below {LARGEST:g}"
+        raise CheckpointError(f"{model.source or 'this model'}: {what}; the training or the export failed")
+    reasons = health.non_finite() or [f"not finite once activated, or above {LARGEST:g}"]
+    return drop(model, health.invalid, "; ".join(reasons), model.source)

@@ -21,7 +21,7 @@ from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
-from mipmap_plugin.models.outputs import REPORT
+from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work

@@ -128,7 +128,7 @@ def test_a_live_model_loses_the_rows_that_a_file_would_lose(tmp_path, values):
     live = poisoned(values)
     columns = live.gaussians()  # the object itself stays as it is
     read = wrap_model(live, cameras=tiny.cameras(2), backend="reference")
-    assert len(read.model) == 9 and len(live) == 10 and any("1 of 10 splats were dropped" in note for note in read.model.notes)
+    assert len(read.model) == 9 and len(live) == 10 and any("1 of 10 splats was dropped" in note for note in read.model.notes)
     assert read.render(read.cameras[0]).image.isfinite().all() and columns.means.shape == (10, 3)
     dictionary = wrap_model(dict(live.parameters()), cameras=tiny.cameras(2), backend="reference")
     assert len(dictionary.model) == 9

@@ -14,13 +14,10 @@ from test_families import FAMILIES
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 VIEWS = tiny.cameras(3, width=8, height=6)
-HALF_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-AWAY = VIEWS[0].looking_from(HALF_TURN @ VIEWS[0].viewmat, "away")  # everything is behind it
 SMALL = [view.resized(2, 1) for view in VIEWS]
 
 # Cameras, scale and settings, on top of two steps on the given views.
 SITUATIONS = {
-    "no gradient": ([AWAY], 1 / 4, {}),
     "everything pruned": (VIEWS, 1 / 4, dict(min_opacity=0.9999, prune_every=1)),
     "one view": (VIEWS[:1], 1 / 4, {}),
     "one view twice": (VIEWS[:1] * 2, 4, {}),

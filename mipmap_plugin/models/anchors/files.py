@@ -20,7 +20,7 @@ from mipmap_plugin.models.anchors.networks import Weights, check_networks, read_
 from mipmap_plugin.models.base import CARRIED, TrainedScale
 from mipmap_plugin.models.columns import NORMAL, POSITION, QUATERNION, numbered, stacked
 from mipmap_plugin.models.detect import Checkpoint, detect_as
-from mipmap_plugin.models.health import LARGEST
+from mipmap_plugin.models.health import LARGEST, dropped
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.vanilla import Origin
 
@@ -153,5 +153,4 @@ def _finite(parameters: dict[str, Tensor], where: Path | str) -> tuple[dict[str,
         return parameters, []
     if not valid.any():
         raise CheckpointError(f"{where}: none of its {len(valid):,} anchors is finite; the training or the export failed")
-    note = f"{int((~valid).sum()):,} of {len(valid):,} anchors are not finite and were dropped"
-    return {name: tensor[valid] for name, tensor in parameters.items()}, [note]
+    return {name: tensor[valid] for name, tensor in parameters.items()}, [dropped(~valid, "anchors", "not finite", where)]

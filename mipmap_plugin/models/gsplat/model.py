@@ -141,7 +141,9 @@ def _parameters(splats: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
     if {"features", "colors"} & set(named):
         advice = "train without app_opt, or export a PLY from gsplat (save_ply), which bakes one appearance"
         raise CheckpointError(f"{path} was trained with app_opt: a network of gsplat colors its splats, which is not read here; {advice}")
-    if set(named) != set(NAMES) or not all(torch.is_tensor(tensor) for tensor in named.values()):
+    if set(named) == set(NAMES) and (wrong := [name for name, value in named.items() if not torch.is_tensor(value)]):
+        raise CheckpointError(f"{path}: {', '.join(wrong)} should be tensors; save the checkpoint again as gsplat's simple_trainer does")
+    if set(named) != set(NAMES):
         raise CheckpointError(f"{path} holds the splat tensors {', '.join(map(str, named))}; expected are {', '.join(NAMES)}")
     return {name: named[name].detach().float() for name in NAMES}
 
