@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import index
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -39,15 +40,41 @@ class Camera:
     index: int | None = None  # number of the training view, for models with one appearance embedding per view
 
     def __post_init__(self) -> None:
-        if not isinstance(self.viewmat, Tensor) or tuple(self.viewmat.shape) != (4, 4):
-            raise ShapeError(f"viewmat: expected shape [4, 4], got {list(getattr(self.viewmat, 'shape', ())) or type(self.viewmat).__name__}")
+        for name in ("width", "height"):
+            object.__setattr__(self, name, self._number(name, index))
+        for name in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, name, self._number(name, float))
         valid = min(self.fx, self.fy) > 0 and all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy)))
         if min(self.width, self.height) < 1 or not valid:
             got = f"{self.width}x{self.height} px, fx {self.fx}, fy {self.fy}, cx {self.cx}, cy {self.cy}"
             raise SettingsError(f"camera {self.name!r}: image size and focal lengths must be positive and finite, got {got}")
-        object.__setattr__(self, "viewmat", self.viewmat.detach().to("cpu", torch.float64))
-        if not self.viewmat.isfinite().all():
+        object.__setattr__(self, "viewmat", self._pose())
+
+    def _number(self, name: str, kind: Callable[[Any], Any]) -> Any:
+        """One of the intrinsics as a number of Python, from one of NumPy or torch. Raises SettingsError."""
+        value = getattr(self, name)
+        try:
+            return kind(None if isinstance(value, str) else value)
+        except (TypeError, ValueError, OverflowError) as error:
+            what = "a whole number" if kind is index else "a number"
+            raise SettingsError(f"camera {self.name!r}: {name} must be {what}, got {value!r}") from error
+
+    def _pose(self) -> Tensor:
+        """A copy of the pose, which its owner cannot change any more. Raises ShapeError, SettingsError."""
+        given = self.viewmat.detach() if isinstance(self.viewmat, Tensor) else self.viewmat
+        try:
+            pose = torch.as_tensor(given, dtype=torch.float64, device="cpu").clone()
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ShapeError(f"viewmat: expected a tensor or an array of shape [4, 4], got {type(given).__name__}") from error
+        if tuple(pose.shape) != (4, 4):
+            raise ShapeError(f"viewmat: expected shape [4, 4], got {list(pose.shape)}")
+        if not pose.isfinite().all():
             raise SettingsError(f"camera {self.name!r}: the pose contains NaN or infinity")
+        if not torch.allclose(pose[3], pose.new_tensor([0, 0, 0, 1])):
+            raise SettingsError(f"camera {self.name!r}: the last row of viewmat must be 0 0 0 1; it may have to be transposed, as that of 3DGS has")
+        if torch.linalg.det(pose) == 0:
+            raise SettingsError(f"camera {self.name!r}: viewmat cannot be inverted")
+        return pose
 
     @property
     def center(self) -> Tensor:

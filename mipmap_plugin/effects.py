@@ -141,6 +141,11 @@ class Effects:
     def __post_init__(self) -> None:
         if unknown := [name for name in self.outputs if name not in OUTPUTS]:
             raise SettingsError(f"there is no output {unknown[0]!r}; choose from {', '.join(OUTPUTS)}")
+        if len(self.background) != 3 or not all(map(math.isfinite, self.background)):
+            raise SettingsError(f"background must be three finite numbers, got {self.background!r}")
+        if not 0 <= self.eps2d < math.inf or self.sh_degree < 0 or self.supersampling < 1:
+            got = f"eps2d {self.eps2d}, sh_degree {self.sh_degree} and supersampling {self.supersampling}"
+            raise SettingsError(f"eps2d and sh_degree must be at least 0, and supersampling at least 1, got {got}")
 
 
 @dataclass(frozen=True)

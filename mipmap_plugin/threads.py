@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from functools import cache
-from typing import TypeVar
+from typing import SupportsIndex, TypeVar
 
 import torch
 
@@ -54,7 +54,7 @@ def limited(threads: int | None, *, shared: bool) -> Iterator[None]:
     Raises SettingsError for less than one, and for far more than the processor has.
     """
     most = MOST_PER_CORE * (os.cpu_count() or 1)
-    if threads is not None and not (isinstance(threads, int) and 1 <= threads <= most):
+    if threads is not None and not (isinstance(threads, SupportsIndex) and 1 <= threads <= most):
         raise SettingsError(f"threads must be at least 1, got {threads!r}; more than {most} are of no use on this machine")
     count = threads or for_kernels()
     token = _shared.set(count if shared else None)

@@ -22,12 +22,14 @@ from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.scenes import Scene, model_cameras
 from mipmap_plugin.splatting.filters import USUAL_EPS2D
+from mipmap_plugin.torch_modes import usual_modes
 from mipmap_plugin.wrapped import RenderOptions as RenderOptions
 from mipmap_plugin.wrapped import Wrapped as Wrapped
 from mipmap_plugin.wrapped import placed as placed
 from mipmap_plugin.wrapped import state_path as state_path
 
 
+@usual_modes()
 def wrap_model(
     model: SplatModel | str | Path | Any,
     *,

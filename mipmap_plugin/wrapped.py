@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict, cast
+from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict, cast
 
 import torch
 
@@ -40,6 +40,7 @@ from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.filters import INTEGRALS, USUAL_EPS2D
 from mipmap_plugin.splatting.viewers import find_viewer, viewers_for
+from mipmap_plugin.torch_modes import usual_modes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -110,6 +111,7 @@ class Wrapped:
             return str(error)
         return ""
 
+    @usual_modes()
     def render(
         self,
         camera: Camera,
@@ -123,14 +125,17 @@ class Wrapped:
         `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: see `RenderOptions`. Raises
         SettingsError.
         """
+        [camera], outputs = checked([camera]), options.get("outputs") or ()
+        if isinstance(outputs, str):
+            raise SettingsError(f"outputs must be a sequence of names, such as [{outputs!r}], got {outputs!r}")
         if unknown := options.keys() - RenderOptions.__annotations__.keys():
             raise TypeError(f"render() got unknown options: {', '.join(sorted(unknown))}; there are {', '.join(RenderOptions.__annotations__)}")
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
         scale = check_scale(scale)
-        if not isinstance(supersampling, int) or supersampling < 1:
+        if not isinstance(supersampling, SupportsIndex) or supersampling < 1:
             raise SettingsError(f"supersampling: must be at least 1 sample per pixel along each axis, got {supersampling!r}")
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
-        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(options.get("outputs", ())), exposure=exposure)
+        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(outputs), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
         return render_model(self.read_by(viewer), backend, camera, effects, form)
@@ -144,6 +149,7 @@ class Wrapped:
         scales, opacities = smooth_3d(gaussians.scales, gaussians.opacities, filter_3d_of(gaussians.means, self.cameras))
         return replace(gaussians, scales=scales, opacities=opacities)
 
+    @usual_modes()
     def adapt(
         self,
         scale: float,
@@ -170,6 +176,7 @@ class Wrapped:
         Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else checked(cameras)
+        _check_kinds(images=(images, Scene), start=(start, FinerLevel))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         if not model.traits.same_for_all_views and (settings.setdefault("merge_to", 1.0) < 1 or settings.get("most_splats")):
             reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
@@ -198,11 +205,12 @@ class Wrapped:
         if self.images is None or not self.images.are_of(model, backend, self.effects()):
             self.images = BaseImages(model, backend, self.effects(), LIMIT if self.keeps_images else 0)
         request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs)
-        with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)):
+        with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)), torch.enable_grad():
             adapted = Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
         adapted.report.seconds["loading"] = self.loading_s
         return replace(adapted, cameras=self.views())
 
+    @usual_modes()
     def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Any:
         """Return a ladder of levels (`levels.ladder.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`."""
         ladder = import_module("mipmap_plugin.levels.ladder")  # which builds on this class, so that it cannot be imported above
@@ -245,6 +253,7 @@ class Wrapped:
         reads_all = viewer is None or not self.model.traits.filtered or all(find_viewer(name).filter_3d for name in viewers_for(viewer))
         return self.model if reads_all else cast(Filtered, self.model).bare()
 
+    @usual_modes()
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit if it came without any."""
         return self.cameras or choose_views([], self.model.parameters()["means"], AdaptConfig())[0]
@@ -266,6 +275,13 @@ class Wrapped:
     def any_camera(self) -> Camera:
         """One of the cameras, or a camera of one pixel if there are none."""
         return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
+
+
+def _check_kinds(**given: tuple[Any, type]) -> None:
+    """Raise SettingsError for arguments, by name, that are neither None nor of the kind that each has to be."""
+    for name, (value, kind) in given.items():
+        if value is not None and not isinstance(value, kind):
+            raise SettingsError(f"{name} must be a {kind.__name__}, got {type(value).__name__}")
 
 
 def placed(model: SplatModel, scene: Scene) -> Scene:

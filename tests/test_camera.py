@@ -1,7 +1,10 @@
 """Camera: zooms keep the field of view, and a known point lands on a known pixel."""
 
 import math
+from dataclasses import replace
+from fractions import Fraction
 
+import numpy as np
 import pytest
 import torch
 
@@ -90,3 +93,30 @@ def test_an_empty_image_or_a_focal_length_that_is_not_positive_is_refused(size):
     width, height, focal = size
     with pytest.raises(SettingsError, match="image size and focal lengths must be positive and finite, got"):
         Camera(width, height, focal, focal, 0.0, 0.0, torch.eye(4))
+
+
+def test_a_pose_is_copied_so_that_its_owner_cannot_move_the_camera():
+    pose = torch.eye(4, dtype=torch.float64)
+    view = Camera(8, 6, 9.0, 9.0, 4.0, 3.0, pose)
+    pose[0, 3] = 1
+    assert view.viewmat[0, 3] == 0
+
+
+def test_numbers_of_other_libraries_become_those_of_python():
+    k = torch.tensor([[9.0, 0, 4], [0, 9, 3], [0, 0, 1]])
+    view = Camera(np.int64(8), np.int32(6), k[0, 0], np.float32(9), Fraction(4), k[1, 2], np.eye(4))
+    assert [type(value) for value in (view.width, view.height, view.fx, view.fy, view.cx, view.cy)] == [int, int, *[float] * 4]
+    assert view.viewmat.dtype == torch.float64
+
+
+@pytest.mark.parametrize(("change", "sentence"), [
+    (dict(width=8.5), "width must be a whole number, got 8.5"),
+    (dict(fx="9"), "fx must be a number, got '9'"),
+    (dict(cy=None), "cy must be a number"),
+    (dict(viewmat="eye"), "expected a tensor or an array of shape"),
+    (dict(viewmat=torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 5, 1]])), "the last row of viewmat must be 0 0 0 1"),
+    (dict(viewmat=torch.diag(torch.tensor([1.0, 1, 0, 1]))), "viewmat cannot be inverted"),
+])  # fmt: skip
+def test_what_is_no_camera_is_named(camera, change, sentence):
+    with pytest.raises((SettingsError, ShapeError), match=sentence):
+        replace(camera, **change)

@@ -1,5 +1,6 @@
 """PSNR is scikit-image's, without loading it."""
 
+import math
 import subprocess
 import sys
 
@@ -7,6 +8,7 @@ import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio
 
+from mipmap_plugin.errors import ShapeError
 from mipmap_plugin.evaluation.metrics import SAME_DB, psnr
 
 
@@ -19,3 +21,11 @@ def test_psnr_is_that_of_scikit_image():
 def test_comparing_viewers_does_not_load_scikit_image():
     code = "import sys; import mipmap_plugin.evaluation.viewer_differences; sys.exit('skimage' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_what_cannot_be_compared_has_no_psnr():
+    """NaN is not the best that there is."""
+    picture = torch.rand(4, 4, 3)
+    assert math.isnan(psnr(torch.full_like(picture, math.nan), picture))
+    with pytest.raises(ShapeError, match=r"an image \[4, 4, 3\] cannot be compared with one \[4, 4, 1\]"):
+        psnr(picture, picture[:, :, :1])

@@ -15,7 +15,7 @@ from mipmap_plugin.backends.supersample import render
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.window import WIDE, moments
+from mipmap_plugin.splatting.window import WIDE, differences, moments
 
 needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
 BACKENDS = [ReferenceBackend(), pytest.param(CpuBackend(), marks=needs_numba)]
@@ -85,3 +85,15 @@ def test_dilation_adds_to_the_variance():
     wide = ReferenceBackend().render(facing((0.2, 0.1, math.hypot(0.5, 0.4), 0.5)), VIEW, WINDOW)
     dilated = ReferenceBackend().render(facing((0.2, 0.1, 0.5, 0.3)), VIEW, Effects(0, "window", 0.16))
     torch.testing.assert_close(dilated.image, wide.image, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("edge", ["first", "last"])
+def test_the_gradient_is_right_where_an_edge_passes_through_the_center(edge):
+    """There the absolute value of its distance has no slope."""
+    width, sigma = torch.tensor(0.5, dtype=torch.float64), torch.tensor(0.3, dtype=torch.float64)
+    at = width / 2 if edge == "first" else -width / 2
+    u = at.clone().requires_grad_()
+    differences(u, width, sigma)[0].backward()
+    step = 1e-6
+    above, below = (differences(at + sign * step, width, sigma)[0] for sign in (1, -1))
+    assert float(u.grad) == pytest.approx(float(above - below) / (2 * step), rel=1e-6)

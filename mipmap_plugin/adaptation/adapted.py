@@ -19,9 +19,11 @@ from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import together, write_json
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.limits import check_image
 from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.torch_modes import usual_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,12 +39,14 @@ class Adapted:
     adapted_to: Sequence[Camera] = ()  # the cameras of the base scale that the model was adapted to or selected on
     cameras: Sequence[Camera] = ()  # the base's, at its scale
 
+    @usual_modes()
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
         """Render the view of a camera of the new scale, in one of the `viewers`; `outputs` and `exposure` as in `Wrapped.render`."""
         if viewer is not None and viewer not in self.viewers:
             available = ", ".join(filter(None, self.viewers)) or "no viewer by name"
             raise SettingsError(f"this model was not made for the viewer {viewer!r}, but for {available}")
         effects = self.effects if viewer is None else self.viewers[viewer]
+        check_image(camera.width, camera.height, self.model.parameters()["means"].device)
         return render_model(self.model, self.backend, camera, replace(effects, outputs=tuple(outputs), exposure=exposure))
 
     def views(self) -> list[Camera]:

@@ -39,8 +39,9 @@ def parts_of(source: Path | None, folder: Path | None) -> list[Path]:
 
     Outputs of adaptations in the same place, which have a report beside them, are not included.
     """
-    files = [] if source is None else [file for file in source.absolute().parent.iterdir() if _belongs(file.name, source.name)]
-    if folder is not None:
+    around = [] if source is None or not source.absolute().parent.is_dir() else source.absolute().parent.iterdir()  # it may be gone
+    files = [file for file in around if source is not None and _belongs(file.name, source.name)]
+    if folder is not None and folder.is_dir():
         files += [*folder.iterdir(), *(file for part in PARTS for file in (folder / part).rglob("*"))]
     return [*([source] if source else []), *(file for file in files if file.is_file() and not is_adapted(file))]
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Real
 
 from mipmap_plugin.effects import DILATION, FRUSTUM_MARGIN, NEAR_PLANE, USUAL, Effects, Packing, RenderSettings
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.registry import Registry
+from mipmap_plugin.screen_filters import SCREEN_FILTERS
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,11 @@ class Viewer:
     unlike: str = ""  # known differences between the viewer and this record
 
     def __post_init__(self) -> None:
-        if not isinstance(self.eps2d, (int, float)) or not 0 <= self.eps2d < math.inf:
+        if self.screen_filter not in SCREEN_FILTERS:
+            raise SettingsError(f"viewer {self.name!r}: there is no screen filter {self.screen_filter!r}; choose from {', '.join(SCREEN_FILTERS)}")
+        if not isinstance(self.settings, RenderSettings) or not isinstance(self.sh_degree, int):
+            raise SettingsError(f"viewer {self.name!r}: settings must be RenderSettings, and sh_degree a whole number")
+        if not isinstance(self.eps2d, Real) or not 0 <= self.eps2d < math.inf:
             raise SettingsError(f"viewer {self.name!r}: eps2d, the dilation in px², must be a number of at least 0, got {self.eps2d!r}")
 
     def effects(self, effects: Effects) -> Effects:

@@ -142,8 +142,9 @@ def differences(u: Tensor, width: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor
     """`moments` from the Gaussian and its integral at both ends of the window."""
     first, last = u - width / 2, u + width / 2
     g_first, g_last = (torch.exp(-(t / sigma).square() / 2) for t in (first, last))
-    tails = [torch.special.erfc((t / sigma).abs() * math.sqrt(0.5)) for t in (first, last)]
-    mass = torch.where((first < 0) & (last > 0), 2 - tails[0] - tails[1], (tails[0] - tails[1]).abs())
+    # Not abs(t), whose gradient is 0 where an end of the window passes through the center.
+    tails = [torch.special.erfc(torch.where(t < 0, -t, t) / sigma * math.sqrt(0.5)) for t in (first, last)]
+    mass = torch.where((first < 0) & (last >= 0), 2 - tails[0] - tails[1], (tails[0] - tails[1]).abs())
     p = math.sqrt(math.pi / 2) * sigma * mass / width
     m = -sigma.square() * (g_last - g_first) / width - u * p
     return p, m, sigma.square() * (p - (last * g_last - first * g_first) / width) - u * (2 * m + u * p)

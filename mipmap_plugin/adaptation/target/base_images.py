@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.backends.drawn import drawn
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -27,6 +28,7 @@ class BaseImages:
         """`effects`: how the model is rendered at the scale of its training. `limit`: bytes of the images that are kept."""
         self.model, self.backend, self.effects = model, backend, effects
         self._store = ImageStore(limit, model.parameters()["means"])
+        self._versions = _versions(model)
         self._activated: Gaussians | None = None
 
     def __call__(self, view: Camera, fraction: float = 1.0) -> Tensor:
@@ -37,8 +39,9 @@ class BaseImages:
         return self._store((facts(view), fraction), lambda: self._render(view, fraction))
 
     def are_of(self, model: SplatModel, backend: Backend, effects: Effects) -> bool:
-        """Whether these are the images of this model by such a backend."""
-        return self.model is model and (self.backend.name, self.effects) == (backend.name, effects)
+        """Whether these are the images of this model, as it is now, by such a backend."""
+        same = self.model is model and self._versions == _versions(model)  # its owner may change a model that is not of a file
+        return same and (self.backend.name, self.effects) == (backend.name, effects)
 
     def keep_only(self, views: Iterable[Camera]) -> None:
         """Forget the images of all other views, so that those of `views` find room."""
@@ -52,7 +55,7 @@ class BaseImages:
         size = (view.width, view.height) if factor == 1 else (max(1, round(view.width * factor)), max(1, round(view.height * factor)))
         camera = view if (factor, view.zoom) == (1, 1) else replace(view.resized(*size), zoom=1.0)
         effects = replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
-        return self.backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
+        return drawn(self.backend, self._splats(camera), camera, effects).image.clamp(0, 1)
 
     def _splats(self, camera: Camera) -> Gaussians:
         """The splats, activated once if all cameras see the same ones: activation takes a fifth of a small image's time."""
@@ -61,6 +64,11 @@ class BaseImages:
         if self._activated is None:
             self._activated = self.model.gaussians(camera)
         return self._activated
+
+
+def _versions(model: SplatModel) -> list[int]:
+    """How often torch has changed each parameter in place."""
+    return [tensor._version for tensor in model.parameters().values()]
 
 
 def facts(view: Camera) -> Hashable:

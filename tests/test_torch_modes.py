@@ -1,0 +1,50 @@
+"""Modes of torch that a caller has set change nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.wrap import wrap_model
+
+
+@contextmanager
+def default_dtype() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+MODES = {
+    "autocast": lambda: torch.autocast("cpu", torch.bfloat16),
+    "inference mode": torch.inference_mode,
+    "no gradients": torch.no_grad,
+    "default dtype": default_dtype,
+    "default device": lambda: torch.device("meta"),  # stands for a GPU
+}
+
+
+def adapted() -> dict[str, torch.Tensor]:
+    """The parameters of an adapted model, and a picture of it."""
+    raw = {name: tensor.clone() for name, tensor in BALL.items()}
+    made = wrap_model(raw, cameras=CAMERAS, backend="reference").adapt(0.5, steps=3, extra_views=2)
+    return {**made.model.parameters(), "image": made.render(made.views()[0], outputs=("depth",)).image}
+
+
+BALL, CAMERAS = tiny.model().parameters(), tiny.cameras(3)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_adaptation_is_the_same_in_any_mode(mode: str) -> None:
+    plain = adapted()
+    asked: AbstractContextManager[object] = MODES[mode]()
+    with asked:
+        other = adapted()
+    assert all(torch.equal(tensor.detach(), other[name].detach()) for name, tensor in plain.items())
+    assert torch.get_default_dtype() == torch.float32 and not torch.is_autocast_enabled("cpu")
