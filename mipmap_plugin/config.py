@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mipmap_plugin.limits import MAX_SEED
 
-ResizeFilter = Literal["box", "area", "bilinear", "pil-bicubic", "lanczos"]
+ResizeFilter = Literal["fitting", "box", "area", "bilinear", "pil-bicubic", "lanczos"]
 ViewPolicy = Literal["given", "train", "test", "orbit", "jittered"]
 Factor = Annotated[float, Field(gt=0)]
 Momentum = Annotated[float, Field(ge=0, lt=1)]
@@ -47,7 +47,7 @@ class AdaptConfig(BaseModel):
     seed: int = Field(0, ge=0, le=MAX_SEED, description="Seed of everything random.")
 
     band: tuple[Factor, Factor] = Field((1.0, 1.0), description="Zoom-out: the file is shown from the first to the second multiple of its scale.")
-    resize: ResizeFilter = Field("pil-bicubic", description="Filter that makes base images smaller; that of the protocol to be evaluated by.")
+    resize: ResizeFilter = Field("pil-bicubic", description="Filter that shrinks images, as that of a protocol; `fitting`: what fits the base.")
     upsampler: str = Field("bicubic", description="What makes base images larger: a registered name, or the file of a network.")
     compare_at: Literal["target", "base", "both"] = Field("target", description="Zoom-in: compare with the upsampled base, the base itself, or both.")
     detail_weight: float = Field(0.1, ge=0, description="`both`: weight of the difference from the upsampled base; that from the base has weight 1.")
@@ -70,6 +70,7 @@ class AdaptConfig(BaseModel):
     decay: float = Field(1.0, gt=0, le=1, description="Fraction of itself that every learning rate decays to, along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's decay rates of the moments.")
     nesterov: bool = Field(False, description="Adam with Nesterov's momentum: each step counts the newest gradient once more.")
+    least_zoom_in: float = Field(1.0, ge=1, description="No steps are taken at a zoom-in below this for what draws as the training did.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
     order: Literal["shuffled", "spread"] = Field("shuffled", description="Order of the views in each round; `spread`: neighbors look from all sides.")
     warm_up: float = Field(0.0, ge=0, le=1, description="Fraction of the steps during which learning rates rise, as far as validation allows.")

@@ -394,7 +394,7 @@ def test_a_scale_that_is_no_zoom_is_refused(scale):
         (dict(recipe="best"), "there is no recipe 'best'; choose from default, instant, paper, thorough"),
         (dict(stepz=3), "there is no setting stepz; did you mean steps?"),
         (dict(steps=-1), "setting steps: Input should be greater than or equal to 0"),
-        (dict(resize="nearest"), "setting resize: Input should be 'box'"),
+        (dict(resize="nearest"), "setting resize: Input should be 'fitting', 'box'"),
         (dict(views="some"), "setting views: Input should be 'given'"),
         (dict(time_budget_s=0), "setting time_budget_s: Input should be greater than 0"),
         (dict(rates={"means": -1}), "setting rates.means: Input should be greater than or equal to 0"),
@@ -516,3 +516,21 @@ def test_cameras_that_show_nothing_are_refused():
     away = replace(tiny.cameras(1)[0], viewmat=behind)
     with pytest.raises(SettingsError, match="none of the 1 views shows a splat"):
         wrap_model(tiny.model(), cameras=[away], backend="reference").adapt(0.5, steps=0, views="given")
+
+
+# Small zoom-ins
+
+
+def test_the_smallest_zoom_ins_take_no_steps_unless_they_are_asked_for_or_another_way_to_draw_is_learned():
+    """Steps would learn to undo the filter that shrinks their picture."""
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    small, asked, other = base.adapt(1.05), base.adapt(1.05, steps=2), base.adapt(1.05, viewer="spark", time_budget_s=0.2)
+    assert small.report.curve[-1].step == 0 and "a zoom below x1.1 shows hardly more than the base" in small.report.ended_by
+    assert asked.report.curve[-1].step == 2 and other.report.curve[-1].step > 0
+
+
+@pytest.mark.parametrize(("screen_filter", "fits"), [("classic", "pil-bicubic"), ("antialiased", "area"), ("mip", "area")])
+def test_a_zoom_in_is_shrunk_by_the_filter_that_fits_its_base(screen_filter, fits):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference", screen_filter=screen_filter)
+    assert base.adapt(2, steps=1, extra_views=1).report.settings.resize == fits
+    assert base.adapt(2, steps=1, extra_views=1, resize="lanczos").report.settings.resize == "lanczos"

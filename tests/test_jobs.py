@@ -236,7 +236,8 @@ def test_another_base_or_another_file_is_not_finished(tmp_path):
 
 
 def test_other_cameras_background_or_photographs_are_not_finished(tmp_path):
-    job = job_of(tmp_path, images=tiny.scene(tmp_path / "scene", train=tiny.cameras(3), count=30), scale=2.0)
+    scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(3), count=30)
+    job = job_of(tmp_path, images=scene, scale=2.0, settings={"steps": 1, "seed": 0, "views": "train"})
     assert run_job(job).status == "done" and finished(job) is not None
     for changed in ({"background": "white"}, {"screen_filter": "mip"}, {"cameras": None}):
         assert finished(replace(job, base=replace(job.base, **changed))) is None
@@ -262,7 +263,7 @@ def test_other_options_of_the_training_are_not_finished(tmp_path):
 
 def test_a_job_that_travels_makes_the_same_bytes(tmp_path):
     scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(3), count=30)
-    here = job_of(tmp_path, images=scene, scale=2.0, skip_finished=False)
+    here = job_of(tmp_path, images=scene, scale=2.0, skip_finished=False, settings={"steps": 1, "seed": 0, "views": "train"})
     assert run_job(here).status == "done"
     away = replace(here, target=tmp_path / "away" / "new.ply")
     parcel = pack(away)

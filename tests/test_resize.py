@@ -60,6 +60,16 @@ def test_area_equals_box_where_the_ratio_is_whole(image):
     torch.testing.assert_close(resize(image, (6, 10), "area"), resize(image, (6, 10), "box"))
 
 
+@pytest.mark.parametrize(("old", "new"), [(3, 2), (4, 3), (208, 160), (2, 3)])
+def test_area_counts_a_pixel_by_how_much_of_it_is_covered(old, new):
+    """The integral of a row of pixels, between the borders of the new ones."""
+    row = torch.rand(old, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    whole = np.concatenate([[0], np.cumsum(row.numpy())])
+    borders = np.interp(np.arange(new + 1) * old / new, np.arange(old + 1), whole)
+    made = resize(row[None, :, None].repeat(1, 1, 3), (1, new), "area")
+    np.testing.assert_allclose(made[0, :, 0], np.diff(borders) * new / old)
+
+
 @pytest.mark.parametrize("size", [SMALLER, LARGER])
 def test_bilinear_has_two_taps_and_no_prefilter(image, size):
     torch.testing.assert_close(resize(image, size, "bilinear"), two_taps(image, size), atol=1e-5, rtol=0)

@@ -129,7 +129,7 @@ def gain(model, scale, **settings):
     """dB against the pseudo truth over the base's own render at the new scale, on the views adapted to; and the adapted model."""
     wrapped = wrap_model(model, cameras=VIEWS, backend="reference")
     adapted = wrapped.adapt(scale, views="given", check_every=10, **{"steps": 30, **settings})
-    config = recipe("default", scale)
+    config = recipe("default", scale, resize="pil-bicubic")
     truth = PseudoTruth(BaseImages(model, adapted.backend, wrapped.effects()), scale, config)
 
     def decibel(image, view):

@@ -16,7 +16,7 @@ from torch import Tensor
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
-from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note
+from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
@@ -33,6 +33,7 @@ from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
+from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, with_times
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -71,13 +72,14 @@ class Session:
         self.targets, self.has_gradients, self.backend_note = request.targets, request.has_gradients, request.backend_note
         self.effects = next(iter(self.targets.values()))
         self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
-        self.asked_steps, config = config.steps, self._affordable(config, cameras)
+        self.asked_steps, config = config.steps, self._affordable(fitting(config, self.base_effects), cameras)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs = request.finer, dict(request.inputs)
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.base.parameters()["means"].device)
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.views = over_band(self.base_views, config)
         self.views_note += f", {real.note(self.base_views)}" if real else ""
+        self._has_photographs = real is not None
         steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
         request.images.keep_only([*self.views, *steering, *choosing])
         self.truth = PseudoTruth(request.images, scale, config, real)
@@ -119,16 +121,16 @@ class Session:
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())
             merging = self.config.merge_to < 1 and self._has_blend_weights
-            steps, plain = self.config.steps > 0, self.base.traits.plain
-            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=steps, merging=merging, by_rows=plain)
+            plain = self.base.traits.plain
+            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self._takes_steps, merging=merging, by_rows=plain)
         as_it_is = self._for_target(self._base_in_viewer, shared=True)
         initial, start = StartSearch(self._start_problem()).best()
         states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
         curve: list[CurvePoint] = []
-        ended_by = "0 steps"
+        ended_by = "0 steps" + fewer_note(self.asked_steps, self.config.model_copy(update={"steps": 0}))
         pool.release_to_system()
         self.seconds["total"] = time.perf_counter() - began
-        if self.config.steps:
+        if self._takes_steps:
             run, ended_by = self._optimize(initial.copy(), resume, observe)
             curve, states = run.curve, states | run.states(initial)
         return self._select(states, curve, ended_by)
@@ -216,6 +218,10 @@ class Session:
         """PSNR (dB) of a model on the views that steer the run."""
         with self.phase("validation"):
             return self.validation.steer(model)
+
+    @property
+    def _takes_steps(self) -> bool:
+        return self._has_photographs or takes_steps(self.config, self.scale, self.base_effects, self.targets.values())
 
     @property
     def _has_blend_weights(self) -> bool:

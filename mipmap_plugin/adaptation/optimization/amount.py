@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effects
 
 # Views and splats that are counted; more change the result by a few percent.
 VIEWS, SPLATS = 12, 1 << 16
@@ -26,6 +27,12 @@ def splats_in_view(means: torch.Tensor, views: Sequence[Camera], near: float) ->
     some = means[:: max(1, -(-len(means) // SPLATS))]
     shares = [float(view.in_picture(view.to_camera(some), near).float().mean()) for view in evenly(views, VIEWS)]
     return len(means) * sum(shares) / max(1, len(shares))
+
+
+def takes_steps(config: AdaptConfig, scale: float, base: Effects, targets: Iterable[Effects]) -> bool:
+    """Whether steps are worth taking: at the smallest zoom-ins only where another way to draw is to be learned. `base`: how that is rendered."""
+    small = 1 < scale < config.least_zoom_in and all(target == base for target in targets)
+    return config.steps > 0 and not small
 
 
 def affordable_for(config: AdaptConfig, means: torch.Tensor, views: Sequence[Camera], near: float) -> AdaptConfig:
@@ -57,10 +64,12 @@ def _fewer(config: AdaptConfig, fraction: float) -> AdaptConfig:
 
 
 def as_taken(config: AdaptConfig, taken: AdaptConfig) -> AdaptConfig:
-    """What `affordable` makes of the settings for the scene of which it made `taken`, if it did so of the same settings.
+    """What `affordable` and `fitting` make of the settings for the scene of which they made `taken`, if they did so of the same settings.
 
     The fraction is known by the steps, which are rounded up, and so the extra views up to one or a few.
     """
+    if config.resize == "fitting":
+        config = config.model_copy(update={"resize": taken.resize})
     if config.most_draws is None or not LEAST_FRACTION * config.steps <= taken.steps < config.steps:
         return config
     least, most = (_fewer(config, steps / config.steps) for steps in (taken.steps - 1, taken.steps))
@@ -70,4 +79,6 @@ def as_taken(config: AdaptConfig, taken: AdaptConfig) -> AdaptConfig:
 
 def fewer_note(asked_steps: int, config: AdaptConfig) -> str:
     """Why a run took fewer steps than it was asked for, in brackets; empty if it did not."""
+    if asked_steps and not config.steps:
+        return f" (of {asked_steps}, because a zoom below x{config.least_zoom_in:g} shows hardly more than the base; --steps takes them)"
     return f" (of {asked_steps}, because the scene is large; --steps takes more)" if config.steps < asked_steps else ""

@@ -33,8 +33,9 @@ class PseudoTruth:
         """Raises SettingsError for an unknown upsampler."""
         self._base, self._scale, self._config = base, scale, config
         check_upsampler(config.upsampler)
-        if photographs and (scale <= 1 or config.compare_at == "target"):
-            raise SettingsError("real images can be used only for a zoom-in that is compared with the base at its own scale; leave them out")
+        if photographs and (scale <= 1 or config.compare_at == "target" or not config.steps):
+            only = "real images can be used only for a zoom-in that takes steps and is compared with the base at its own scale"
+            raise SettingsError(f"{only}; leave them out")
         self._photographs = photographs
         self._store = ImageStore(LIMIT, base.model.parameters()["means"])
 

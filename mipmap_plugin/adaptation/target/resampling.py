@@ -99,11 +99,13 @@ def _kernel(function: Callable[[Tensor], Tensor], support: float) -> Callable[[i
 
 
 def _area(old: int, new: int) -> Taps:
-    """The mean of all old pixels that a new pixel overlaps."""
+    """The mean over the area of a new pixel: each old one counts by how much of it that covers."""
     output = torch.arange(new)[:, None]
     low, high = output * old // new, -(-(output + 1) * old // new)
     inputs = low + torch.arange(int((high - low).max()))
-    return _flat(inputs.clamp_max(old - 1), (inputs < high) / (high - low).double())
+    # In units of 1 / new of an old pixel, so that borders that coincide are equal.
+    covered = torch.minimum((inputs + 1) * new, (output + 1) * old) - torch.maximum(inputs * new, output * old)
+    return _flat(inputs.clamp_max(old - 1), covered.clamp_min(0).double() / old)
 
 
 def _bilinear(old: int, new: int) -> Taps:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resampling import resample
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.splatting.filters import compensates
 
 
 def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
@@ -26,6 +29,18 @@ def _check_box(image: Tensor, size: tuple[int, int]) -> None:
     old = list(image.shape[:2])
     if any(pixels % new for pixels, new in zip(old, size, strict=True)):
         raise SettingsError(f"box: {old} px is not a whole multiple of {list(size)} px; use area")
+
+
+def fitting(config: AdaptConfig, base: Effects) -> AdaptConfig:
+    """The settings with the filter that fits a base which is rendered with these effects, where they leave the choice of one.
+
+    A base whose screen filter stands for the area of a pixel shows means over that area. One that is sampled at the pixel's center looks like its
+    photographs, which were shrunk by a bicubic filter or alike: against the mean over the area, photographs of lego and chair at x1.25 to x3
+    are matched better by up to 0.5 dB.
+    """
+    if config.resize != "fitting":
+        return config
+    return config.model_copy(update={"resize": "area" if compensates(base.screen_filter) else "pil-bicubic"})
 
 
 def difference_from(target: Tensor, image: Tensor, method: str) -> Tensor:
