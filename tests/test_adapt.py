@@ -518,6 +518,28 @@ def test_cameras_that_show_nothing_are_refused():
         wrap_model(tiny.model(), cameras=[away], backend="reference").adapt(0.5, steps=0, views="given")
 
 
+def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
+    splats = tiny.gaussians()
+    small = VanillaModel.from_gaussians(replace(splats, means=splats.means * 0.01, scales=splats.scales * 0.01))
+    smaller = torch.diag(torch.tensor([0.01, 0.01, 0.01, 1.0], dtype=torch.float64))
+    views = [view.moved(smaller) for view in tiny.cameras(2)]
+    with pytest.raises(SettingsError, match=r"all splats lie nearer than 0.2 units, .* scale the scene and its cameras up"):
+        wrap_model(small, cameras=views, backend="reference").adapt(0.5, steps=0, views="given")
+
+
+def test_views_that_show_nothing_do_not_count_in_the_mean():
+    """They are at 120 dB, whatever the others show."""
+    away = [replace(view, viewmat=HALF_TURN @ view.viewmat) for view in tiny.cameras(3)]
+    model = wrap_model(tiny.model(), cameras=[*tiny.cameras(3), *away], backend="reference")
+    alone = wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="reference")
+    settings = dict(steps=1, views_per_step=400, extra_views=0)  # many views for validation
+    both, without = (each.adapt(0.5, **settings).report.psnr_before() for each in (model, alone))
+    assert both == pytest.approx(without, abs=6)
+
+
+HALF_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
+
+
 # Small zoom-ins
 
 

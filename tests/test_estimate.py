@@ -9,7 +9,7 @@ import torch
 
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization import loop
-from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.optimization.estimate import Costs, Forecast
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.views import ViewSchedule
@@ -64,6 +64,15 @@ def test_after_a_tenth_of_the_run_the_estimate_is_right_within_thirty_percent(cl
         if passed > total / 10:
             assert left == pytest.approx(total - passed, rel=0.3, abs=0.01 * total)
     assert told[-1][1] == pytest.approx(0, abs=1e-6)
+
+
+def test_slow_first_steps_are_soon_forgotten():
+    """Memory, caches and threads have to be found for them."""
+    views, config = tiny.cameras(4), recipe("default", SCALE, steps=40, views_per_step=2, warm_up=0)
+    forecast, costs = Forecast(ViewSchedule(views, config), config, checks=[]), Costs(truths=dict.fromkeys(views, 0.0))
+    seconds = [5.0 + 0.1 * step for step in range(1, 41)]  # the first takes 50 times as long
+    left = [forecast.left(step, spent, costs) for step, spent in enumerate(seconds, start=1)]
+    assert left[0] > 100 and left[3] == pytest.approx(36 * 0.1) and left[-1] == 0
 
 
 def test_a_budget_bounds_the_estimate(clock, monkeypatch):

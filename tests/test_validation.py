@@ -159,7 +159,14 @@ def test_the_best_state_is_chosen_and_every_score_is_told():
 @pytest.mark.parametrize(("worse_db", "chosen"), [(0.0, "later"), (TIE_DB / 2, "later"), (2 * TIE_DB, "earlier")])
 def test_of_equals_the_later_is_chosen(worse_db, chosen):
     later = 0.1 * 10 ** (worse_db / 20)
-    assert judge(0.0).choose({"earlier": shows(0.1, 0.1), "later": shows(later, later)})[0] == chosen
+    assert judge(0.0).choose({"base": shows(0.3, 0.3), "earlier": shows(0.1, 0.1), "later": shows(later, later)})[0] == chosen
+
+
+def test_none_that_is_worse_than_what_went_in_is_chosen():
+    """Not even by so little that it counts as equal."""
+    worse = 0.1 * 10 ** (TIE_DB / 2 / 20)
+    assert judge(0.0).choose({"base": shows(0.1, 0.1), "later": shows(worse, worse)})[0] == "base"
+    assert judge(0.0).choose({"base": shows(0.1, 0.1), "later": shows(0.1, 0.1)})[0] == "later"
 
 
 def test_only_what_is_allowed_is_chosen_and_the_others_are_told_too():

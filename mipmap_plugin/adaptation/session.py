@@ -34,7 +34,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, with_times
+from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, showing, with_times
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
@@ -104,6 +104,8 @@ class Session:
         chosen, note = choose_views(cameras, means, self.config)
         views, validation = split_validation(cameras, chosen, means, self.scale, self.config)
         note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
+        if len(shown := showing(validation, means, self.base_effects.near_plane)) > 1:  # one to steer by, and one to choose by
+            validation = shown  # others are at 120 dB, which would hide what these show
         if self.base.traits.moves:
             views, times = with_times(views, self.config.seed)
             validation, _ = with_times(validation, self.config.seed)
@@ -116,7 +118,7 @@ class Session:
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self.copy_of_base(), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        refuse_blind(self.base_views, self.base.parameters()["means"], self.truth)
+        refuse_blind(self.base_views, self.base.parameters()["means"], self.base_effects.near_plane, self.truth)
         began = time.perf_counter()
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())

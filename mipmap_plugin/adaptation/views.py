@@ -132,14 +132,22 @@ def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: A
     return views, f"the {len(views)} {split} views"
 
 
-def refuse_blind(views: Sequence[Camera], means: Tensor, image_of: Callable[[Camera], Tensor]) -> None:
-    """Raise SettingsError for views that show nothing: of cameras of another scene, for example. `image_of`: a view's image [h, w, 3]."""
+def showing(views: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
+    """The views that show one of the `means` [N, 3], farther than the near plane (world units)."""
+    return [view for view in views if view.in_picture(view.to_camera(means.detach()), near).any()]
+
+
+def refuse_blind(views: Sequence[Camera], means: Tensor, near: float, image_of: Callable[[Camera], Tensor]) -> None:
+    """Raise SettingsError for views that show nothing: of cameras of another scene, for example. `near`: the near plane, in world units;
+    `image_of`: a view's image [h, w, 3]."""
     some = evenly(views, LOOKED_AT)
-    if any(view.in_picture(view.to_camera(means.detach())).any() for view in some):
+    if showing(some, means, near):
         return
     if all(torch.equal(image, image[:1, :1].expand_as(image)) for image in map(image_of, some)):  # nor a splat whose center lies outside
-        wrong = "the cameras seem to be of another scene, or in other coordinates"
-        raise SettingsError(f"none of the {len(views)} views shows a splat: {wrong}; give those of this scene")
+        wrong = "the cameras seem to be of another scene, or in other coordinates; give those of this scene"
+        if showing(some, means, 0.0):
+            wrong = f"all splats lie nearer than {near:g} units, where renderers of 3DGS draw none; scale the scene and its cameras up"
+        raise SettingsError(f"none of the {len(views)} views shows a splat: {wrong}")
 
 
 def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:

@@ -55,16 +55,20 @@ class Forecast:
     config: AdaptConfig
     checks: Sequence[int]  # the steps after which the run is checked, in order
     first_step: int = 0  # steps that an earlier process has done
+    history: list[tuple[int, float]] = field(default_factory=list)  # draws and seconds of the views alone, before each step of this process
 
     def left(self, step: int, seconds: float, costs: Costs) -> float:
         """Seconds left after `step`, of which everything since the first step has taken `seconds`; infinity before there is a step."""
-        draws = [self.schedule.draws_before(number) for number in (self.first_step, step, self.config.steps)]
-        if draws[1] == draws[0]:
+        first, done, last = (self.schedule.draws_before(number) for number in (self.first_step, step, self.config.steps))
+        if done == first:
             return math.inf
-        a_view = (seconds - costs.seconds()) / (draws[1] - draws[0])
-        new_views = max(0, min(self.schedule.views, draws[2]) - len(costs.truths))
+        self.history.append((done, seconds - costs.seconds()))
+        # Since half of the steps: the first ones take longer than all others.
+        draws, spent = self.history[len(self.history) // 2 - 1] if len(self.history) > 1 else (first, 0.0)
+        a_view = (self.history[-1][1] - spent) / (done - draws)
+        new_views = max(0, min(self.schedule.views, last) - len(costs.truths))
         checks = len(self.checks) - bisect_right(self.checks, step)
-        return (draws[2] - draws[1]) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks)
+        return (last - done) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks)
 
 
 def _mean(seconds: Any) -> float:

@@ -92,11 +92,15 @@ class Validation:
         return decibel(fmean(10 ** (-psnr / 10) for psnr in self.viewer_psnrs(model, self.steering)))
 
     def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float]]:
-        """Return the name of the best state (of equals the last), of those that are `allowed`, and the PSNR of each state in its worst viewer."""
+        """Return the name of the best state, of those that are `allowed`, and the PSNR of each state in its worst viewer.
+
+        Of states that are equal the last, but none that is worse than the first of `states`, which is what went in.
+        """
         psnrs = {name: min(self.viewer_psnrs(model, self.choosing)) for name, model in states.items()}
         among = [name for name in states if allowed is None or name in allowed]
-        best = max(psnrs[name] for name in among)
-        return [name for name in among if psnrs[name] >= best - TIE_DB][-1], psnrs
+        best, first = max(psnrs[name] for name in among), next(iter(states))
+        least = max(best - TIE_DB, psnrs[first]) if first in among else best - TIE_DB
+        return [name for name in among if psnrs[name] >= least][-1], psnrs
 
 
 def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians, Camera], Tensor]) -> Validation:
