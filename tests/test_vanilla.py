@@ -334,6 +334,7 @@ def test_only_a_model_folder_is_replaced_and_only_with_the_option(tmp_path):
     with pytest.raises(OutputExists, match="--overwrite"):
         new.save(tmp_path / "out", provenance={})
     assert len(load_model(tmp_path / "out")) == 2
+    (tmp_path / "out/.DS_Store").touch()
     new.save(tmp_path / "out", provenance={}, overwrite=True)
     assert len(load_model(tmp_path / "out")) == 3
     (tmp_path / "out/notes").mkdir()

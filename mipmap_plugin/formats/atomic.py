@@ -19,6 +19,9 @@ from typing import Any
 from mipmap_plugin.errors import MipmapPluginError, OutputError, OutputExists
 from mipmap_plugin.formats.staging import Staging, settle
 
+# Files that systems leave in folders, and that nobody misses.
+OF_SYSTEMS = {".DS_Store", "Thumbs.db", "desktop.ini"}
+
 # The output that is being written, if any.
 _open: ContextVar[Staging | None] = ContextVar("_open", default=None)
 
@@ -220,7 +223,8 @@ def refuse_to_lose(target: Path, source: Path | None, holds: str, ours: Iterable
         raise OutputExists(f"{target} holds the base checkpoint itself, which --overwrite would delete; choose another folder")
     if place.is_dir() and any(place.iterdir()) and not (place / holds).exists():
         raise OutputExists(f"{target} is a folder with other things in it, which --overwrite would delete; choose another folder")
-    files = (file.relative_to(place).as_posix() for file in place.rglob("*") if file.is_symlink() or not file.is_dir())
+    found = (file for file in place.rglob("*") if file.is_symlink() or not file.is_dir())
+    files = (file.relative_to(place).as_posix() for file in found if file.name not in OF_SYSTEMS)
     if other := next((name for name in files if not any(fnmatchcase(name, pattern) for pattern in ours)), None):
         raise OutputExists(f"{target} has other things in it, such as {other}, which --overwrite would delete; move them, or choose another folder")
     if place.is_file():

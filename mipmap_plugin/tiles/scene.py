@@ -14,6 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.optimization.validation import split_validation
+from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
@@ -161,6 +162,7 @@ class TiledScene:
 
     def _affordable(self, config: AdaptConfig) -> AdaptConfig:
         """The settings with no more steps than a scene of this size can have, as without tiles."""
+        config = fitting(config, self.base_effects)
         return affordable_for(config, self.base.places[:, :3], self.wrapped.cameras, self.target.near_plane)
 
     @cached_property

@@ -28,6 +28,7 @@ from mipmap_plugin.adaptation.start.closed_form import pixel_size
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
+from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import GOLDEN, choose_views
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, digest_of, evenly
@@ -91,7 +92,7 @@ class Scene:
     def config(self, level: int) -> AdaptConfig:
         """The settings of a level. Rows stay what they are, because those of the finer level come first."""
         scale = min(1 - 1e-3, float(self.rule.ratio ** (0.5 - level)))
-        config = make_config(self.request.recipe, scale, merge_to=1.0, **self.request.settings)
+        config = fitting(make_config(self.request.recipe, scale, merge_to=1.0, **self.request.settings), self.base.effects())
         return config.model_copy(update={"prune_every": max(1, config.steps)})
 
     def unmade(self, finest: Gaussians, level: int) -> Gaussians:
