@@ -332,7 +332,7 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
     assert code == 0
     assert "| one       | x0.25 | P3 " in out and "| mean of 2 | x0.25 | P3 " in out
     assert "published, mean over the 8 scenes of NeRF-Synthetic" in out and "Mipmap-GS (arXiv 2408.06286)" in out
-    refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "1 of CHECKPOINT and 2 of --images")
+    refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images is given 2 times")
 
 
 def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):

@@ -57,6 +57,14 @@ def test_adapting_to_images_says_so_and_leads_elsewhere(scene):
     assert not torch.equal(adapted.model.parameters()["sh0"], alone.model.parameters()["sh0"])
 
 
+def test_photographs_are_learned_from_at_any_zoom_in(scene):
+    """Also where the base's own image has nothing to teach."""
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    settings = dict(extra_views=1, time_budget_s=0.2, least_zoom_in=1.1)
+    assert model.adapt(1.05, images=scene, **settings).report.curve[-1].step > 0
+    assert model.adapt(1.05, **settings).report.curve[-1].step == 0
+
+
 def test_a_run_is_not_resumed_with_other_images(scene, tmp_path, monkeypatch):
     model, state = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference"), tmp_path / "state"
     train = tiny.cameras(3, width=2 * tiny.WIDTH, height=2 * tiny.HEIGHT)

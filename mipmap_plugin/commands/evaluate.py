@@ -155,7 +155,7 @@ def _scene(folder: Path, appearance: str) -> Scene:
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
     if len(checkpoint) != len(images):
-        raise SettingsError(f"there are {len(checkpoint)} of CHECKPOINT and {len(images)} of --images; give one folder of images for each checkpoint")
+        raise SettingsError(f"give one --images DIR for each checkpoint: --images is given {len(images)} times, for {len(checkpoint)} of these")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
     read = [part for path in checkpoint for part in _parts(path)] + [file for folder in images for file in folder.glob("transforms*.json")]

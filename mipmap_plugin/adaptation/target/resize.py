@@ -34,9 +34,8 @@ def _check_box(image: Tensor, size: tuple[int, int]) -> None:
 def fitting(config: AdaptConfig, base: Effects) -> AdaptConfig:
     """The settings with the filter that fits a base which is rendered with these effects, where they leave the choice of one.
 
-    A base whose screen filter stands for the area of a pixel shows means over that area. One that is sampled at the pixel's center looks like its
-    photographs, which were shrunk by a bicubic filter or alike: against the mean over the area, photographs of lego and chair at x1.25 to x3
-    are matched better by up to 0.5 dB.
+    A base whose screen filter stands for the area of a pixel shows means over that area. For one that is sampled at the pixel's center a bicubic
+    filter is better: photographs of lego and chair at x1.25 to x3 are matched by up to 0.5 dB more, whichever filter shrinks these.
     """
     if config.resize != "fitting":
         return config
