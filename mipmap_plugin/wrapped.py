@@ -222,8 +222,8 @@ class Wrapped:
         parts = parts_of(source, self.model.folder)
         model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
         model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
-        for file in (report, state_path(path)):
-            refuse_output(file, True, parts, is_file=True)
+        refuse_output(report, overwrite, parts, is_file=True)
+        refuse_output(state_path(path), True, parts, is_file=True)
         refuse_unwritable(path, 0 if source is None else source.stat().st_size)
 
     def targets(self, viewer: str | None) -> dict[str, Effects]:

@@ -459,6 +459,26 @@ def test_an_output_that_exists_is_not_overwritten_unless_asked(tmp_path):
     assert len(load_model(tmp_path / "new.ply")) == 40
 
 
+def test_a_report_without_its_model_is_not_overwritten_unless_asked(tmp_path):
+    adapted, report = wrapped().adapt(4, recipe="instant"), tmp_path / "new.ply.adaptation.json"
+    report.write_text("precious")
+    with pytest.raises(OutputExists, match=r"new\.ply\.adaptation\.json exists already; pass --overwrite"):
+        adapted.save(tmp_path / "new.ply")
+    assert report.read_text() == "precious" and not (tmp_path / "new.ply").exists()
+    adapted.save(tmp_path / "new.ply", overwrite=True)
+    assert json.loads(report.read_text())["scale"] == 4
+
+
+@pytest.mark.parametrize("answer", [True, np.float64(1) < 2, torch.ones(()) < 2])
+def test_an_observer_ends_a_run_by_true_of_any_library(answer):
+    assert wrapped().adapt(1 / 4, **BRIEF, observe=lambda step, *_: step == 2 and answer).report.ended_by == "its observer"
+
+
+@pytest.mark.parametrize("answer", [None, 1, "yes", torch.ones(2, 2), [True]])
+def test_no_other_answer_of_an_observer_ends_a_run(answer):
+    assert wrapped().adapt(1 / 4, **BRIEF, observe=lambda *_: answer).report.ended_by == "7 steps"
+
+
 def test_a_bare_file_without_cameras_adapts_on_an_orbit(tmp_path, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
     adapted = wrap_model(tiny.ply(tmp_path / "base.ply"), backend="reference").adapt(1 / 4, steps=2, extra_views=3)

@@ -18,7 +18,7 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance import chunks as chunks_module
-from mipmap_plugin.levels.distance.chunks import Chunks
+from mipmap_plugin.levels.distance.chunks import Chunks, shrunk
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats, shaped
 from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, scene_of
 from mipmap_plugin.levels.distance.mixture import Mixture, together
@@ -130,6 +130,12 @@ def test_one_large_splat_hardly_enlarges_a_box():
     ends = [Chunks.of(replace(splats, scales=each), extent=0.5, least=10) for each in (splats.scales, scales)]
     grown = ((ends[1].high - ends[1].low) - (ends[0].high - ends[0].low)).max()
     assert 40 < grown < 100  # of more than 200
+
+
+def test_of_two_boxes_the_larger_is_the_usual_one():
+    """As in PlayCanvas, whose median of an even number is the upper one."""
+    assert shrunk(torch.tensor([[1.0, 1, 1], [5, 5, 5]])).tolist() == [[1, 1, 1], [5, 5, 5]]
+    assert shrunk(torch.tensor([[1.0, 1, 1], [1, 1, 1], [5, 5, 5]]))[2].tolist() == [2, 2, 2]
 
 
 def test_splats_in_one_place_are_one_chunk():

@@ -70,7 +70,7 @@ class Adapted:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
         with together(Path(path)):  # a new model never appears without its report
             saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
-            write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=True)
+            write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=overwrite)
         if self.state is not None:
             self.state.remove()
         return saved

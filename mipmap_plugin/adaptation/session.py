@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 from torch import Tensor
 
 from mipmap_plugin import pool, threads
@@ -41,8 +42,8 @@ from mipmap_plugin.effects import Effect, Effects, explain
 from mipmap_plugin.models.base import SplatModel, digest_of_parameters, effects_of
 from mipmap_plugin.progress import announced
 
-# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> True to end the run with this
-# step, and anything else to go on. Its time is not counted.
+# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> True (Python's, NumPy's or torch's)
+# to end the run with this step, and anything else to go on. Its time is not counted.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], object]
 
 
@@ -184,9 +185,10 @@ class Session:
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
         task, config = within_budget(run, task, self.config)
 
-        def after_step(run: Run) -> object:
+        def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
-            return observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
+            answer = observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
+            return isinstance(answer, (bool, np.bool_, Tensor)) and np.array_equal(answer, True)
 
         ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
         run.optimizer.state.clear()

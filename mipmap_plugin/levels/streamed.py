@@ -16,9 +16,12 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import torch
+
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
+from mipmap_plugin.levels.distance.chunks import shrunk
 from mipmap_plugin.levels.manifest import read_manifest
 
 STREAMED, META, SETTINGS = "streamed", "lod-meta.json", "playcanvas.json"
@@ -31,8 +34,8 @@ CANVAS = 1080
 # The part of the distance of the first switch that a chunk may extend over, so that its near and far end are seen at nearly one zoom.
 EXTENT = 1 / 4
 
-# PlayCanvas's own: the part of a box's excess that is left out of distances, and the splats that are shown at most.
-SHRINK, BUDGET = 0.75, 1_000_000
+# The splats that PlayCanvas shows at most.
+BUDGET = 1_000_000
 
 # PlayCanvas's bounds of `lodBaseDistance`, in world units, and of `lodMultiplier`.
 NEAREST, LEAST_MULTIPLIER = 0.1, 1.2
@@ -48,11 +51,9 @@ def distances(manifest: dict[str, Any], canvas: int = CANVAS) -> list[float]:
 
 def nearer(chunks: Sequence[Chunk]) -> float:
     """How much closer than its splats a chunk is taken to be, in world units: the mean over the finest level's splats."""
-    halves = [[(high - low) / 2 for low, high in zip(chunk.low, chunk.high, strict=True)] for chunk in chunks]
-    usual = [sorted(axis)[len(axis) // 2] for axis in zip(*halves, strict=True)]
-    seen = [[half - SHRINK * max(0.0, half - middle) for half, middle in zip(each, usual, strict=True)] for each in halves]
-    splats = [chunk.splats[0] for chunk in chunks]
-    return float(sum(count * sum(each) / 2 for count, each in zip(splats, seen, strict=True))) / max(1, sum(splats))
+    low, high = (torch.tensor([getattr(chunk, end) for chunk in chunks], dtype=torch.float64) for end in ("low", "high"))
+    splats = torch.tensor([chunk.splats[0] for chunk in chunks], dtype=torch.float64)
+    return float(splats @ shrunk((high - low) / 2).sum(1) / 2 / splats.sum().clamp_min(1))
 
 
 def progression(rising: Sequence[float], ratio: float) -> tuple[float, float]:

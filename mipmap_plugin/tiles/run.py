@@ -205,5 +205,5 @@ def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) ->
             degree = scene.wrapped.model.gaussians(scene.wrapped.any_camera()).sh_degree
             folder, iteration = scene.checkpoint.folder, scene.checkpoint.iteration
             saved = write_folder(job.target, folder, cfg_args_for(folder, job.target, trained, degree), iteration, job.overwrite, write)
-        write_json(saved.with_name(saved.name + REPORT), joined.facts(), overwrite=True)
+        write_json(saved.with_name(saved.name + REPORT), joined.facts(), overwrite=job.overwrite)
     return replace(joined, file=saved)
