@@ -66,7 +66,7 @@ def main(
     """
     wrapped = wrap_model(data / "checkpoints" / "bases" / base, backend=backend)
     scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
-    evaluator = Evaluator(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
+    evaluator = Evaluator(test_views(scene, wrapped.cameras, wrapped.background), PROTOCOLS["P3"], scene=scene.source.name)
     scored = dict(views="given", cameras=[view.camera for view in evaluator.views])
     warm_up(wrapped, scale, wrapped.cameras)
     for name in only or ABLATIONS:

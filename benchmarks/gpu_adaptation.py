@@ -43,7 +43,7 @@ def _of_base(data: Path, base: str, backend: str, device: str, settings: dict) -
     here = load_model(data / "checkpoints" / "bases" / base)
     wrapped = wrap_model(here.to(device), cameras=own_cameras(here), backend=backend)
     scene = wrapped.place(load_scene(data / "images" / base.split("_")[0]))
-    evaluator = Evaluator(test_views(scene, wrapped.cameras[0], wrapped.background), PROTOCOLS["P3"])
+    evaluator = Evaluator(test_views(scene, wrapped.cameras, wrapped.background), PROTOCOLS["P3"])
     wrapped.adapt(1 / 2, **{**settings, "steps": 10})  # compiles what is to be compiled
     rows = []
     for scale in SCALES[base]:

@@ -61,7 +61,7 @@ def main(
     torch.set_num_threads(1)
     for base in only or SCALES:
         model = wrap_model(data / "checkpoints" / "bases" / base)
-        judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras[0], model.background)[:views]
+        judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras, model.background)[:views]
         judge = Evaluator(judged, PROTOCOLS["P3"], None, base)
         rows = [row for scale in SCALES[base] if scale != 1 for row in rows_of(model, judge, scale)]
         write_json(output / "tenth" / f"{base}.json", records(rows), overwrite=True)

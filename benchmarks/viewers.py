@@ -147,7 +147,7 @@ def main(
     pictures.mkdir(parents=True, exist_ok=True)
     for base in only or BASES:
         wrapped = wrap_model(data / "checkpoints" / "bases" / base)
-        views = test_views(wrapped.place(load_scene(data / "images" / base.split("_")[0])), wrapped.cameras[0], wrapped.background)[VIEWS]
+        views = test_views(wrapped.place(load_scene(data / "images" / base.split("_")[0])), wrapped.cameras, wrapped.background)[VIEWS]
         for at in scale or SCALES:
             with tempfile.TemporaryDirectory() as folder, Browser() as browser:
                 work = Work(wrapped, at, Path(folder))

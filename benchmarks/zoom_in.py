@@ -115,7 +115,7 @@ def main(
     perceptual = Perceptual("alex", data / "lpips" / "alexnet_features_fp16.pth")
     for base in only or ("lego_100", "chair_100"):
         model = wrap_model(data / "checkpoints" / "bases" / base)
-        judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras[0], model.background)[:views]
+        judged = test_views(load_scene(data / "images" / base.split("_")[0]), model.cameras, model.background)[:views]
         judge = Evaluator(judged, PROTOCOLS["P3"], perceptual, base)
         file, rows = output / "zoom_in" / f"{base}.json", []
         for each in scale or (2, 4):

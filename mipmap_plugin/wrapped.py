@@ -188,7 +188,7 @@ class Wrapped:
             config = make_config(recipe, scale, **(settings_for_several(config) | settings))
         views = {} if cameras is None else {"views": digest_of(cameras)}
         inputs = self.asked | views | ({} if images is None else {"photographs": images.digest()})
-        photographs = None if images is None else Photographs(self.place(images), next(iter(self.cameras), None), self.background)
+        photographs = None if images is None else Photographs(self.place(images), self.cameras, self.background)
         if cameras is None:
             cameras = photographs.cameras if photographs else self.cameras
         needs = [replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]

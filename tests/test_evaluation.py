@@ -137,7 +137,7 @@ def test_p4_refuses_a_size_that_no_folder_has(folders, tmp_path):
 def test_test_views_are_brought_to_the_density_of_the_base(scene):
     base = tiny.cameras()[0]
     for scale in (1, 1 / 2):
-        views = protocols.test_views(scene, base.zoomed(scale), (0.0, 0.0, 0.0))
+        views = protocols.test_views(scene, [base.zoomed(scale)], (0.0, 0.0, 0.0))
         assert [view.camera.name for view in views] == ["view_0", "view_1"]
         assert all(view.camera.split == "test" and view.camera.size == (24 * scale, 32 * scale) for view in views)
         assert all(view.photograph.shape == (24, 32, 3) for view in views)
@@ -169,19 +169,19 @@ def test_beyond_the_limit_photographs_are_read_again(scene, monkeypatch):
 
 def test_all_photographs_are_judged_by_where_none_is_a_test_view(scene):
     only_train = replace(scene, cameras=tuple(scene.split("train")))
-    assert len(protocols.test_views(only_train, tiny.cameras()[0], (0.0, 0.0, 0.0))) == 3
+    assert len(protocols.test_views(only_train, tiny.cameras(), (0.0, 0.0, 0.0))) == 3
 
 
 def test_a_scene_without_photographs_is_refused(scene):
     with pytest.raises(SettingsError, match="there are no photographs to compare with"):
-        protocols.test_views(replace(scene, images={}), tiny.cameras()[0], (0.0, 0.0, 0.0))
+        protocols.test_views(replace(scene, images={}), tiny.cameras(), (0.0, 0.0, 0.0))
 
 
 # Rows
 
 
 def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
-    views = protocols.test_views(scene, tiny.cameras()[0], (0.0, 0.0, 0.0))
+    views = protocols.test_views(scene, tiny.cameras(), (0.0, 0.0, 0.0))
     row = Evaluator(views, PROTOCOLS["P3"]).row("black", 1, lambda camera: torch.zeros(*camera.size, 3), gaussians=7)
     assert row.psnr_db == pytest.approx(sum(psnr(torch.zeros(24, 32, 3), view.photograph) for view in views) / 2)
     assert (row.name, row.scale, row.gaussians, row.adapt_seconds, row.adapted_on) == ("black", 1, 7, 0.0, "-")
@@ -189,7 +189,7 @@ def test_a_row_is_the_mean_over_the_views_of_each_views_decibel(scene):
 
 
 def test_the_base_against_photographs_of_itself_is_perfect(model, scene):
-    views = protocols.test_views(scene, tiny.cameras()[0], (0.0, 0.0, 0.0))
+    views = protocols.test_views(scene, tiny.cameras(), (0.0, 0.0, 0.0))
     [row] = training_free_rows(model, Evaluator(views, PROTOCOLS["P3"]), 1)
     assert row.name == "base" and row.psnr_db > 50 and row.ssim == pytest.approx(1.0, abs=1e-3)
 

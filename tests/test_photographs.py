@@ -1,16 +1,18 @@
 """Real images as the truth of a zoom-in, for the views that have one."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin.adaptation.target.base_images import BaseImages
-from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.target.photographs import Photographs, at_density_of
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.camera import Camera
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
@@ -34,15 +36,25 @@ def scene(folder):
 
 
 def test_images_are_brought_to_the_density_of_the_base(scene):
-    real = Photographs(scene, tiny.cameras()[0], BLACK)
+    real = Photographs(scene, tiny.cameras(), BLACK)
     assert [camera.size for camera in real.cameras] == [(24, 32)] * 3
     photograph = scene.image(scene.split("train")[1], BLACK)
     torch.testing.assert_close(real(real.cameras[1]), resize(photograph, (24, 32), "pil-bicubic").clamp(0, 1))
     assert real(tiny.cameras()[0]) is None
 
 
+def test_images_of_several_sizes_are_brought_to_the_density_of_their_own_views():
+    """Trainings shrink upright and wide images of one lens to the same width."""
+    wide, upright = (Camera(*size, 3000, 3000, size[0] / 2, size[1] / 2, torch.eye(4)) for size in ((4000, 3000), (3000, 4000)))
+    base = [wide.resized(1600, 1200), upright.resized(1600, 2133)]
+    assert [camera.size for camera in at_density_of([upright, wide], base)] == [(2133, 1600), (1200, 1600)]
+    by_name = [replace(base[0], name="a"), replace(base[0].resized(400, 300), name="b")]
+    photographs = [replace(wide, name=name) for name in ("images/b.jpg", "a.png", "c")]
+    assert [camera.width for camera in at_density_of(photographs, by_name)] == [400, 1600, 1600]
+
+
 def test_the_truth_is_the_image_where_there_is_one_and_the_bases_elsewhere(scene):
-    real, other = Photographs(scene, tiny.cameras()[0], BLACK), tiny.cameras(1)[0]
+    real, other = Photographs(scene, tiny.cameras(), BLACK), tiny.cameras(1)[0]
     truth = PseudoTruth(BaseImages(tiny.model(), ReferenceBackend(), Effects(1)), 2, recipe("default", 2), real)
     torch.testing.assert_close(truth(real.cameras[0]), real(real.cameras[0]), atol=1e-4, rtol=0)
     base = ReferenceBackend().render(tiny.gaussians(), other, Effects(1)).image.clamp(0, 1)

@@ -165,7 +165,7 @@ def evaluator_of(
     scene = model.place(scene)
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
-    views = test_views(scene, model.cameras[0], model.background)
+    views = test_views(scene, model.cameras, model.background)
     return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, watcher, cells or Cells())
 
 

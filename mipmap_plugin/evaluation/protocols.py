@@ -11,7 +11,7 @@ rounds, and their metrics.py reads those files.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol as TypingProtocol
@@ -127,8 +127,8 @@ def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
     raise SettingsError(f"P4 needs {required}, but there is {available}; evaluate a scale that has one, or by P3")
 
 
-def test_views(scene: Scene, base: Camera, background: tuple[float, float, float]) -> list[TestView]:
-    """The scene's test photographs (all, if none is marked as test), with their cameras at the pixel density of `base`."""
+def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, float, float]) -> list[TestView]:
+    """The scene's test photographs (all, if none is marked as test), with their cameras at the pixel density of the cameras of the base."""
     cameras = [c for c in scene.cameras if c in scene.images]
     cameras = [c for c in cameras if c.split == "test"] or cameras
     if not cameras:
@@ -136,11 +136,11 @@ def test_views(scene: Scene, base: Camera, background: tuple[float, float, float
 
     photographs = Photographs(scene, background)
 
-    def view(camera: Camera) -> TestView:
-        file = scene.images[camera]
-        return TestView(at_density_of(camera, base), photographs.of(camera), file, background, file in scene.lenses)
+    def view(original: Camera, camera: Camera) -> TestView:
+        file = scene.images[original]
+        return TestView(camera, photographs.of(original), file, background, file in scene.lenses)
 
-    return [view(camera) for camera in cameras]
+    return [*map(view, cameras, at_density_of(cameras, base))]
 
 
 def not_exposed(model: SplatModel) -> list[str]:

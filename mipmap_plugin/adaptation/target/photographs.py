@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Sequence
+from pathlib import Path
 
 from torch import Tensor
 
@@ -15,12 +18,13 @@ from mipmap_plugin.scenes import Scene
 class Photographs:
     """The training images of a scene at the pixel density of the base, and their cameras."""
 
-    def __init__(self, scene: Scene, base: Camera | None, background: tuple[float, float, float]) -> None:
-        """`base`: any camera of the base scale. Raises SettingsError if it is None, and for a scene without training images."""
-        if base is None:
+    def __init__(self, scene: Scene, base: Sequence[Camera], background: tuple[float, float, float]) -> None:
+        """`base`: the cameras of the base. Raises SettingsError if it has none, and for a scene without training images."""
+        if not base:
             raise SettingsError("the checkpoint has no cameras, so that the scale of the images is not known; give its model folder")
         self._scene, self._background = scene, background
-        self._originals = {at_density_of(camera, base): camera for camera in scene.split("train") if camera in scene.images}
+        originals = [camera for camera in scene.split("train") if camera in scene.images]
+        self._originals = dict(zip(at_density_of(originals, base), originals, strict=True))
         if not self._originals:
             raise SettingsError(f"{scene.source}: there are no training images to adapt to; leave them out, or give the folder that has them")
         self.cameras = list(self._originals)
@@ -39,7 +43,25 @@ class Photographs:
         return resize(self._scene.image(self._originals[view], self._background), view.size, "pil-bicubic").clamp(0, 1)
 
 
-def at_density_of(camera: Camera, base: Camera) -> Camera:
-    """`camera` at the pixel density of `base`, as a view of the base scale (its `zoom` stays)."""
-    ratio = base.fx / camera.fx
-    return camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
+def at_density_of(cameras: Sequence[Camera], base: Sequence[Camera]) -> list[Camera]:
+    """The cameras as views of the base scale (their `zoom` stays): each at the pixel density of the base's view of that name.
+
+    Cameras that the base does not have get the density of those of the most similar field of view: trainings shrink images of other sizes
+    by other factors, such as upright and wide ones of the same lens to the same width.
+    """
+    kinds, named = {(*view.size, view.fx, view.fy): view for view in base}, defaultdict[str, list[Camera]](list)
+    for view in base:
+        named[Path(view.name).stem].append(view)  # several, where images of several folders have the same names
+
+    def at_density(camera: Camera) -> Camera:
+        views = named.get(Path(camera.name).stem) or kinds.values()
+        ratio = min(views, key=lambda view: _difference(view, camera)).fx / camera.fx
+        return camera.resized(max(1, round(camera.width * ratio)), max(1, round(camera.height * ratio)))
+
+    return [*map(at_density, cameras)]
+
+
+def _difference(one: Camera, other: Camera) -> float:
+    """How much the fields of view of two cameras differ along both axes: the sum of the logarithms of their ratios."""
+    ratios = one.width / one.fx * other.fx / other.width, one.height / one.fy * other.fy / other.height
+    return sum(abs(math.log(ratio)) for ratio in ratios)

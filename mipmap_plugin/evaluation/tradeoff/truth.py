@@ -47,7 +47,7 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
     scene = model.place(scene)
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
-    judged: dict[Camera, TruthView] = {view.camera: view for view in test_views(scene, model.cameras[0], model.background)}
+    judged: dict[Camera, TruthView] = {view.camera: view for view in test_views(scene, model.cameras, model.background)}
     train = [camera for camera in model.cameras if camera.split == "train"] or model.cameras
     views, adapt_on = list(judged), _others(train, list(judged))
     if not adapt_on:
