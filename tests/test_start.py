@@ -95,7 +95,25 @@ def test_merging_is_done_as_far_as_it_may_cost(a_decibel_a_splat):
 def test_merged_splats_that_are_worse_than_the_base_are_not_begun_with(monkeypatch):
     monkeypatch.setattr(Validation, "steer", lambda self, model: float(len(model)))
     report = adapted(merge_to=0.5, merging_costs=COUNT).report
-    assert (start_of(report), report.gaussians_after) == ("the base", COUNT)
+    assert (start_of(report), report.gaussians_after) == ("the closed form", COUNT)
+
+
+def test_what_is_merged_furthest_without_being_worse_than_the_base_is_begun_with(monkeypatch):
+    """Also where the closed form of all splats is worse than both."""
+    tried = []
+
+    def steer(self, model):
+        tried.append(len(model))
+        return [30.0, 20.0, 35.0, 25.0, 32.0][len(tried) - 1]  # the base, the closed form, and merging mildly, strongly, and in between
+
+    monkeypatch.setattr(Validation, "steer", steer)
+    report = adapted(merge_to=0.5, merging_costs=COUNT).report
+    assert (start_of(report), report.gaussians_after) == ("the closed form of merged splats", tried[4])
+
+
+def test_merging_without_a_closed_form_is_called_so(monkeypatch):
+    monkeypatch.setattr(Validation, "steer", lambda self, model: float(-len(model)))
+    assert start_of(adapted(merge_to=0.5, closed_form=False).report) == "merged splats"
 
 
 def test_phases_are_named():

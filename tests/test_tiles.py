@@ -221,16 +221,47 @@ def test_parts_of_other_columns_are_refused(tmp_path):
 # The halo
 
 
-@pytest.fixture
-def halved(job):
-    """A scene in three tiles that begins with the base, and has the layers and halos of its first sweep."""
-    job = replace(job, settings=job.settings | {"closed_form": False})
+def cut_in_three(job, **settings):
+    """A scene in three tiles with its truths, and its folder."""
+    job = replace(job, settings=job.settings | settings)
     folder = work_folder(job.target)
     folder.mkdir()
     make_cut(job.base.checkpoint, 3, folder)
     scene = opened(job.base, job.scale, None, job.config(), folder)
     for part in range(parts(scene.used_views)):
         draw_truths(scene, part, folder)
+    return scene, folder
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "name"),
+    [
+        ((30.0, 20.0, 25.0, 32.0), "the closed form of merged splats"),  # the base, the closed form, and what is merged less and less
+        ((30.0, 31.0, 25.0, 26.0, 27.0), "the closed form"),
+        ((30.0, 20.0, 25.0, 26.0, 27.0), "the base as it is"),
+    ],
+)
+def test_no_start_is_worse_than_the_base(job, monkeypatch, psnrs, name):
+    scene, folder = cut_in_three(job, merge_to=0.5, merging_costs=20.0)
+    measured = iter(psnrs)
+    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
+    StartSearch(scene, folder).run()
+    assert torch.load(folder / "start.pt")["name"] == name and not list(measured)
+
+
+def test_without_a_closed_form_merged_splats_keep_their_opacities(job, monkeypatch):
+    """As without tiles, where they are matched in the closed form."""
+    scene, folder = cut_in_three(job, merge_to=0.5, closed_form=False)
+    monkeypatch.setattr(StartSearch, "_match", None)
+    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda scene, splats, *_: -float(len(splats)))
+    StartSearch(scene, folder).run()
+    assert torch.load(folder / "start.pt")["name"] == "merged splats"
+
+
+@pytest.fixture
+def halved(job):
+    """A scene in three tiles that begins with the base, and has the layers and halos of its first sweep."""
+    scene, folder = cut_in_three(job, closed_form=False)
     StartSearch(scene, folder).run()
     for number in range(3):
         draw_layers(scene, number, scene.sweeps[0], folder)
@@ -518,6 +549,7 @@ def test_invalid_splats_are_left_out(tmp_path, job):
     [
         ({}, 1, "give at least 2, got 1"),
         ({"scale": 4.0}, 2, "cut into tiles for a zoom-out"),
+        ({"scale": 1.0}, 2, "x1: the base is right as it is"),
         ({"viewer": "portable"}, 2, "stands for several; give one of them"),
         ({"settings": {"most_splats": 10}}, 2, "to no number of splats"),
     ],

@@ -35,6 +35,8 @@ def refuse(job: Job, tiles: int) -> None:
         raise SettingsError(f"tiles: give at least 2, got {tiles}; a scene that is not cut needs no tiles")
     if job.images is not None or job.scale > 1:
         raise SettingsError(f"x{job.scale:g}: a scene is cut into tiles for a zoom-out, without photographs; adapt it without tiles")
+    if job.scale == 1 and job.viewer is None:
+        raise SettingsError("x1: the base is right as it is, so that there is nothing to cut it into tiles for; give a smaller scale, or a viewer")
     if config.most_splats is not None or config.band != (1, 1):
         raise SettingsError("tiles are adapted to one scale, and to no number of splats; leave most_splats (--splats) and band out")
     if job.viewer is not None and len(viewers_for(job.viewer)) > 1:

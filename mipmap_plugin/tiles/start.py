@@ -12,7 +12,7 @@ from torch import Tensor
 from mipmap_plugin import pool
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.adaptation.report import AS_IT_IS
-from mipmap_plugin.adaptation.start.candidates import WEIGHT_VIEWS
+from mipmap_plugin.adaptation.start.candidates import WEIGHT_VIEWS, start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, filter_suffices, pixel_size
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge
@@ -42,19 +42,22 @@ class StartSearch:
     @torch.no_grad()
     def run(self) -> None:
         """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
-        scene, config = self.scene, self.scene.config
+        scene, config, base_db = self.scene, self.scene.config, self.steer(self.scene.base)
+        if not (config.closed_form or config.merge_to < 1):
+            return self._take_base(base_db)
         weights = scene.painter(scene.base_effects).blend_weights(scene.base, self.views) * scene.scale**2
         pool.release_to_system()
-        if not (config.closed_form or config.merge_to < 1):
-            return self._take_base(self.steer(scene.base))
         self._candidate("formed", weights, 1.0)
-        formed_db, base_db = self.steer(self._open("formed")), self.steer(self.scene.base)
+        formed_db = self.steer(self._open("formed"))
+        least_db = max(formed_db - config.merging_costs, base_db)
         for fraction in (config.merge_to ** (1 / root) for root in ROOTS) if config.merge_to < 1 else ():
             self._candidate("merged", weights, fraction)
             merged_db = self.steer(self._open("merged"))
-            if merged_db >= formed_db - config.merging_costs:
-                return self._take("merged", "the closed form of merged splats", merged_db) if merged_db >= base_db else self._take_base(base_db)
-        return self._take_base(base_db) if formed_db < base_db else self._take("formed", "the closed form", formed_db)
+            if merged_db >= least_db:
+                return self._take("merged", start_name(config, merged=True), merged_db)
+        if formed_db < base_db or not config.closed_form:
+            return self._take_base(base_db)
+        return self._take("formed", start_name(config), formed_db)
 
     def steer(self, splats: Splats) -> float:
         """PSNR (dB) on the steering views."""
@@ -71,7 +74,7 @@ class StartSearch:
         cores = range(len(self.scene.cores))
         wanted = torch.cat([self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores])
         pool.release_to_system()
-        if self.matches:
+        if self.matches and self.scene.config.closed_form:
             self._match(name, wanted)
             pool.release_to_system()
 

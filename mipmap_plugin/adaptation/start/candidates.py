@@ -76,6 +76,14 @@ class StartProblem:
         )  # fmt: skip
 
 
+def start_name(config: AdaptConfig, *, merged: bool = False) -> str:
+    """What a start is called in the report."""
+    splats = "merged splats" if merged else "the base"
+    if not config.closed_form:
+        return splats
+    return f"the closed form of {splats}" if merged else "the closed form"
+
+
 class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
@@ -94,35 +102,35 @@ class StartSearch:
         with problem.phase("blend weights"):
             weights = self._base_weights(base) if self._matches_weights or config.merge_to < 1 or too_many else None
         if too_many:
-            return self._candidate(weights, 0.0), "the closed form of merged splats"
+            return self._candidate(weights, 0.0), start_name(config, merged=True)
         formed = self._candidate(weights, 1.0)
         if config.merge_to == 1 and config.returns == "last":
-            return formed, "the closed form"
+            return formed, start_name(config)
         base_db, formed_db = problem.steer(base), problem.steer(formed)
+        least_db = max(formed_db - config.merging_costs, base_db - problem.may_lose)
         least_coarse_db = math.inf if problem.coarse_base is None else self._least_coarse_db(base_db, problem.coarse_base())
-        merged = self._merged(weights, formed_db - config.merging_costs, least_coarse_db) if config.merge_to < 1 else None
+        merged = self._merged(weights, least_db, least_coarse_db) if config.merge_to < 1 else None
         if merged is not None:
-            model, merged_db = merged
-            return (model, "the closed form of merged splats") if merged_db >= base_db - problem.may_lose else (base, problem.name)
-        return (formed, "the closed form") if formed_db >= base_db else (base, problem.name)
+            return merged, start_name(config, merged=True)
+        return (formed, start_name(config)) if formed_db >= base_db and config.closed_form else (base, problem.name)
 
-    def _merged(self, weights: Tensor | None, least_db: float, least_coarse_db: float) -> tuple[SplatModel, float] | None:
-        """What is merged furthest and shows at least so many dB, and its PSNR; None if merging costs too much.
+    def _merged(self, weights: Tensor | None, least_db: float, least_coarse_db: float) -> SplatModel | None:
+        """What is merged furthest and shows at least so many dB; None if merging costs too much.
 
         Splats that can hardly be merged lose too much by the mildest merging already, as those of captures do: then no other is tried.
         """
         for power in COARSE_POWERS if self._problem.coarse_base else ():
             coarse, coarse_db = self._tried(weights, power, coarsely=True)
             if coarse_db >= max(least_db, least_coarse_db):
-                return coarse, coarse_db
+                return coarse
         mildest, mildest_db = self._tried(weights, POWERS[-1])
         if mildest_db < least_db:
             return None
         for power in POWERS[:-1]:
             merged, merged_db = self._tried(weights, power)
             if merged_db >= least_db:
-                return merged, merged_db
-        return mildest, mildest_db
+                return merged
+        return mildest
 
     def _tried(self, weights: Tensor | None, power: float, coarsely: bool = False) -> tuple[SplatModel, float]:
         """A candidate and its PSNR."""
