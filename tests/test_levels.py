@@ -13,7 +13,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin import cli, load_model, wrap_model
+from mipmap_plugin import cli, load_model, recipes, wrap_model
 from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -192,8 +192,38 @@ def test_levels_below_a_half_are_denser_unless_a_ratio_is_asked_for():
 
 
 def test_a_level_that_starts_from_a_finer_one_takes_fewer_steps():
-    assert LadderRequest("spark").steps(1 / 4) == math.ceil(STEPS_KEPT * recipe("default", 1 / 4).steps)
-    assert LadderRequest("spark", recipe="instant").steps(1 / 4) == 0
+    assert LadderRequest("spark").steps(1 / 4)["steps"] == math.ceil(STEPS_KEPT * recipe("default", 1 / 4).steps)
+    assert LadderRequest("spark", recipe="instant").steps(1 / 4)["steps"] == 0
+
+
+def test_levels_of_a_large_scene_take_fewer_steps_unless_asked_for(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.recipes.DEFAULT_OUT", recipes.DEFAULT_OUT | dict(steps=40, most_draws=1.0, extra_views=2))
+
+    def steps(**settings):
+        ladder = make_levels(wrapped(), LadderRequest("classic", coarsest=1 / 2, ratio=4.0, settings={"validation_views": 2, **settings}))
+        return ladder.levels[1].adapted.report.settings.steps
+
+    assert steps() == math.ceil(STEPS_KEPT * 40 / 4)
+    assert steps(steps=5) == 5
+
+
+@pytest.mark.parametrize("change", [{"split": "test"}, {"time": 0.5}, {"width": 33}])
+def test_levels_of_other_cameras_are_not_gone_on_with(tmp_path, change):
+    base = wrapped()
+    make_levels(base, request(coarsest=0.9), tmp_path / "state")
+    base.cameras[-1] = replace(base.cameras[-1], **change)
+    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
+        make_levels(base, request(coarsest=0.9), tmp_path / "state")
+
+
+def test_levels_of_another_model_are_not_gone_on_with(tmp_path):
+    """One whose parameters have the same sums."""
+    first, other = wrapped(), wrapped()
+    with torch.no_grad():
+        other.model.parameters()["means"].copy_(first.model.parameters()["means"].flip(0))
+    make_levels(first, request(coarsest=0.9), tmp_path / "state")
+    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
+        make_levels(other, request(coarsest=0.9), tmp_path / "state")
 
 
 @pytest.mark.parametrize(

@@ -306,6 +306,9 @@ def test_a_ladder_from_end_to_end(tmp_path, small_chunks, capsys):
     assert progression(distances(manifest, manifest["canvas"]), 2.0) == pytest.approx((manifest["lodBaseDistance"], manifest["lodMultiplier"]))
     assert manifest["levels"][0]["distance_to"] == pytest.approx(manifest["lodBaseDistance"]) == manifest["levels"][1]["distance_from"]
     assert manifest["levels"][-1]["distance_to"] is None
+    assert [level["scale"] for level in manifest["levels"]] == [level.report.scale for level in ladder.contents.levels]
+    near, pixels = manifest["base_pixel"], [level["pixel_from"] for level in manifest["levels"][1:]]
+    assert [level["scale"] for level in manifest["levels"][1:]] == pytest.approx([near / (pixel * 2**0.5) for pixel in pixels])
     assert [point["pixel"] for point in manifest["curve"]] == sorted(point["pixel"] for point in manifest["curve"])
     print_summary(folder, manifest)
     assert "3 levels by distance" in capsys.readouterr().out

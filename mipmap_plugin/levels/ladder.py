@@ -101,7 +101,7 @@ class _Work:
         start, ratio = FinerLevel(last.adapted.model, last.band.scale), self.request.next_ratio(last.band.low, ratio)
         while True:
             band = last.band.next(ratio, self.request.coarsest)
-            settings = band.settings() | {"start": start, "steps": self.request.steps(band.scale)}
+            settings = band.settings() | {"start": start, **self.request.steps(band.scale)}
             level = self._made(f"level_{len(levels)}_x{band.scale:.6g}", band, settings)
             narrower = ratio**0.5
             if self._suffices(level) or narrower * SAME < FINEST_RATIO:

@@ -98,9 +98,13 @@ class LadderRequest:
         """The ratio below a level that is shown down to this zoom, after levels of the given ratio."""
         return min(ratio, NARROW) if self.ratio is None and shown_down_to < DENSE_BELOW else ratio
 
-    def steps(self, scale: float) -> int:
-        """The steps of a level that starts from a finer one. Raises SettingsError for a setting that is unknown or out of range."""
-        return math.ceil(STEPS_KEPT * recipe(self.recipe, scale).steps)
+    def steps(self, scale: float) -> dict[str, Any]:
+        """The settings of AdaptConfig for the steps of a level that starts from a finer one; fewer of a large scene, unless the user settles it.
+
+        Raises SettingsError for a setting that is unknown or out of range.
+        """
+        steps = math.ceil(STEPS_KEPT * recipe(self.recipe, scale).steps)
+        return {"steps": steps, "most_draws": recipe(self.recipe, scale, **self.settings).most_draws}
 
     @property
     def seed(self) -> int:

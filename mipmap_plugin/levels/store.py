@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Callable
@@ -12,12 +11,14 @@ from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
+from mipmap_plugin.camera import digest_of
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.atomic import json_text, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.base import digest_of_parameters
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.wrap import Wrapped, state_path
 
@@ -72,8 +73,6 @@ def _trained(base: Wrapped, target: Effects) -> Any:
 
 def _facts(base: Wrapped, request: LadderRequest) -> dict[str, Any]:
     """Everything that the levels depend on."""
-    poses = [[view.width, view.height, view.fx, view.fy, view.cx, view.cy, *view.viewmat.flatten().tolist()] for view in base.cameras]
-    digest = hashlib.sha256(json.dumps([poses, base.background]).encode()).hexdigest()
-    parameters = base.model.digest or [float(tensor.double().sum()) for tensor in base.model.parameters().values()]
+    of_base = {"base": base.model.digest or digest_of_parameters(base.model), "trained": str(base.trained), "background": base.background}
     made_with = {"backend": base.backend(viewer=request.viewer)[0].name, "versions": versions()}
-    return {"base": parameters, "cameras": digest, "trained": str(base.trained), "request": request.facts(), **made_with}
+    return {**of_base, "cameras": digest_of(base.cameras), "request": request.facts(), **made_with}

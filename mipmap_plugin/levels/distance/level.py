@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Task
@@ -38,7 +39,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats, shaped
 from mipmap_plugin.levels.distance.mixture import Mixture
-from mipmap_plugin.levels.distance.rule import DistanceRule
+from mipmap_plugin.levels.distance.rule import DistanceRule, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, foreground
 from mipmap_plugin.levels.request import MERGING_COSTS, LadderRequest
 from mipmap_plugin.models.base import Rebuilt, SplatModel, digest_of_parameters, effects_of
@@ -48,6 +49,9 @@ from mipmap_plugin.wrap import Wrapped
 
 # Samples of the truth per pixel along each side, to adapt to and to measure by. In walks over flowers, three agree with six to 67 dB.
 SAMPLES, MEASURED_SAMPLES = 2, 3
+
+# The settings of a zoom-out end here; at x1 nothing would be merged.
+BELOW_1 = 1 - 1e-3
 
 # A view is used at least so many times in a run, because its truth costs as much as several steps.
 USES = 6
@@ -89,11 +93,23 @@ class Scene:
     def pixel_of(self, means: Tensor) -> Tensor:
         return pixel_size(means, self.views)
 
+    @cached_property
+    def near(self) -> float:
+        """The size of a pixel of the training at the nearest parts of the scene, in world units."""
+        return nearest(self.pixel_of(self.splats.means))
+
+    def scale(self, level: int) -> float:
+        """The scale of a level at the nearest parts of the scene."""
+        return min(1.0, self.near / self.rule.middle(level)) if level else 1.0
+
     def config(self, level: int) -> AdaptConfig:
         """The settings of a level. Rows stay what they are, because those of the finer level come first."""
-        scale = min(1 - 1e-3, float(self.rule.ratio ** (0.5 - level)))
-        config = fitting(make_config(self.request.recipe, scale, merge_to=1.0, **self.request.settings), self.base.effects())
-        return config.model_copy(update={"prune_every": max(1, config.steps)})
+        config = affordable_for(self.asked(level), self.splats.means, self.views, self.target.near_plane)
+        return fitting(config, self.base.effects()).model_copy(update={"prune_every": max(1, config.steps)})
+
+    def asked(self, level: int) -> AdaptConfig:
+        """The settings of a level in a scene of any size."""
+        return make_config(self.request.recipe, min(BELOW_1, self.scale(level)), merge_to=1.0, **self.request.settings)
 
     def unmade(self, finest: Gaussians, level: int) -> Gaussians:
         """A level that is not made yet, in closed form."""
@@ -218,16 +234,15 @@ class LevelRun:
 
     def _fingerprint(self) -> str:
         scene = self.scene
-        finer = [float(tensor.detach().double().sum()) for model in self.finer for tensor in model.parameters().values()]
         base = scene.base.model.digest or digest_of_parameters(scene.base.model)
         facts = [base, self.number, self.config.model_dump(), scene.backend.name, asdict(scene.target), asdict(scene.rule)]
-        return hashlib.sha256(json.dumps([*facts, finer, digest_of(self.views)]).encode()).hexdigest()
+        return hashlib.sha256(json.dumps([*facts, *map(digest_of_parameters, self.finer), digest_of(self.views)]).encode()).hexdigest()
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, best: str, psnrs: dict[str, float]) -> Report:
         scene, any_camera = self.scene, self.scene.base.any_camera()
         effects = scene.base.effects()
         return Report(
-            scale=scene.rule.ratio ** (0.5 - self.number),
+            scale=scene.scale(self.number),
             base=scene.base.model.digest or digest_of_parameters(scene.base.model),
             settings=self.config,
             backend=scene.note,
@@ -238,11 +253,12 @@ class LevelRun:
             gaussians_before=len(scene.splats),
             gaussians_after=len(student.gaussians(any_camera)),
             seconds=self.seconds,
-            ended_by=ended_by,
+            ended_by=ended_by + fewer_note(scene.asked(self.number).steps, self.config),
             returned=best,
             validation=psnrs,
             curve=curve,
             versions=versions(),
+            inputs=scene.base.asked,
         )
 
 

@@ -10,7 +10,6 @@ from typing import Any
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.formats.atomic import new_folder, sha256, write_json
 from mipmap_plugin.levels.distance.level import Scene
-from mipmap_plugin.levels.distance.rule import nearest
 from mipmap_plugin.levels.distance.yardstick import TRUTH, WalkPoint
 from mipmap_plugin.levels.manifest import FORMAT, MANIFEST, level_name, refuse_ladder
 
@@ -39,7 +38,6 @@ def write(ladder: Contents, folder: Path, overwrite: bool) -> Path:
 def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
     """The manifest of a ladder whose levels are in `files`."""
     scene, first = ladder.scene, ladder.levels[0].report
-    near = nearest(scene.pixel_of(scene.splats.means))
     switches = [scene.rule.ends(number)[1] for number in range(scene.rule.count - 1)]
     distance, multiplier = scene.rule.playcanvas(CANVAS)
     return {
@@ -47,9 +45,9 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
         "by": "distance",
         "viewer": scene.request.viewer,
         "base": first.base,
-        "base_pixel": near,
-        "levels": [_entry(ladder, number, file, near) for number, file in enumerate(files)],
-        "switches": [{"pixel": size, "zoom": near / size} for size in switches],
+        "base_pixel": scene.near,
+        "levels": [_entry(ladder, number, file) for number, file in enumerate(files)],
+        "switches": [{"pixel": size, "zoom": scene.near / size} for size in switches],
         "lodBaseDistance": distance,
         "lodMultiplier": multiplier,
         "canvas": CANVAS,
@@ -62,7 +60,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
     }
 
 
-def _entry(ladder: Contents, number: int, file: Path, near: float) -> dict[str, Any]:
+def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:
     """One level, and the distances on the canvas between which it is shown; null: no limit."""
     level, rule = ladder.levels[number], ladder.scene.rule
     low, high = rule.ends(number)
@@ -70,7 +68,7 @@ def _entry(ladder: Contents, number: int, file: Path, near: float) -> dict[str, 
     to_distance = rule.playcanvas(CANVAS)[0] / rule.first
     return {
         "file": file.name,
-        "scale": min(1.0, near / rule.middle(number)) if number else 1.0,
+        "scale": ladder.scene.scale(number),
         "pixel_from": low,
         "pixel_to": None if last else high,
         "distance_from": low * to_distance,
