@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+from dataclasses import replace
 from importlib.resources import files
 
 import pytest
@@ -14,6 +15,7 @@ from PIL import Image
 from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists
+from mipmap_plugin.evaluation.evaluate import Row
 from mipmap_plugin.evaluation.metrics import SAME_DB
 from mipmap_plugin.evaluation.shots import Shot
 from mipmap_plugin.formats.images import data_uri
@@ -21,7 +23,7 @@ from mipmap_plugin.pages.gallery import Gallery
 from mipmap_plugin.pages.html import LARGEST, html, write_page
 from mipmap_plugin.pages.in_viewers import made_for_viewers, viewer_pictures, why_not
 from mipmap_plugin.pages.record import Page, Picture, Zoom, zoom_name
-from mipmap_plugin.pages.reports import adaptation_zoom
+from mipmap_plugin.pages.reports import adaptation_zoom, evaluation_page
 
 TITLES = {"base": "base", "adapted": "adapted", "supersampled": "supersampling, 4 x 4", "truth": "truth"}
 BRIEF = ["--backend", "reference", "--views", "given", "--steps", "2"]
@@ -136,6 +138,29 @@ def test_a_file_for_a_viewer_is_compared_with_the_base_in_that_viewer(model_fold
     assert next(iter(roles)) == "base in spark" and [each.name for each in zoom.viewers if each.made_for] == ["spark"]
 
 
+def test_a_file_for_several_viewers_is_told_of_by_the_worst_of_them(model_folder):
+    base = wrap_model(model_folder, backend="reference")
+    camera, gallery = base.cameras[0], Gallery(base, "itself")
+    truth, row = base.render(camera).image, Row("", 1 / 2, "P3", 20.0, None, 3.0, 1.0, 9, scene="ball")
+    for name in ("base in spark", "base in classic", "instant in spark", "instant in classic"):
+        if name.startswith("instant"):
+            gallery.adapted(name, base.adapt(1 / 2, recipe="instant"))
+        gallery.shot(Shot(name, "ball", 1 / 2, camera, truth, truth, 20.0, None, None))
+    rows = [replace(row, name="base in classic, worst of 2"), replace(row, name="instant in spark, worst of 2", psnr_db=30.0)]
+    page = evaluation_page("ball", [gallery], rows, commands=())
+    assert page.lead == "×1/2 in the worst of 2 viewers: 20.0 dB as it is, 30.0 dB adapted in 3.0 s."
+    assert [picture.name for picture in page.zooms[0].pictures[:3]] == ["base in classic", "base in spark", "instant in spark"]
+
+
+def test_a_recipe_at_two_scales_is_adapted_at_both(model_folder):
+    gallery = Gallery(wrap_model(model_folder, backend="reference"), "itself")
+    image = torch.zeros(8, 8, 3)
+    for scale in (1 / 2, 1 / 4):
+        gallery.restored("default", {"scale": scale})
+        gallery.shot(Shot("default", "ball", scale, tiny.cameras()[0], image, image, 20.0, None, None))
+    assert [zoom.pictures[0].role for zoom in gallery.zooms([])] == ["adapted", "adapted"]
+
+
 def test_evaluate_without_an_output_takes_a_free_name_in_this_folder(model_folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["evaluate", "base", "--images", str(tiny.scene(tmp_path / "scene")), "--scale", "1", "--backend", "reference"]
@@ -243,5 +268,5 @@ def test_zooming_in_is_compared_with_the_base_after_shrinking(model_folder):
     base = wrap_model(model_folder, backend="reference")
     zoom = adaptation_zoom(base, base.adapt(2, recipe="instant"))
     assert [picture.role for picture in zoom.pictures] == ["base", "adapted", "other"]
-    assert zoom.truth.startswith("the base, with which the image is compared after shrinking")
-    assert zoom.view == "view_0" and all(picture.view["psnr_db"] > 10 for picture in zoom.pictures)
+    assert zoom.truth.startswith("the base's own image, with which the image is compared after shrinking")
+    assert zoom.view == "jittered_0000" and all(picture.view["psnr_db"] > 10 for picture in zoom.pictures)

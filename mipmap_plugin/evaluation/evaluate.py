@@ -37,6 +37,9 @@ from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.viewers import viewers_for
 from mipmap_plugin.wrap import Wrapped
 
+# In the name of a row that is the worst of several viewers'.
+WORST = ", worst of "
+
 
 @dataclass(frozen=True)
 class Row:
@@ -125,7 +128,13 @@ def training_free_rows(
 def worst(rows: Sequence[Row]) -> list[Row]:
     """The row of lowest PSNR, marked as the worst of several viewers; [] without rows."""
     least = sorted(rows, key=lambda row: row.psnr_db)[:1]
-    return [replace(row, name=f"{row.name}, worst of {len(rows)}") for row in least] if len(rows) > 1 else least
+    return [replace(row, name=f"{row.name}{WORST}{len(rows)}") for row in least] if len(rows) > 1 else least
+
+
+def shown_as(row: Row) -> tuple[str, str]:
+    """The name of the row's shot, and what the row is of several, such as "worst of 13"."""
+    name, worst_of, count = row.name.partition(WORST)
+    return name, f"{worst_of}{count}".removeprefix(", ")
 
 
 def notes(model: Wrapped, scales: Sequence[float], appearance: str = "mean") -> list[str]:

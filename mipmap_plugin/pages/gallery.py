@@ -8,7 +8,7 @@ from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.effects import explain
-from mipmap_plugin.evaluation.evaluate import Row
+from mipmap_plugin.evaluation.evaluate import Row, shown_as
 from mipmap_plugin.evaluation.measure import BASE
 from mipmap_plugin.evaluation.shots import Shot
 from mipmap_plugin.models.base import effects_of
@@ -27,7 +27,7 @@ class Gallery:
         """`truth`: what the images are compared with, in a few words."""
         self._base, self._truth = base, truth
         self._shots: dict[float, list[Shot]] = {}
-        self._adapted: dict[str, float] = {}
+        self._adapted: set[tuple[str, float]] = set()
         self._viewers: dict[float, list[ViewerPictures]] = {}
         self._last: Adapted | None = None
         self.adaptations: list[dict[str, Any]] = []
@@ -39,7 +39,7 @@ class Gallery:
     def adapted(self, row: str, adapted: Adapted) -> None:
         """Keep an adaptation's report, and draw the first of each scale as viewers do."""
         scale = adapted.report.scale
-        self._adapted[row] = scale
+        self._adapted.add((row, scale))
         if adapted is self._last:  # the same file in another viewer
             return
         self._last = adapted
@@ -50,7 +50,7 @@ class Gallery:
 
     def restored(self, row: str, report: dict[str, Any]) -> None:
         """Keep the report of an adaptation from before an interruption; its file is no longer there to be drawn as viewers do."""
-        self._adapted[row] = report["scale"]
+        self._adapted.add((row, report["scale"]))
         self.adaptations.append({"title": f"{zoom_name(report['scale'])}, {row}", **report})
 
     def effects(self) -> list[dict[str, Any]]:
@@ -62,13 +62,13 @@ class Gallery:
         return [self._zoom(scale, self._shots[scale], rows, named) for scale in sorted(self._shots)]
 
     def _zoom(self, scale: float, shots: Sequence[Shot], rows: Sequence[Row], named: bool) -> Zoom:
-        means = {row.name: _quality(row) for row in rows if row.scale == scale and row.scene == shots[0].scene}
+        means = {name: (_quality(row), note) for row in rows if row.scale == scale and row.scene == shots[0].scene for name, note in (shown_as(row),)}
         in_viewer = any(shot.row.startswith(IN_VIEWER) for shot in shots)
-        pictures = [Picture(shot.row, self._role(shot, in_viewer), shot.image, _quality(shot), means.get(shot.row, {})) for shot in shots]
+        pictures = [Picture(shot.row, self._role(shot, in_viewer), shot.image, _quality(shot), *means.get(shot.row, ({},))) for shot in shots]
         pictures.append(Picture("truth", "truth", shots[0].truth, note=self._truth))
         label = f"{shots[0].scene} {zoom_name(scale)}" if named else zoom_name(scale)
         reason = "Nothing was adapted: give --recipe default."
-        if any(each == scale for each in self._adapted.values()):
+        if any(each == scale for _, each in self._adapted):
             reason = why_not(self._base) or "It was adapted before an interruption, after which viewers' pictures are not drawn again."
         return Zoom(
             label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", self._viewers.get(scale, ()),
@@ -77,7 +77,7 @@ class Gallery:
 
     def _role(self, shot: Shot, in_viewer: bool) -> Role:
         """`in_viewer`: the file was made for a viewer, and is compared with the base in that viewer."""
-        if shot.row in self._adapted:  # what was adapted to the very views that judge it is a figure for the literature
+        if (shot.row, shot.scale) in self._adapted:  # what was adapted to the very views that judge it is a figure for the literature
             return "other" if shot.row.endswith("scored") else "adapted"
         if shot.row.startswith(IN_VIEWER) if in_viewer else shot.row == BASE:
             return "base"
@@ -95,6 +95,6 @@ def effects_of_base(base: Wrapped) -> list[dict[str, Any]]:
 
 
 def in_order(pictures: Sequence[Picture]) -> list[Picture]:
-    """Base, adapted, supersampled and truth first, then the rest."""
+    """Base, adapted, supersampled and truth first, then the rest; of several in one role, such as one for each viewer, those of a row first."""
     order: tuple[Role, ...] = ("base", "adapted", "supersampled", "truth", "other")
-    return sorted(pictures, key=lambda picture: order.index(picture.role))
+    return sorted(pictures, key=lambda picture: (order.index(picture.role), not picture.mean))

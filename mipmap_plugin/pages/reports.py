@@ -9,10 +9,10 @@ import torch
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import versions
-from mipmap_plugin.evaluation.evaluate import Row
+from mipmap_plugin.evaluation.evaluate import Row, shown_as
 from mipmap_plugin.evaluation.measure import BASE, RESIZED, baselines
 from mipmap_plugin.evaluation.report import records
-from mipmap_plugin.evaluation.tradeoff.truth import base_itself
+from mipmap_plugin.evaluation.tradeoff.truth import base_itself, unseen
 from mipmap_plugin.pages.gallery import Gallery, effects_of_base, in_order
 from mipmap_plugin.pages.in_viewers import viewer_pictures, why_not
 from mipmap_plugin.pages.record import Page, Picture, Quality, Role, Zoom, zoom_name
@@ -44,10 +44,10 @@ def adaptation_page(title: str, zooms: Sequence[Zoom], adaptations: Sequence[dic
 
 @torch.no_grad()
 def adaptation_zoom(base: Wrapped, adapted: Adapted) -> Zoom:
-    """Pictures of a view that nothing was adapted to, if there is one: without photographs, so that the base itself is the truth."""
+    """Pictures of a view that nothing was adapted to: without photographs, so that the base itself is the truth."""
     report, viewer = adapted.report, next(iter(filter(None, adapted.viewers)), None)
-    scale, truth = report.scale, base_itself(base, report.scale, 1)
-    view = truth.views[0]
+    scale, view = report.scale, unseen(base, adapted.adapted_to)[0]
+    truth = base_itself(base, scale, 1, [view])
     images = {each.name: each.render(view) for each in baselines(base, scale, truth.shrink_by, filters=())}
     base_name = f"base in {viewer}" if viewer else BASE
     images[base_name] = base.render(view.zoomed(scale), viewer=viewer).image
@@ -63,7 +63,7 @@ def adaptation_zoom(base: Wrapped, adapted: Adapted) -> Zoom:
     reason = why_not(base)
     shown = () if reason else viewer_pictures(base, adapted, view.zoomed(scale), images.get(RESIZED) if scale < 1 else None)
     label = f"{zoom_name(scale)}{f' for {report.viewer}' if report.viewer else ''}"
-    against = "the base's own image, made smaller" if scale < 1 else "the base, with which the image is compared after shrinking"
+    against = "the base's own image" + (", made smaller" if scale < 1 else ", with which the image is compared after shrinking" if scale > 1 else "")
     return Zoom(label, scale, in_order(pictures), view.name, f"{against} (no photographs)", "the validation views", shown, reason)
 
 
@@ -73,18 +73,19 @@ def _psnr(psnr_db: float | None) -> Quality:
 
 def _lead(zoom: Zoom, rows: Sequence[Row]) -> str:
     """What one zoom gained, in a sentence."""
-    means = {picture.role: picture.mean["psnr_db"] for picture in reversed(zoom.pictures) if picture.mean.get("psnr_db") is not None}
+    judged = {picture.role: picture for picture in reversed(zoom.pictures) if picture.mean.get("psnr_db") is not None}
+    means = {role: picture.mean["psnr_db"] for role, picture in judged.items()}
     if "base" not in means:
         return ""
-    adapted = f", {means['adapted']:.1f} dB adapted{_in_seconds(zoom, rows)}" if "adapted" in means else ""
+    adapted = f", {means['adapted']:.1f} dB adapted{_in_seconds(judged['adapted'], zoom.scale, rows)}" if "adapted" in means else ""
     sampled = f", {means['supersampled']:.1f} dB supersampled" if "supersampled" in means else ""
-    where = next(picture.name for picture in zoom.pictures if picture.role == "base").removeprefix(BASE)
+    base = judged["base"]
+    where = f" in the {base.note} viewers" if base.note else base.name.removeprefix(BASE)
     return f"{zoom.label}{where}: {means['base']:.1f} dB as it is{adapted}{sampled}."
 
 
-def _in_seconds(zoom: Zoom, rows: Sequence[Row]) -> str:
-    name = next(picture.name for picture in zoom.pictures if picture.role == "adapted")
-    seconds = next((row.adapt_seconds for row in rows if (row.name, row.scale) == (name, zoom.scale)), None)
+def _in_seconds(adapted: Picture, scale: float, rows: Sequence[Row]) -> str:
+    seconds = next((row.adapt_seconds for row in rows if row.scale == scale and shown_as(row)[0] == adapted.name), None)
     return "" if seconds is None else f" in {seconds:.1f} s"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -62,10 +62,13 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
 
 
 @torch.no_grad()
-def base_itself(model: Wrapped, scale: float, most: int | None) -> GroundTruth:
-    """The truth without photographs. Zoom-out: the supersampled base. Zoom-in: the base, with which images are compared after shrinking."""
-    views, adapt_on = _held_out(model)
-    views = evenly(views, most)
+def base_itself(model: Wrapped, scale: float, most: int | None, views: Sequence[Camera] = ()) -> GroundTruth:
+    """The truth without photographs. Zoom-out: the supersampled base. Zoom-in: the base, with which images are compared after shrinking.
+
+    `views`: to evaluate on, instead of at most `most` that are held out here.
+    """
+    held_out, adapt_on = _held_out(model)
+    views = list(views) or evenly(held_out, most)
     base_images = {view: model.render(view).image.clamp(0, 1) for view in views}
     if scale > 1:
         label = f"dB of the image, shrunk, against the base itself (no photographs), {len(views)} views"
@@ -74,6 +77,12 @@ def base_itself(model: Wrapped, scale: float, most: int | None) -> GroundTruth:
     label = f"dB against the base supersampled {n} x {n} (no photographs), {len(views)} views"
     truths = {view: resized_base(image, view.zoomed(scale).size, shrink_by="area") for view, image in base_images.items()}
     return GroundTruth(label, views, adapt_on, lambda view, image: psnr(image, truths[view]), "area", True)
+
+
+def unseen(model: Wrapped, adapted_to: Sequence[Camera]) -> list[Camera]:
+    """Views that nothing was adapted to: the cameras that are not among those `adapted_to` or, if all are, a generated one."""
+    views = _others(model.cameras, adapted_to) or jittered(model.views(), 1, torch.Generator().manual_seed(EVALUATION_SEED))
+    return with_times(views, EVALUATION_SEED)[0] if model.model.traits.moves else views
 
 
 def _held_out(model: Wrapped) -> tuple[list[Camera], list[Camera]]:
@@ -91,7 +100,7 @@ def _held_out(model: Wrapped) -> tuple[list[Camera], list[Camera]]:
     return (with_times(judged, EVALUATION_SEED)[0] if model.model.traits.moves else judged), train
 
 
-def _others(cameras: list[Camera], judged: list[Camera]) -> list[Camera]:
+def _others(cameras: list[Camera], judged: Sequence[Camera]) -> list[Camera]:
     """The cameras that are not among the `judged` views."""
     seen = views_seen(cameras, judged)
     return [camera for camera in cameras if camera not in seen]
