@@ -17,6 +17,7 @@ import pytest
 import tiny
 from running import saving_often, wait_until
 
+from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists, SettingsError
@@ -30,6 +31,7 @@ from mipmap_plugin.jobs.parcel import do_parcel, pack, unpack
 from mipmap_plugin.jobs.run import run as run_job
 from mipmap_plugin.jobs.worker import Worker, do
 from mipmap_plugin.scenes import write_cameras
+from mipmap_plugin.tiles.job import TileJob
 from mipmap_plugin.wrap import Wrapped
 
 QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
@@ -261,9 +263,10 @@ def test_other_options_of_the_training_are_not_finished(tmp_path):
     assert finished(job) is None
 
 
-def test_a_job_that_travels_makes_the_same_bytes(tmp_path):
+@pytest.mark.parametrize("given", ["", "transforms_train.json"])
+def test_a_job_that_travels_makes_the_same_bytes(tmp_path, given):
     scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(3), count=30)
-    here = job_of(tmp_path, images=scene, scale=2.0, skip_finished=False, settings={"steps": 1, "seed": 0, "views": "train"})
+    here = job_of(tmp_path, images=scene / given, scale=2.0, skip_finished=False, settings={"steps": 1, "seed": 0, "views": "train"})
     assert run_job(here).status == "done"
     away = replace(here, target=tmp_path / "away" / "new.ply")
     parcel = pack(away)
@@ -278,6 +281,44 @@ def test_a_job_that_travels_makes_the_same_bytes(tmp_path):
         unpack(delivery, away)
     failed = unpack(do_parcel(replace(parcel, job=replace(parcel.job, viewer="nobody")), run_job), away)
     assert failed.status == "failed" and "nobody" in failed.reason
+
+
+def test_photographs_outside_the_folder_of_their_list_do_not_travel(tmp_path):
+    scene = tiny.scene(tmp_path / "scene", train=tiny.cameras(1), count=30)
+    (scene / "lists").mkdir()
+    file = scene / "lists" / "transforms_train.json"
+    file.write_text((scene / "transforms_train.json").read_text().replace('"file_path": "', '"file_path": "../'))
+    with pytest.raises(SettingsError, match="lies outside its folder"):
+        pack(job_of(tmp_path, images=file))
+
+
+def test_an_interrupted_run_travels_with_its_state(tmp_path):
+    job = job_of(tmp_path, target=tmp_path / "new" / "out.ply", settings={"steps": 4, "seed": 0, "views": "given", "warm_up": 0})
+
+    def interrupted(job):
+        stopped = lambda run, task, config, stop, observe: adapt(run, task, config, stop, lambda run: stop(run) if run.step == 2 else None)  # noqa: E731
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr("mipmap_plugin.adaptation.session.adapt", stopped)
+            try:
+                run_job(job)
+            except KeyboardInterrupt as interrupt:
+                return Outcome(job, "interrupted", reason=str(interrupt))
+
+    outcome = unpack(do_parcel(pack(job), interrupted), job)
+    state = job.target.with_name("out.ply.resume")
+    assert outcome.status == "interrupted" and state.is_file() and not job.target.exists()
+    began = []
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, *rest: began.append(run.step) or adapt(run, *rest))
+        assert unpack(do_parcel(pack(job), run_job), job).status == "done"
+    assert began == [2] and not state.exists()
+    whole = replace(job, target=tmp_path / "whole.ply")
+    assert run_job(whole).status == "done" and whole.target.read_bytes() == job.target.read_bytes()
+
+
+def test_tiles_do_not_travel(tmp_path):
+    with pytest.raises(SettingsError, match="tiles need a folder that all workers see"):
+        pack(TileJob(**vars(job_of(tmp_path))))
 
 
 @pytest.mark.parametrize("given", ["", "point_cloud/iteration_30000/point_cloud.ply"])

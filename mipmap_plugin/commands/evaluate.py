@@ -106,7 +106,7 @@ class _Results:
         lpips = self._perceptual and self._perceptual.label
         asked = {"protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings, "page": self._page is not None}
         made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "trained": str(wrapped.trained), "scene": scene.digest()}
-        cells = Cells(self._kept, asked | made_from | {"backend": wrapped.backend()[0].name})
+        cells = Cells(self._kept, asked | made_from | {"backend": wrapped.backend()[0].name, "threads": wrapped.threads})
         judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, gallery, cells)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
         self._notes |= dict.fromkeys(evaluation.notes(wrapped, self._scales, appearance))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.jobs.base import Base
@@ -26,6 +26,8 @@ class Job:
     images: Path | None = None  # a scene whose photographs are the truth of a zoom-in
     overwrite: bool = False
     skip_finished: bool = True  # do nothing if the target was made from the same base with the same settings
+
+    needs_folder: ClassVar[str] = ""  # why the files of such a job cannot be sent, in a sentence
 
     def config(self) -> AdaptConfig:
         """The settings to adapt with, unless the model calls for others. Raises SettingsError."""

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import io
+import os
 import tarfile
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import named, new_file, new_folder, refuse_output, together
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models import detect
 from mipmap_plugin.models.outputs import parts_of, refuse_parts
+from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.wrapped import state_path
 
 # Folders of an unpacked parcel.
 BASE, CAMERAS, IMAGES, OUTPUT = Path("base"), Path("cameras"), Path("images"), Path("output")
@@ -35,7 +39,12 @@ class Delivery:
 
 
 def pack(job: Job) -> Parcel:
-    """Pack the checkpoint of a job, its cameras and its photographs. Raises CheckpointError, OutputExists, OutputError, OSError."""
+    """Pack the checkpoint of a job, its cameras and photographs, and the state of its run, if it was interrupted.
+
+    Raises CheckpointError, SceneError, SettingsError, OutputExists, OutputError, OSError.
+    """
+    if job.needs_folder:
+        raise SettingsError(job.needs_folder)
     base = job.base
     checkpoint = detect(base.checkpoint)
     refuse_output(job.target, job.overwrite, parts_of(checkpoint.path, checkpoint.folder))  # which the worker cannot know
@@ -45,7 +54,9 @@ def pack(job: Job) -> Parcel:
     parts = [part for part in dict.fromkeys(parts_of(checkpoint.path, checkpoint.folder)) if part.is_relative_to(folder)]
     members = {BASE / part.relative_to(folder): part for part in parts}
     members |= {} if base.cameras is None else _scene(base.cameras, CAMERAS)
-    members |= {} if job.images is None else _scene(job.images, IMAGES)
+    members |= {} if job.images is None else _photographs(job.images, IMAGES)
+    state = state_path(job.target)
+    members |= {OUTPUT / state.name: state} if state.is_file() else {}
     sent = replace(base, checkpoint=BASE / base.checkpoint.relative_to(folder), cameras=base.cameras and _packed(base.cameras, CAMERAS))
     target = OUTPUT / named(job.target).name
     return Parcel(replace(job, base=sent, target=target, images=job.images and _packed(job.images, IMAGES)), _archive(members))
@@ -57,18 +68,25 @@ def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
         place, job = Path(folder), parcel.job
         with tarfile.open(fileobj=io.BytesIO(parcel.files)) as archive:
             archive.extractall(place, filter="data")
-        (place / OUTPUT).mkdir()
+        (place / OUTPUT).mkdir(exist_ok=True)
         base = replace(job.base, checkpoint=place / job.base.checkpoint, cameras=job.base.cameras and place / job.base.cameras)
         outcome = do(replace(job, base=base, target=place / job.target, images=job.images and place / job.images))
-        written = [file for file in (place / OUTPUT).rglob("*") if file.is_file()] if outcome.status == "done" else []
+        state = state_path(place / job.target)
+        kept = {"done": (place / OUTPUT).rglob("*"), "interrupted": [state]}.get(outcome.status, [])
+        written = [file for file in kept if file.is_file()]
         file = outcome.file and outcome.file.relative_to(place / OUTPUT)
         reason = outcome.reason.replace(f"{place}/", "")
         return Delivery(replace(outcome, job=job, file=file, reason=reason), _archive({each.relative_to(place / OUTPUT): each for each in written}))
 
 
 def unpack(delivery: Delivery, job: Job) -> Outcome:
-    """Write what came back to where the job was to write it, atomically. Raises OutputExists, OutputError."""
-    outcome, place = replace(delivery.outcome, job=job), named(job.target).parent
+    """Write what came back to where the job was to write it, atomically: its files, or the state of its run. Raises OutputExists, OutputError."""
+    outcome, place, state = replace(delivery.outcome, job=job), named(job.target).parent, state_path(job.target)
+    if outcome.status == "interrupted":
+        with tarfile.open(fileobj=io.BytesIO(delivery.files)) as archive:
+            for member in archive.getmembers():
+                _write(archive, member, place, replace(job, overwrite=True), [])
+        return outcome
     if outcome.status != "done" or outcome.file is None:
         return outcome
     base, within = job.base.checkpoint, outcome.file.parts[1:]  # of a model folder
@@ -81,6 +99,7 @@ def unpack(delivery: Delivery, job: Job) -> Outcome:
         else:
             for member in archive.getmembers():
                 _write(archive, member, place, job, parts_of(source, model_folder))
+    state.unlink(missing_ok=True)
     return replace(outcome, file=place / outcome.file)
 
 
@@ -99,6 +118,16 @@ def _scene(path: Path, folder: Path) -> dict[Path, Path]:
     if (path / "cameras.json").is_file():
         return {folder / "cameras.json": path / "cameras.json"}
     return {folder / file.relative_to(path): file for file in path.rglob("*") if file.is_file()}
+
+
+def _photographs(path: Path, folder: Path) -> dict[Path, Path]:
+    """`_scene` of photographs, also of a file that names them."""
+    if path.is_dir():
+        return _scene(path, folder)
+    within = {file: os.path.relpath(file, path.parent) for file in (path, *load_scene(path).images.values())}
+    if other := next((file for file, name in within.items() if name.startswith("..")), None):
+        raise SettingsError(f"{path}: its photograph {other} lies outside its folder, so that it cannot be sent; give a folder with all of them")
+    return {folder / name: file for file, name in within.items()}
 
 
 def _packed(path: Path, folder: Path) -> Path:

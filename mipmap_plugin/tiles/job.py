@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from mipmap_plugin import pool
 from mipmap_plugin import threads as thread_pool
@@ -19,6 +19,8 @@ Work = Literal["truth", "start", "layer", "halo", "tile", "steering"]
 @dataclass(frozen=True)
 class TileJob(Job):
     """A job of one scene; its target is the file that it leaves in the scene's folder."""
+
+    needs_folder: ClassVar[str] = "tiles need a folder that all workers see, and some worker does not see the checkpoint's; use --jobs, or share it"
 
     work: Work = "tile"
     number: int = 0

@@ -17,7 +17,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import USUAL, Effects, RenderSettings
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.cells import Cells
 from mipmap_plugin.evaluation.measure import (
@@ -42,14 +42,14 @@ from mipmap_plugin.wrap import Wrapped
 # Steps after which the quality of a run is measured: evenly spaced on the logarithmic axis of time.
 OBSERVED_STEPS = (0, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
-# Renderer settings that may save time, each alone: (name, settings, float type).
-RENDERERS: tuple[tuple[str, RenderSettings, torch.dtype], ...] = (
-    ("as usual", USUAL, torch.float32),
-    ("float64", USUAL, torch.float64),
-    *((f"alpha from {name}", replace(USUAL, min_alpha=1 / least), torch.float32) for name, least in (("1/64", 64), ("1/16", 16))),
-    *((f"stop at {least:g}", replace(USUAL, min_transmittance=least), torch.float32) for least in (0.01, 0.1)),
-    *((f"radius {radius:g}", replace(USUAL, radius=radius), torch.float32) for radius in (3.0, 2.0)),
-    *((f"tile {tile}", replace(USUAL, tile=tile), torch.float32) for tile in (8, 32)),
+# Renderer settings that may save time, each alone: (name, what is changed, float type).
+RENDERERS: tuple[tuple[str, dict[str, Any], torch.dtype], ...] = (
+    ("as usual", {}, torch.float32),
+    ("float64", {}, torch.float64),
+    *((f"alpha from {name}", {"min_alpha": 1 / least}, torch.float32) for name, least in (("1/64", 64), ("1/16", 16))),
+    *((f"stop at {least:g}", {"min_transmittance": least}, torch.float32) for least in (0.01, 0.1)),
+    *((f"radius {radius:g}", {"radius": radius}, torch.float32) for radius in (3.0, 2.0)),
+    *((f"tile {tile}", {"tile": tile}, torch.float32) for tile in (8, 32)),
 )  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def measure(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan, cells:
     free = [baseline for backend in plan.backends for baseline in _baselines(on_backend(model, backend), truth, scale, plan)]
     count = len(model.model.gaussians(model.any_camera()))
     bar = tqdm(total=len(free) + len(runs) * plan.repeats + len(RENDERERS) * plan.renderers, disable=None, desc=f"tradeoff x{scale:g}")
-    adapted: dict[tuple[str, int | None, str], Adapted] = {}
+    first: list[Adapted] = []  # of the first of the runs
     warm: set[str] = set()
 
     def kept(key: dict[str, Any], measure: Callable[[], list[Point]]) -> list[Point]:
@@ -124,13 +124,15 @@ def measure(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan, cells:
         if backend not in warm:
             warm_up(on_backend(model, backend), scale, truth.adapt_on)
             warm.add(backend)
-        points, adapted[name, steps, backend] = _run(on_backend(model, backend), truth, scale, plan, (name, steps), bar)
+        points, adapted = _run(on_backend(model, backend), truth, scale, plan, (name, steps), bar)
+        if (name, steps, backend) == runs[0]:
+            first.append(adapted)
         return points
 
     def rendered() -> list[Point]:
-        if runs and runs[0] not in adapted:  # it was measured before an interruption
+        if runs and not first:  # it was measured before an interruption
             run(*runs[0])
-        shown = _renderers(model, adapted[runs[0]] if runs else None, scale)
+        shown = _renderers(model, first[0] if runs else None, scale)
         return [_measured(point, show, truth, plan.repeats) for point, show in shown]
 
     with bar, ticking(bar):
@@ -212,21 +214,24 @@ def _run(
             quality = statistics.fmean(truth.psnr(view, show(view.zoomed(scale))) for view in truth.views)
             measured.setdefault(step, []).append((seconds, quality))
 
-    runs, ends = [], []
+    first: Adapted | None = None
+    ends = []
     for repeat in range(plan.repeats):
         settings: dict[str, Any] = {"seed": plan.seed + repeat} | ({} if steps is None else {"steps": steps})
         adapted = adapt_alone(model, scale, recipe=recipe, viewer=plan.viewer, cameras=truth.adapt_on, observe=observe, **settings)
-        runs.append(adapted)
-        report = adapted.report
+        first, report = first or adapted, adapted.report
         end = Point(scale, "adapted", _name(recipe, steps), adapted.backend.name, report.gaussians_after, ended_by=report.ended_by)
         ends.append(_measured(replace(end, adapt_seconds=Spread.of([report.seconds["total"]])), _shows(adapted, scale), truth, 1))
         bar.update()
-    intermediate = replace(ends[0], ms_per_frame=None, ended_by="")
-    points = [
-        replace(intermediate, step=step, **_spreads(adapt_seconds=[seconds for seconds, _ in values], psnr_db=[quality for _, quality in values]))
-        for step, values in measured.items()
-    ]
-    return [*points, _over_repeats(ends)], runs[0]
+    assert first is not None  # since there is at least one repeat
+    intermediate, curve = replace(ends[0], ms_per_frame=None, ended_by=""), first.report.curve
+
+    def between(step: int, values: Sequence[tuple[float, float]]) -> Point:
+        splats = next((point.gaussians for point in reversed(curve) if point.step <= step), intermediate.gaussians)
+        seconds, qualities = zip(*values, strict=True)
+        return replace(intermediate, step=step, gaussians=splats, **_spreads(adapt_seconds=seconds, psnr_db=qualities))
+
+    return [*(between(step, values) for step, values in measured.items()), _over_repeats(ends)], first
 
 
 def _name(recipe: str, steps: int | None) -> str:
@@ -255,7 +260,8 @@ def _renderers(model: Wrapped, adapted: Adapted | None, scale: float) -> Iterato
     title = adapted.report.settings.recipe if adapted else BASE
     seconds = Spread.of([adapted.report.seconds["total"]]) if adapted else NOTHING
     count = len(splats.gaussians(model.any_camera()))
-    for name, settings, dtype in RENDERERS:
+    for name, changes, dtype in RENDERERS:
+        settings = replace(effects.settings, **changes)
         point = Point(scale, "renderer", f"{title}, {name}", backend.name, count, adapt_seconds=seconds)
         yield point, _render_with(backend, splats, replace(effects, settings=settings), dtype, scale)
 
