@@ -149,7 +149,7 @@ def rows_of(name: str, scale: float, data: Path, most: int | None) -> list[Row]:
     rows = [free_rows(base, judge, scale) for judge in judged_by]
     warm_up(base, scale, others)
     for recipe, settings in recipes(capture, scale).items():
-        adapted = adapt_alone(base, scale, cameras=others, **settings)
+        adapted = adapt_alone(base, scale, cameras=others or None, **settings)
         assert not views_seen(judged, adapted.adapted_to), f"{name}: views that are judged were adapted to"
         for judge, beside in zip(judged_by, rows, strict=True):
             beside.append(adapted_row(recipe, adapted, judge))

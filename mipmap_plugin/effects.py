@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
+from mipmap_plugin.allowed import OF_PACKING, OF_SETTINGS, check
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
@@ -55,6 +56,10 @@ class Packing:
     half_means: bool = False  # float16, in the world and again relative to the eye
 
 
+    def __post_init__(self) -> None:
+        check("packing", self, OF_PACKING, optional=frozenset({"color", "log_scales", "quats"}))
+
+
 @dataclass(frozen=True)
 class RenderSettings:
     """How splats are rasterized, and which are left out. `tile` affects only the time. Viewers' own settings are in `splatting.viewers`.
@@ -84,6 +89,9 @@ class RenderSettings:
     picture_step: float | None = None  # the picture is rounded to multiples after each splat, back to front; the gradient ignores the rounding
 
     def __post_init__(self) -> None:
+        check("render settings", self, OF_SETTINGS, optional=frozenset({"radius", "max_color", "color_steps", "picture_step"}))
+        if not isinstance(self.packing, Packing | None):
+            raise SettingsError(f"render settings: packing must be a Packing, or None, got {type(self.packing).__name__}")
         if self.fades and self.radius is None:
             raise SettingsError("`fades` needs the radius at which a splat falls to 0; give radius, such as 8**0.5")
         if self.radial and self.bucketed:

@@ -72,17 +72,17 @@ THOROUGH_UPSAMPLED = dict(
 
 def default(scale: float, network: bool) -> dict[str, Any]:
     """For most uses: closed form, merging and a short optimization, minutes at most."""
-    return DEFAULT_OUT | _zoom_out_settings(scale) if scale <= 1 else DEFAULT_UPSAMPLED if network else DEFAULT_IN
+    return DEFAULT_OUT | _zoom_out_settings(scale) if scale <= 1 else dict(DEFAULT_UPSAMPLED if network else DEFAULT_IN)
 
 
 def thorough(scale: float, network: bool) -> dict[str, Any]:
     """Better quality in several times the time; at zoom-in without a network the same as `default`."""
-    return THOROUGH_OUT | _zoom_out_settings(scale) if scale <= 1 else THOROUGH_UPSAMPLED if network else DEFAULT_IN
+    return THOROUGH_OUT | _zoom_out_settings(scale) if scale <= 1 else dict(THOROUGH_UPSAMPLED if network else DEFAULT_IN)
 
 
 def paper(scale: float, network: bool) -> dict[str, Any]:
     """The published method of Mipmap-GS with its settings, at every scale, for comparison."""
-    return PAPER
+    return dict(PAPER)
 
 
 def instant(scale: float, network: bool) -> dict[str, Any]:

@@ -31,11 +31,13 @@ from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, check_scale
-from mipmap_plugin.models.base import Filtered, Placed, SplatModel, TrainedScale, why_no_viewer
+from mipmap_plugin.models.base import Filtered, Placed, SplatModel, TrainedScale, checked_splats, why_no_viewer
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.places import state_path as state_path
+from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.filters import INTEGRALS, USUAL_EPS2D
@@ -175,7 +177,7 @@ class Wrapped:
         `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
         Raises SettingsError and BackendUnavailable.
         """
-        scale, cameras = check_scale(scale), None if cameras is None else checked(cameras)
+        scale, cameras = check_scale(scale), None if cameras is None else checked(cameras, some=True)
         _check_kinds(images=(images, Scene), start=(start, FinerLevel))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         if not model.traits.same_for_all_views and (settings.setdefault("merge_to", 1.0) < 1 or settings.get("most_splats")):
@@ -200,12 +202,13 @@ class Wrapped:
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)
         if start is not None and start.scale <= scale:
             raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
-        in_viewer = self.read_by(viewer)
-        base_in_viewer = model if in_viewer is self.model else in_viewer
+        base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
         if self.images is None or not self.images.are_of(model, backend, self.effects()):
             self.images = BaseImages(model, backend, self.effects(), LIMIT if self.keeps_images else 0)
         request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs)
-        with threads.limited(self.threads, shared=getattr(backend, "own_threads", False)), torch.enable_grad():
+        family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
+        alone = threads.limited(self.threads, shared=getattr(backend, "own_threads", False))
+        with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
             adapted = Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
         adapted.report.seconds["loading"] = self.loading_s
         return replace(adapted, cameras=self.views())
@@ -268,8 +271,8 @@ class Wrapped:
     @cached_property
     def _needs(self) -> Needs:
         """What the base needs of a backend; computed once, because the base never changes."""
-        with torch.no_grad():
-            gaussians = self.model.gaussians(self.any_camera())
+        with torch.no_grad(), naming_any({f"family {self.model.family!r}": self.model}):
+            gaussians = checked_splats(self.model, self.any_camera())
         return Needs.of(gaussians, Effects(gaussians.used_sh_degree(), self.trained.screen_filter), gradients=False)
 
     def any_camera(self) -> Camera:
@@ -291,9 +294,3 @@ def placed(model: SplatModel, scene: Scene) -> Scene:
     scene = scene.original()
     capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
     return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))
-
-
-def state_path(output: Path) -> Path:
-    """The path of the state of a run whose model is to be saved to `output`."""
-    output = named(output)
-    return output.with_name(output.name + ".resume")

@@ -15,7 +15,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 STOREYS = [
     {"errors", "freed_memory", "garbage"},
     {"limits", "pool"},
-    {"registry", "config", "torchvision_absent", "torch_modes", "threads", "progress", "screen_filters"},
+    {"registry", "config", "torchvision_absent", "torch_modes", "threads", "progress", "screen_filters", "allowed", "plugin_errors"},
     {"gaussians", "camera"},
     {"formats"},
     {"effects"},

@@ -197,7 +197,7 @@ def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_d
     monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
     base = wrap_model(tiny.model(), cameras=[], backend="reference")
     judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,)))
-    adapted = base.adapt(0.25, recipe="instant", cameras=others)
+    adapted = base.adapt(0.25, recipe="instant", cameras=others or None)
     assert len(judged) == unbounded.ORBIT_VIEWS and others == [] and views_seen(judged, adapted.adapted_to) == []
 
 

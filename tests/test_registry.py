@@ -70,7 +70,7 @@ def test_auto_takes_the_fastest_that_lacks_nothing_and_says_why():
     register_backend("fast", Fast)
     register_backend("fussy", Fussy)
     backend, why = choose_backend("auto", NEEDS)
-    assert isinstance(backend, Fast)
+    assert backend.name == "fast"
     assert why == "fast: the fastest that can serve the request; fussy cannot: it is not in the mood"
 
 
@@ -175,7 +175,7 @@ def test_a_name_is_taken_once():
     with pytest.raises(SettingsError, match="the name 'fast' is taken; pass replace=True to override it"):
         register_backend("fast", Fussy)
     register_backend("fast", Fussy, replace=True)
-    assert isinstance(get_backend("fast"), Fussy)
+    assert get_backend("fast").name == "fussy"
 
 
 def test_an_installed_backend_is_seen_and_used(install):

@@ -253,7 +253,7 @@ def test_a_torchvision_that_works_is_used(monkeypatch):
     [
         (lambda image, size: 1 / 0, "failed: ZeroDivisionError"),
         (lambda image, size: None, "returned a NoneType"),
-        (lambda image, size: image, r"returned \[24, 32, 3\], all finite"),
+        (lambda image, size: image, r"returned \[24, 32, 3\] in torch.float32"),
         (lambda image, size: torch.full((*size, 3), torch.nan), "not all finite"),
     ],
 )

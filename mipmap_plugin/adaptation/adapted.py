@@ -17,12 +17,14 @@ from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.atomic import together, write_json
+from mipmap_plugin.formats.atomic import refuse_output, together, write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image
-from mipmap_plugin.models.base import SplatModel, effects_of
+from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of
 from mipmap_plugin.models.exposure import exposed
+from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.torch_modes import usual_modes
 
 
@@ -68,7 +70,8 @@ class Adapted:
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> Path:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
-        with together(Path(path)):  # a new model never appears without its report
+        refuse_output(Path(path), overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
+        with together(Path(path)), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
             saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
             write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=overwrite)
         if self.state is not None:
@@ -82,7 +85,10 @@ def render_model(
 ) -> Rendered:
     """Render a model, its splats first changed by `form`, and report the effects that were simulated. Raises SettingsError."""
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
-    gaussians = model.gaussians(camera) if form is None else form(model.gaussians(camera))
+    family = f"family {model.family!r}"
+    with naming_any({family: model}), unchanged(family, model.parameters()):
+        gaussians = checked_splats(model, camera)
+    gaussians = gaussians if form is None else form(gaussians)
     rendered = supersample.render(backend, gaussians, camera, effects)
     if effects.outputs:
         from mipmap_plugin.backends import geometry  # an effect that is off is not imported

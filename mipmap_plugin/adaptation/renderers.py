@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from mipmap_plugin.backends.base import Backend, Stepper
-from mipmap_plugin.backends.drawn import drawn
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -22,7 +21,7 @@ ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
 
 def renderer(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
     """A function that renders the image of a camera. It holds no session, which would keep the state's file locked after the run."""
-    return lambda gaussians, camera: drawn(backend, gaussians, camera, effects).image
+    return lambda gaussians, camera: backend.render(gaussians, camera, effects).image
 
 
 def views_renderer(backend: Backend, targets: Sequence[Effects]) -> ViewsRenderer | None:

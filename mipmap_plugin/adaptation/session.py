@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 from torch import Tensor
 
 from mipmap_plugin import pool, threads
@@ -188,7 +187,7 @@ class Session:
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
             answer = observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
-            return isinstance(answer, (bool, np.bool_, Tensor)) and np.array_equal(answer, True)
+            return _is_true(answer)
 
         ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
         run.optimizer.state.clear()
@@ -280,6 +279,12 @@ class Session:
             versions=versions(),
             inputs=self.inputs,
         )
+
+
+def _is_true(answer: object) -> bool:
+    """Whether an observer's answer is True: Python's, NumPy's or torch's."""
+    kind = answer is True or str(getattr(answer, "dtype", "")) in ("bool", "torch.bool")
+    return kind and getattr(answer, "shape", ()) == () and bool(answer)
 
 
 def _rows(model: SplatModel) -> int:

@@ -9,7 +9,9 @@ from typing import Any
 import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend, Needs
+from mipmap_plugin.backends.guarded import Guarded
 from mipmap_plugin.errors import BackendUnavailable, PluginError
+from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import Registry
 
 BACKENDS = Registry(
@@ -43,7 +45,7 @@ def get_backend(name: str) -> Backend:
     missing += [part for part, kind in (("name", str), ("speed", (int, float))) if not isinstance(getattr(backend, part, None), kind)]
     if missing:
         raise PluginError(f"backend {name!r} lacks {', '.join(missing)}; see mipmap_plugin.backends.base.Backend")
-    return backend
+    return Guarded(name, backend) if is_third_party(backend) else backend
 
 
 def survey(*needs: Needs) -> dict[str, list[str]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from mipmap_plugin.backends.base import Backend, Rendered
-from mipmap_plugin.backends.drawn import drawn
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -18,9 +17,9 @@ def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effe
     """
     n = effects.supersampling
     if n == 1:
-        return drawn(backend, gaussians, camera, effects)
+        return backend.render(gaussians, camera, effects)
     fine = camera.resized(camera.width * n, camera.height * n)
     finer = replace(effects, supersampling=1, eps2d=effects.eps2d * n**2, settings=effects.settings.finer(n))
-    rendered = drawn(backend, gaussians, fine, finer)
+    rendered = backend.render(gaussians, fine, finer)
     blocks = rendered.image.unflatten(1, (-1, n)).unflatten(0, (-1, n))
     return Rendered(blocks.mean(dim=(1, 3)), rendered.alpha.unflatten(1, (-1, n)).unflatten(0, (-1, n)).mean(dim=(1, 3)))

@@ -98,9 +98,9 @@ def _choices(wrapped: Wrapped, viewer: str | None) -> tuple[list[str | None], li
     """The viewers and the recipes that the page offers, what is asked for first."""
     from mipmap_plugin.models.base import why_no_viewer
     from mipmap_plugin.recipes import RECIPES
-    from mipmap_plugin.splatting.viewers import VIEWERS, viewers_for
+    from mipmap_plugin.splatting.viewers import single_viewers
 
-    single = [] if why_no_viewer(wrapped.model) else [name for name in VIEWERS.names() if viewers_for(name) == (name,)]
+    single = [] if why_no_viewer(wrapped.model) else single_viewers()
     return list(dict.fromkeys((viewer, None, *single))), list(dict.fromkeys(("default", *RECIPES.names())))
 
 

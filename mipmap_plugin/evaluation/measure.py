@@ -124,7 +124,7 @@ def warm_stopwatch(show: RenderView, view: Camera) -> Stopwatch:
 
 def warm_up(model: Wrapped, scale: float, cameras: Sequence[Camera]) -> None:
     """Adapt one step on one view, so that compiling at first use is not counted in an adaptation."""
-    model.adapt(scale, cameras=cameras[:1], views="given" if cameras else "orbit", extra_views=1, steps=1, validation_views=2)
+    model.adapt(scale, cameras=cameras[:1] or None, views="given" if cameras else "orbit", extra_views=1, steps=1, validation_views=2)
 
 
 def adapt_alone(model: Wrapped, scale: float, **options: Any) -> Adapted:

@@ -15,8 +15,8 @@ from mipmap_plugin.formats.atomic import named, new_file, new_folder, refuse_out
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models import detect
 from mipmap_plugin.models.outputs import parts_of, refuse_parts
+from mipmap_plugin.models.places import state_path
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrapped import state_path
 
 # Folders of an unpacked parcel.
 BASE, CAMERAS, IMAGES, OUTPUT = Path("base"), Path("cameras"), Path("images"), Path("output")

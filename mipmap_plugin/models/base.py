@@ -6,16 +6,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effect
+from mipmap_plugin.errors import PluginError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.hosts import Capture
+from mipmap_plugin.plugin_errors import is_third_party
 
 # Name, among a model's parameters, of values that are never optimized but removed with their rows, such as an anchor's level.
 CARRIED = "carried"
@@ -162,6 +164,19 @@ def why_no_viewer(model: SplatModel) -> str:
     if not traits.same_for_all_views:
         return "its splats differ from view to view or in time, and a viewer's file holds them once and for all"
     return "it says that its files are for its own project alone" if model.trained.keeps_filter else ""
+
+
+def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
+    """The splats that a camera sees. Raises PluginError if a third-party family returns something else, or splats that no image can show."""
+    gaussians: Any = model.gaussians(camera)
+    if not is_third_party(model):
+        return cast(Gaussians, gaussians)
+    if not isinstance(gaussians, Gaussians):
+        raise PluginError(f"family {model.family!r}: gaussians() has to return Gaussians; it returned a {type(gaussians).__name__}")
+    tensors = {name: tensor for name, tensor in vars(gaussians).items() if isinstance(tensor, Tensor)}
+    if wrong := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise PluginError(f"family {model.family!r}: gaussians() returned NaN or infinity in {', '.join(wrong)}; leave such splats out while loading")
+    return gaussians
 
 
 def digest_of_parameters(model: SplatModel) -> str:

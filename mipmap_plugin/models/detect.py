@@ -9,9 +9,12 @@ from pathlib import Path
 
 from mipmap_plugin.errors import CheckpointError, PluginError
 from mipmap_plugin.formats.atomic import settled
-from mipmap_plugin.models.families import FAMILIES, find_family, not_loaded
+from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import Family, Files, Match
 from mipmap_plugin.models.places import REPORT
+
+# The families of this package.
+OWN = frozenset(family.name for family in BUILT_IN)
 
 
 @dataclass(frozen=True)
@@ -76,9 +79,9 @@ def _claims(files: Files) -> tuple[dict[str, tuple[Family, Match]], list[str]]:
                 raise PluginError(f"its recognize returns a {type(match).__name__}; it has to be a Match or None")
             if match is not None:
                 claims[name] = family, match
-        except CheckpointError:
-            raise
-        except Exception as error:  # third-party code may fail in any way
+        except (Exception, SystemExit) as error:  # third-party code may fail in any way
+            if name in OWN and isinstance(error, CheckpointError):
+                raise  # what is wrong with the file
             notes.append(f"the family {name!r} failed: {error}")
     return claims, notes
 
@@ -151,7 +154,8 @@ def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:
             checkpoint, match = _recognize(settled(ply))
             if match.lacks:
                 raise CheckpointError(f"{entries[number]} is an incomplete checkpoint, without {', '.join(match.lacks)}")
-            return Checkpoint(checkpoint.family, ply, folder, number, tuple(f"iteration_{number} is used, since {trouble}" for trouble in troubles))
+            skipped = tuple(f"iteration_{number} is used, since {trouble}" for trouble in troubles)
+            return Checkpoint(checkpoint.family, ply, folder, number, (*checkpoint.notes, *skipped))
         except CheckpointError as error:
             troubles.append(str(error))
     raise CheckpointError(f"{folder} has no whole checkpoint: {'; '.join(troubles)}")

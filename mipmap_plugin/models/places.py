@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from mipmap_plugin.formats.atomic import named
+
 # Checkpoints in the result folders of projects that save with torch: subfolder, and pattern of the file names.
 GSPLAT = ("ckpts", r"ckpt_(?P<step>\d+)(?:_rank(?P<rank>\d+))?\.pt")
 SPLATFACTO = ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")
@@ -37,3 +39,9 @@ def network_of(ply: Path, family: str) -> Path:
 def is_coarse(ply: Path) -> bool:
     """Whether the PLY is of the first (coarse) stage of 4D Gaussians, in which nothing moves."""
     return ply.absolute().parent.name.startswith("coarse_iteration_")
+
+
+def state_path(output: Path) -> Path:
+    """The path of the state of a run whose model is to be saved to `output`."""
+    output = named(output)
+    return output.with_name(output.name + ".resume")

@@ -7,10 +7,12 @@ all WebGL viewers have in common.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 from dataclasses import dataclass, replace
-from numbers import Real
 
+from mipmap_plugin.allowed import OF_VIEWER, check
 from mipmap_plugin.effects import DILATION, FRUSTUM_MARGIN, NEAR_PLANE, USUAL, Effects, Packing, RenderSettings
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.registry import Registry
@@ -33,12 +35,11 @@ class Viewer:
     unlike: str = ""  # known differences between the viewer and this record
 
     def __post_init__(self) -> None:
-        if self.screen_filter not in SCREEN_FILTERS:
+        if not isinstance(self.screen_filter, str) or self.screen_filter not in SCREEN_FILTERS:
             raise SettingsError(f"viewer {self.name!r}: there is no screen filter {self.screen_filter!r}; choose from {', '.join(SCREEN_FILTERS)}")
-        if not isinstance(self.settings, RenderSettings) or not isinstance(self.sh_degree, int):
-            raise SettingsError(f"viewer {self.name!r}: settings must be RenderSettings, and sh_degree a whole number")
-        if not isinstance(self.eps2d, Real) or not 0 <= self.eps2d < math.inf:
-            raise SettingsError(f"viewer {self.name!r}: eps2d, the dilation in px², must be a number of at least 0, got {self.eps2d!r}")
+        if not isinstance(self.settings, RenderSettings):
+            raise SettingsError(f"viewer {self.name!r}: settings must be RenderSettings, got {type(self.settings).__name__}")
+        check(f"viewer {self.name!r}", self, OF_VIEWER, optional=frozenset({"near_plane"}))
 
     def effects(self, effects: Effects) -> Effects:
         """`effects` under this viewer's convention. The near plane changes only if the viewer has one."""
@@ -147,6 +148,9 @@ BUILT_IN = (
     ),
 )  # fmt: skip
 
+# What a name may be: files that are adapted for the viewer have it in theirs.
+IN_FILES = re.compile(r"\w[\w.+-]*")
+
 ALIASES = {"supersplat": "playcanvas"}
 
 VIEWERS = Registry("mipmap_plugin.viewers", {})
@@ -154,7 +158,9 @@ VIEWERS = Registry("mipmap_plugin.viewers", {})
 
 def register_viewer(name: str, viewer: Viewer | tuple[str, ...] | str, *, replace: bool = False) -> None:
     """Register a viewer under `name`: a record, or `"package.module:RECORD"`, which is imported at first use; or a group, given by the
-    names of registered viewers, that one file has to suit."""
+    names of registered viewers, that one file has to suit. Raises SettingsError for a name that is taken, or cannot be part of a file's."""
+    if isinstance(name, str) and not IN_FILES.fullmatch(name):
+        raise SettingsError(f"viewers are named in files: a name begins with a letter or a digit, and has . _ + - beside these, got {name!r}")
     VIEWERS.add(name, viewer, replace=replace)
 
 
@@ -186,3 +192,13 @@ def find_viewer(name: str) -> Viewer:
     if not isinstance(viewer, Viewer):
         raise PluginError(f"viewer {name!r} must be a mipmap_plugin.splatting.viewers.Viewer, got {type(viewer).__name__}")
     return viewer
+
+
+def single_viewers() -> list[str]:
+    """The names of all viewers, without groups of them and without those of packages that cannot be loaded."""
+    found = []
+    for name in VIEWERS.names():
+        with contextlib.suppress(PluginError, SettingsError):
+            find_viewer(name)
+            found.append(name)
+    return found

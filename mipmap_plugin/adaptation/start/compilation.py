@@ -11,7 +11,6 @@ import torch
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.backends.base import AdamStep, Backend
-from mipmap_plugin.backends.drawn import drawn
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -23,7 +22,7 @@ def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], 
     """Let the backend compile what draws splats like these with all `effects`, and what their `gradients`, `merging` and steps `by_rows` need."""
     few = gaussians[torch.arange(min(2, len(gaussians)))].detach()
     for number, setting in enumerate(effects):
-        image = drawn(backend, replace(few, means=few.means.clone().requires_grad_(gradients)), CAMERA, setting).image
+        image = backend.render(replace(few, means=few.means.clone().requires_grad_(gradients)), CAMERA, setting).image
         if merging and number == 0:  # here, because another process may be compiling the backward pass by now
             weights = blend_weights(few, [CAMERA], backend, setting)
             merge(few, torch.ones_like(weights), weights, fraction=0.5)

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.backends.base import Backend
-from mipmap_plugin.backends.drawn import drawn
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -55,7 +54,7 @@ class BaseImages:
         size = (view.width, view.height) if factor == 1 else (max(1, round(view.width * factor)), max(1, round(view.height * factor)))
         camera = view if (factor, view.zoom) == (1, 1) else replace(view.resized(*size), zoom=1.0)
         effects = replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
-        return drawn(self.backend, self._splats(camera), camera, effects).image.clamp(0, 1)
+        return self.backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
 
     def _splats(self, camera: Camera) -> Gaussians:
         """The splats, activated once if all cameras see the same ones: activation takes a fifth of a small image's time."""

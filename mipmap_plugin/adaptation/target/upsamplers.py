@@ -11,10 +11,14 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.super_resolution import SUFFIXES, Network
-from mipmap_plugin.errors import MipmapPluginError, PluginError, SettingsError
+from mipmap_plugin.errors import PluginError, SettingsError
+from mipmap_plugin.plugin_errors import is_third_party, naming
 from mipmap_plugin.registry import Registry
 
 Upsampler = Callable[[Tensor, tuple[int, int]], Tensor]
+
+# Colors are 0..1, and what sharpens goes a little beyond. Farther beyond, an image is one of another range, such as 0..255.
+LOWEST, HIGHEST = -1.0, 2.0
 
 UPSAMPLERS = Registry(
     "mipmap_plugin.upsamplers",
@@ -38,16 +42,21 @@ def find_upsampler(name: str) -> Upsampler:
 
 def _enlarged(name: str, upsampler: Upsampler, image: Tensor, size: tuple[int, int]) -> Tensor:
     """What an upsampler makes of an image, [size[0], size[1], 3]. Raises PluginError."""
-    try:
-        made = upsampler(image, size)
-    except (MipmapPluginError, MemoryError):
-        raise
-    except Exception as error:  # third-party code may fail in any way
-        raise PluginError(f"upsampler {name!r} failed: {type(error).__name__}: {error}") from error
-    if not isinstance(made, Tensor) or tuple(made.shape) != (*size, 3) or not made.isfinite().all():
-        got = f"{list(made.shape)}, {'' if made.isfinite().all() else 'not '}all finite" if isinstance(made, Tensor) else f"a {type(made).__name__}"
-        raise PluginError(f"upsampler {name!r} has to return an image {[*size, 3]} of finite numbers; it returned {got}")
+    with naming(f"upsampler {name!r}"):
+        made: Any = upsampler(image.clone() if is_third_party(upsampler) else image, size)
+    wanted = f"upsampler {name!r} has to return an image {[*size, 3]} of finite {image.dtype}"
+    if not isinstance(made, Tensor) or tuple(made.shape) != (*size, 3) or made.dtype != image.dtype or not made.isfinite().all():
+        raise PluginError(f"{wanted}; it returned {_described(made)}")
+    low, high = (float(end) for end in made.aminmax())
+    if not LOWEST <= low <= high <= HIGHEST:
+        raise PluginError(f"{wanted}, whose colors are 0..1; those that it returned are {low:.3g} to {high:.3g}")
     return made
+
+
+def _described(made: Any) -> str:
+    if not isinstance(made, Tensor):
+        return f"a {type(made).__name__}"
+    return f"{list(made.shape)} in {made.dtype}{'' if made.isfinite().all() else ', not all finite'}"
 
 
 def check_upsampler(name: str) -> None:

@@ -1,0 +1,127 @@
+"""Third-party backends behind a look at whether they keep their contract: what fails names its backend, and no wrong image passes for a right one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.backends.base import AdamStep, Needs, Rendered, Stepper
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import PluginError
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.plugin_errors import naming, unchanged
+
+# What a backend may have beside `lacking` and `render`.
+OPTIONAL = ("render_views", "blend_weights", "stepper")
+
+
+class Guarded:
+    """A backend whose images, gradients and weights are looked at. Raises PluginError for what is not as `backends.base` says."""
+
+    def __init__(self, name: str, theirs: Any) -> None:
+        self.theirs, self._title = theirs, f"backend {name!r}"
+
+    def __getattr__(self, name: str) -> Any:
+        """An attribute of the backend itself; what it may have beside `render` is looked at, too."""
+        part = getattr(self.theirs, name)
+        return partial(getattr(self, f"_{name}"), part) if name in OPTIONAL else part
+
+    def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+        """See `base.Backend`."""
+        watched = _watched(self._title, gaussians)
+        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
+            rendered = self.theirs.render(watched, camera, effects)
+        return self._checked(rendered, gaussians, camera, effects)
+
+    def _checked(self, rendered: Any, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+        image, wanted = getattr(rendered, "image", None), (*camera.size, 3)
+        if not isinstance(rendered, Rendered) or not isinstance(image, Tensor) or tuple(image.shape) != wanted:
+            got = f"an image {list(image.shape)}" if isinstance(image, Tensor) else f"a {type(rendered).__name__}"
+            raise PluginError(f"{self._title} has to return a Rendered with an image {list(wanted)}; it returned {got}")
+        if image.dtype != gaussians.means.dtype:
+            raise PluginError(f"{self._title} has to return images of the splats' type {gaussians.means.dtype}; it returned {image.dtype}")
+        if not image.isfinite().all():
+            view = f"{camera.name or 'a view'}, {camera.width} x {camera.height} px"
+            raise PluginError(f"{self._title} returned an image with NaN or infinity, of {view}")
+        if torch.is_grad_enabled() and not image.requires_grad and any(tensor.requires_grad for tensor in _tensors(gaussians).values()):
+            shows = bool((image != image[:1, :1]).any())  # an image of nothing has no gradients
+            if shows and not self.theirs.lacking(Needs.of(gaussians, effects, gradients=True)):
+                raise PluginError(f"{self._title} returned an image without gradients, and does not say in `lacking` that it has none")
+        return rendered.replaced(alpha=partial(self._alpha, rendered, wanted[:2]))
+
+    def _alpha(self, rendered: Rendered, wanted: tuple[int, ...]) -> Tensor:
+        with naming(self._title):
+            alpha = rendered.alpha
+        if not isinstance(alpha, Tensor) or tuple(alpha.shape) != wanted:
+            got = list(alpha.shape) if isinstance(alpha, Tensor) else f"a {type(alpha).__name__}"
+            raise PluginError(f"{self._title} has to return an alpha {list(wanted)}; it returned {got}")
+        return alpha
+
+    def _render_views(self, theirs: Any, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
+        watched = _watched(self._title, gaussians)
+        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
+            views = theirs(watched, shots)
+        if not isinstance(views, (list, tuple)) or len(views) != len(shots):
+            got = f"{len(views)}" if isinstance(views, (list, tuple)) else f"a {type(views).__name__}"
+            raise PluginError(f"{self._title}: render_views has to return a list of {len(shots)} Rendered, one for each view; it returned {got}")
+        return [self._checked(view, gaussians, *shot) for view, shot in zip(views, shots, strict=True)]
+
+    def _blend_weights(self, theirs: Any, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor | None:
+        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
+            weights: Tensor | None = theirs(gaussians, camera, effects)
+        if weights is not None and (not isinstance(weights, Tensor) or tuple(weights.shape) != (len(gaussians),) or not weights.isfinite().all()):
+            raise PluginError(f"{self._title}: blend_weights has to return {len(gaussians)} finite numbers, one for each splat, or None")
+        return weights
+
+    def _stepper(self, theirs: Any, raw: Mapping[str, Tensor]) -> Stepper:
+        with naming(self._title):
+            return _GuardedStepper(self._title, theirs(raw))
+
+
+class _GuardedStepper:
+    """A stepper whose failures name its backend."""
+
+    def __init__(self, title: str, theirs: Stepper) -> None:
+        self._title, self._theirs = title, theirs
+
+    def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
+        with naming(self._title):
+            return self._theirs.render(number, camera, effects)
+
+    def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
+        with naming(self._title):
+            self._theirs.differentiate(number, d_image, d_alpha)
+
+    def step(self, step: AdamStep) -> None:
+        with naming(self._title):
+            self._theirs.step(step)
+        if wrong := [name for name, tensor in step.raw.items() if not tensor.isfinite().all()]:
+            raise PluginError(f"{self._title}: a step left NaN or infinity in {', '.join(wrong)}")
+
+
+def _tensors(gaussians: Gaussians) -> dict[str, Tensor]:
+    return {name: tensor for name, tensor in vars(gaussians).items() if isinstance(tensor, Tensor)}
+
+
+def _watched(title: str, gaussians: Gaussians) -> Gaussians:
+    """The same splats; a gradient that is not finite raises PluginError in the backward pass."""
+
+    def watched(name: str, tensor: Tensor) -> Tensor:
+        tensor = tensor.view_as(tensor)  # no leaf, which would keep the hook
+        tensor.register_hook(partial(_refuse_gradient, title, name))
+        return tensor
+
+    if not torch.is_grad_enabled():
+        return gaussians
+    return replace(gaussians, **{name: watched(name, tensor) for name, tensor in _tensors(gaussians).items() if tensor.requires_grad})
+
+
+def _refuse_gradient(title: str, name: str, gradient: Tensor) -> None:
+    if not gradient.isfinite().all():
+        raise PluginError(f"{title} returned gradients with NaN or infinity for {name}")

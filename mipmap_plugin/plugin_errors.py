@@ -1,0 +1,64 @@
+"""Errors of third-party code, in a sentence that names the plug-in. Errors of this package's own stay what they are: bugs, with a traceback."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from mipmap_plugin.errors import MipmapPluginError, PluginError
+from mipmap_plugin.limits import is_out_of_memory
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def is_third_party(thing: Any) -> bool:
+    """Whether an object's class, or a function, is not of this package."""
+    return _module(thing).partition(".")[0] != __name__.partition(".")[0]
+
+
+def _module(thing: Any) -> str:
+    return str(getattr(thing, "__module__", None) or type(thing).__module__)
+
+
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Errors inside, which is third-party code alone, become a PluginError; so does an attempt to end the process. `what`: "backend 'mine'"."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        if isinstance(error, MipmapPluginError) or is_out_of_memory(error):
+            raise
+        raise PluginError(f"{what} failed: {type(error).__name__}: {error}") from error
+
+
+@contextmanager
+def naming_any(plugins: Mapping[str, Any]) -> Iterator[None]:
+    """Errors that pass through the code of one of the third-party `plugins`, objects by what they are called, become a PluginError."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        if isinstance(error, MipmapPluginError) or is_out_of_memory(error):
+            raise
+        for what, thing in plugins.items():
+            if is_third_party(thing) and any(_is_of(frame, thing) for frame, _ in traceback.walk_tb(error.__traceback__)):
+                raise PluginError(f"{what} failed: {type(error).__name__}: {error}") from error
+        raise
+
+
+def _is_of(frame: FrameType, thing: Any) -> bool:
+    """Whether a frame is of an object's method, or of its module; a script may have other things in it, such as an observer."""
+    module = frame.f_globals.get("__name__")
+    return frame.f_locals.get("self") is thing or (module == _module(thing) and module != "__main__")
+
+
+@contextmanager
+def unchanged(what: str, tensors: Mapping[str, Tensor]) -> Iterator[None]:
+    """Raise PluginError if third-party code changes one of the tensors, by name, in place: they may be the base's own."""
+    before = {name: tensor._version for name, tensor in tensors.items()}
+    yield
+    if changed := [name for name, tensor in tensors.items() if tensor._version != before[name]]:
+        raise PluginError(f"{what} changed its input in place ({', '.join(changed)}), which may be the base itself; let it work on a copy")

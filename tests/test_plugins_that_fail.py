@@ -1,0 +1,275 @@
+"""Plug-ins that break their contract while they are used: a sentence names them, the base stays as it was, and nothing wrong passes for a result."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import register_backend, register_model, register_recipe, register_upsampler, register_viewer, wrap_model
+from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.backends.base import Rendered
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.cli import main
+from mipmap_plugin.effects import Packing, RenderSettings
+from mipmap_plugin.errors import OutputExists, PluginError, SettingsError
+from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, detect
+from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.plugin_errors import naming_any
+from mipmap_plugin.recipes import default
+from mipmap_plugin.splatting.viewers import Viewer, single_viewers
+
+
+def backend(render, **parts):
+    """A backend that draws as the reference, but for `render(rendered, gaussians)`."""
+
+    def changed(self, gaussians, camera, effects):
+        return render(ReferenceBackend.render(self, gaussians, camera, effects), gaussians)
+
+    register_backend("odd", type("Odd", (ReferenceBackend,), {"name": "odd", "render": changed, **parts}))
+    return wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="odd")
+
+
+class Broken(torch.autograd.Function):
+    """An image whose gradient is not finite."""
+
+    @staticmethod
+    def forward(ctx, image):
+        return image.clone()
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return gradient * torch.nan
+
+
+def in_place(rendered, gaussians):
+    with torch.no_grad():
+        gaussians.means.add_(0.01)
+    return rendered
+
+
+BRIEF = dict(steps=1, extra_views=2, validation_views=2, merge_to=1.0)
+
+
+@pytest.mark.parametrize(
+    ("render", "said"),
+    [
+        (lambda rendered, _: 1 / 0, "backend 'odd' failed: ZeroDivisionError: division by zero"),
+        (lambda rendered, _: sys.exit(0), "backend 'odd' failed: SystemExit: 0"),
+        (lambda rendered, _: rendered.replaced(image=rendered.image * torch.nan), "backend 'odd' returned an image with NaN or infinity"),
+        (lambda rendered, _: rendered.replaced(image=rendered.image.double()), "images of the splats' type torch.float32; it returned torch.float64"),
+        (in_place, r"backend 'odd' changed its input in place \(means\)"),
+    ],
+)
+def test_what_a_backend_draws_wrong_is_told_by_its_name(render, said):
+    base = backend(render)
+    with pytest.raises(PluginError, match=said):
+        base.render(base.cameras[0])
+    with pytest.raises(PluginError, match=said):
+        base.adapt(0.5, **BRIEF)
+
+
+@pytest.mark.parametrize(
+    ("render", "said"),
+    [
+        (lambda rendered, _: rendered.replaced(image=Broken.apply(rendered.image)), "backend 'odd' returned gradients with NaN or infinity for"),
+        (lambda rendered, _: rendered.replaced(image=rendered.image.detach()), "backend 'odd' returned an image without gradients"),
+    ],
+)
+def test_wrong_gradients_of_a_backend_are_told_by_its_name(render, said):
+    base = backend(render)
+    base.adapt(2, recipe="instant")
+    with pytest.raises(PluginError, match=said):
+        base.adapt(0.5, **BRIEF)
+
+
+@pytest.mark.parametrize("alpha", [None, torch.zeros(3, 3)])
+def test_a_wrong_alpha_of_a_backend_is_told_by_its_name(alpha):
+    base = backend(lambda rendered, _: Rendered(rendered.image, alpha))
+    with pytest.raises(PluginError, match=r"backend 'odd' has to return an alpha \[48, 64\]"):
+        base.render(base.cameras[0], supersampling=2)
+
+
+@pytest.mark.parametrize(
+    ("part", "method", "said"),
+    [
+        ("render_views", lambda self, gaussians, shots: [], "render_views has to return a list of 4 Rendered, one for each view; it returned 0"),
+        ("blend_weights", lambda self, *_: torch.zeros(3), "blend_weights has to return 60 finite numbers"),
+        ("stepper", lambda self, raw: 1 / 0, "failed: ZeroDivisionError"),
+    ],
+)
+def test_what_a_backend_may_have_is_looked_at_too(part, method, said):
+    base = backend(lambda rendered, _: rendered, **{part: method})
+    with pytest.raises(PluginError, match=f"backend 'odd'.*{said}"):
+        base.adapt(0.5, **BRIEF, views_per_step=4, warm_up=0)
+
+
+def test_a_backend_that_fails_ends_a_command_in_a_sentence(tmp_path, capsys):
+    backend(lambda rendered, _: 1 / 0)
+    folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
+    assert main(["adapt", str(folder), "--scale", "1/2", "--backend", "odd", "--output", str(tmp_path / "new.ply")]) == 2
+    assert capsys.readouterr().err.strip().endswith("mipmap-plugin: backend 'odd' failed: ZeroDivisionError: division by zero")
+    assert not (tmp_path / "new.ply").exists()
+
+
+def family(**methods):
+    """A wrapped model of a third-party family."""
+    theirs = type("Theirs", (VanillaModel,), {"family": "theirs", **methods})
+    model = theirs(tiny.model().parameters())
+    return wrap_model(model, cameras=tiny.cameras(2), backend="reference")
+
+
+def moving_itself(self, camera=None):
+    with torch.no_grad():
+        self.parameters()["means"].add_(0.01)
+    return VanillaModel.gaussians(self, camera)
+
+
+@pytest.mark.parametrize(
+    ("gaussians", "said"),
+    [
+        (lambda self, camera=None: {}["level"], "family 'theirs' failed: KeyError: 'level'"),
+        (lambda self, camera=None: None, r"family 'theirs': gaussians\(\) has to return Gaussians; it returned a NoneType"),
+        (
+            lambda self, camera=None: (splats := VanillaModel.gaussians(self, camera)) and replace(splats, means=splats.means * torch.nan),
+            r"family 'theirs': gaussians\(\) returned NaN or infinity in means",
+        ),
+        (moving_itself, r"family 'theirs' changed its input in place \(means\)"),
+    ],
+)
+def test_what_a_family_does_wrong_is_told_by_its_name(gaussians, said):
+    with pytest.raises(PluginError, match=said):
+        base = family(gaussians=gaussians)
+        base.render(base.cameras[0])
+    with pytest.raises(PluginError, match=said):
+        family(gaussians=gaussians).adapt(0.5, **BRIEF)
+
+
+def test_a_family_that_ignores_what_is_there_replaces_nothing(tmp_path):
+    def save(self, path, *, provenance, overwrite=False):
+        return VanillaModel.save(self, path, provenance=provenance, overwrite=True)
+
+    adapted = family(save=save).adapt(0.5, recipe="instant")
+    (tmp_path / "new.ply").write_text("precious")
+    with pytest.raises(OutputExists):
+        adapted.save(tmp_path / "new.ply")
+    assert (tmp_path / "new.ply").read_text() == "precious"
+
+
+def test_an_error_of_this_package_stays_what_it_is():
+    with pytest.raises(ZeroDivisionError), naming_any({"backend 'odd'": ReferenceBackend()}):
+        1 / 0  # noqa: B018
+
+
+def damaged(files):
+    from mipmap_plugin.errors import CheckpointError
+
+    raise CheckpointError("this is no .theirs file")
+
+
+def test_a_family_that_raises_while_it_recognizes_breaks_no_other(tmp_path):
+    register_model("theirs", Family("theirs", "Theirs", damaged, API_VERSION))
+    for path in (tiny.folder(tmp_path / "base"), tiny.ply(tmp_path / "base.ply")):
+        found = detect(path)
+        assert found.family == "3dgs" and found.notes == ("the family 'theirs' failed: this is no .theirs file",)
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda image, size: 255 * resize(image, size, "lanczos"), "whose colors are 0..1; those that it returned are"),
+        (lambda image, size: (255 * resize(image, size, "lanczos")).byte(), "in torch.uint8"),
+        (lambda image, size: sys.exit(0), "upsampler 'odd' failed: SystemExit"),
+    ],
+)
+def test_an_upsampler_of_other_numbers_is_told(made, said):
+    register_upsampler("odd", made)
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="reference")
+    with pytest.raises(PluginError, match=said):
+        base.adapt(2, recipe="paper", upsampler="odd", steps=1)
+
+
+def test_an_upsampler_has_a_copy_of_the_image():
+    def dims(image, size):
+        return resize(image.mul_(0.5) / 0.5, size, "lanczos")
+
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="reference")
+    register_upsampler("odd", dims)
+    odd, plain = (base.adapt(2, recipe="paper", upsampler=name, steps=2).report.curve[-1].psnr_db for name in ("odd", "lanczos"))
+    assert odd == pytest.approx(plain, abs=1e-3)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2])
+@pytest.mark.parametrize("recipe", ["default", "thorough", "paper"])
+def test_a_recipe_made_from_another_leaves_that_as_it_is(recipe, scale):
+    from mipmap_plugin import recipes
+
+    made = getattr(recipes, recipe)
+    before = made(scale, False)
+    made(scale, False)["steps"] = 3
+    assert made(scale, False) == before and default(scale, True)["steps"] != 3
+
+
+def test_a_recipe_may_be_made_from_another():
+    register_recipe("mine", lambda scale, network: {**default(scale, network), "steps": 1})
+    assert wrap_model(tiny.model(), cameras=tiny.cameras(2)).adapt(0.5, recipe="mine", extra_views=2).report.settings.steps == 1
+
+
+@pytest.mark.parametrize("name", ["", " ", "../kiosk", "our/kiosk", "x\ny", "-v", ".hidden"])
+def test_names_are_parts_of_file_names(name):
+    with pytest.raises(SettingsError, match=r"a name is a text of a line|a name begins with a letter"):
+        register_viewer(name, Viewer("kiosk", "Kiosk", "ours", "classic", 0.3))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"min_alpha": 0.0}, {"min_alpha": 2.0}, {"min_alpha": "x"}, {"min_alpha": float("nan")}, {"min_transmittance": 2.0}, {"radius": 0},
+        {"radius": -3.0}, {"tile": 0}, {"tile": 3.5}, {"tile": 100_000}, {"max_alpha": 0.0}, {"max_color": -1.0}, {"color_steps": (0.1, 0.1)},
+        {"color_steps": [0.1, 0.1, 0.1]}, {"min_variance": -1.0}, {"max_half_axis": 0.0, "radius": 3.0}, {"frame": -1.0}, {"picture_step": -1.0},
+        {"packing": "yes"},
+    ],
+)  # fmt: skip
+def test_render_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(SettingsError, match=f"render settings: {next(iter(wrong))} must be"):
+        RenderSettings(**wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"opacity": (0.0,)}, {"color": 0.0}, {"bands": (0.0,)}, {"log_scales": (9.0, -12.0, 0.1)}, {"quats": "smallest"}, {"bands": [0.1]}],
+)
+def test_packings_out_of_range_are_refused(wrong):
+    with pytest.raises(SettingsError, match=f"packing: {next(iter(wrong))} must be"):
+        Packing(**wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"near_plane": float("nan")}, {"near_plane": "0.2"}, {"near_plane": -5}, {"sh_degree": -1}, {"eps2d": True}, {"eps2d": 1e300}]
+)
+def test_viewers_out_of_range_are_refused(wrong):
+    values = {"eps2d": 0.3, **wrong}
+    with pytest.raises(SettingsError, match=f"viewer 'kiosk': {next(iter(wrong))} must be"):
+        Viewer("kiosk", "Kiosk", "ours", "classic", **values)
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert RenderSettings(min_alpha=np.float64(0.01)).min_alpha == 0.01
+
+
+def test_a_viewer_that_cannot_be_loaded_hides_no_other():
+    register_viewer("missing", "nosuch:VIEWER")
+    register_viewer("none", ())
+    assert {"spark", "classic"} <= set(single_viewers()) and not {"missing", "none", "portable"} & set(single_viewers())
+
+
+@pytest.mark.parametrize("cameras", [[], ()])
+def test_an_empty_list_of_cameras_is_no_wish_for_an_orbit(cameras):
+    with pytest.raises(SettingsError, match="cameras: there are none"):
+        wrap_model(tiny.model(), cameras=tiny.cameras(2)).adapt(0.5, cameras=cameras)
+
+
+def test_a_claim_is_still_believed():
+    register_model("theirs", Family("theirs", "Theirs", lambda files: Match(CERTAIN, "it says so"), API_VERSION))
