@@ -26,7 +26,7 @@ BYTES_PER_PIXEL = 32
 def check_scale(scale: Any) -> float:
     """Return a number of any type as a scale. Raises SettingsError for what is no number, or out of range."""
     try:
-        number = math.nan if isinstance(scale, str) else float(scale)
+        number = math.nan if isinstance(scale, (str, bool)) else float(scale)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not MIN_SCALE <= number <= MAX_SCALE:  # also for NaN

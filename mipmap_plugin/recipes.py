@@ -118,7 +118,8 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     try:
         config = AdaptConfig(**{"recipe": name, **settings, **overrides})
     except ValidationError as error:
-        raise SettingsError("; ".join(map(_told, error.errors()))) from None
+        asked = all(each["loc"] and each["loc"][0] in overrides for each in error.errors())
+        raise SettingsError(f"{'' if asked else f'recipe {name}: '}{'; '.join(map(_told, error.errors()))}") from None
     if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
         raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
     return config
@@ -130,7 +131,7 @@ def _told(error: Any) -> str:
     if error["type"] == "extra_forbidden":
         known = LearningRates.model_fields if len(error["loc"]) > 1 else AdaptConfig.model_fields
         meant = get_close_matches(str(error["loc"][-1]), known, 1)
-        return f"there is no setting {name}{f'; did you mean {meant[0]}?' if meant else ''} mipmap_plugin.config has all of them"
+        return f"there is no setting {name}; {f'did you mean {meant[0]}? ' if meant else ''}mipmap_plugin.config has all of them"
     return f"setting {name}: {error['msg']}" if name else error["msg"].removeprefix("Value error, ")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from importlib import import_module
@@ -178,7 +178,7 @@ class Wrapped:
         Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else checked(cameras, some=True)
-        _check_kinds(images=(images, Scene), start=(start, FinerLevel))
+        _check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         if not model.traits.same_for_all_views and (settings.setdefault("merge_to", 1.0) < 1 or settings.get("most_splats")):
             reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
@@ -280,11 +280,11 @@ class Wrapped:
         return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 
-def _check_kinds(**given: tuple[Any, type]) -> None:
+def _check_kinds(**given: tuple[Any, Any]) -> None:
     """Raise SettingsError for arguments, by name, that are neither None nor of the kind that each has to be."""
     for name, (value, kind) in given.items():
         if value is not None and not isinstance(value, kind):
-            raise SettingsError(f"{name} must be a {kind.__name__}, got {type(value).__name__}")
+            raise SettingsError(f"{name} must be a {getattr(kind, '__name__', kind)}, got {type(value).__name__}")
 
 
 def placed(model: SplatModel, scene: Scene) -> Scene:

@@ -383,7 +383,7 @@ def test_splats_with_ends_of_every_range_stay_finite():
 # What is refused
 
 
-@pytest.mark.parametrize("scale", [0, -1, float("inf"), float("nan")])
+@pytest.mark.parametrize("scale", [0, -1, float("inf"), float("nan"), True])
 def test_a_scale_that_is_no_zoom_is_refused(scale):
     with pytest.raises(SettingsError, match=f"scale must be from 1e-09 to 10000, such as 0.25 or 4, got {scale}"):
         wrapped().adapt(scale)
@@ -393,7 +393,10 @@ def test_a_scale_that_is_no_zoom_is_refused(scale):
     ("settings", "sentence"),
     [
         (dict(recipe="best"), "there is no recipe 'best'; choose from default, instant, paper, thorough"),
-        (dict(stepz=3), "there is no setting stepz; did you mean steps?"),
+        (dict(stepz=3), r"there is no setting stepz; did you mean steps\? mipmap_plugin.config has all of them"),
+        (dict(nosuch=3), "there is no setting nosuch; mipmap_plugin.config has all of them"),
+        (dict(resume=5), r"resume must be a str \| pathlib.Path, got int"),
+        (dict(observe=5), "observe must be a Callable, got int"),
         (dict(steps=-1), "setting steps: Input should be greater than or equal to 0"),
         (dict(resize="nearest"), "setting resize: Input should be 'fitting', 'box'"),
         (dict(views="some"), "setting views: Input should be 'given'"),

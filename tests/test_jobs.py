@@ -197,9 +197,11 @@ def test_files_that_adaptations_leave_are_left_out(tmp_path):
     job = job_of(tmp_path)
     run_job(job)
     (tmp_path / "out.ply.resume").write_bytes(b"")
+    (tmp_path / "ladder").mkdir()
+    (tmp_path / "ladder" / "levels.json").write_text("{}")
     kept, left_out = without_outputs(sorted(tmp_path.iterdir()))
     assert kept == [tmp_path / "base.ply", tmp_path / "cameras.json"]
-    assert {path.name for path in left_out} == {"out.ply", "out.ply.adaptation.json", "out.ply.resume"}
+    assert {path.name for path in left_out} == {"ladder", "out.ply", "out.ply.adaptation.json", "out.ply.resume"}
 
 
 # What counts as finished

@@ -217,6 +217,15 @@ def test_a_recipe_may_be_made_from_another():
     assert wrap_model(tiny.model(), cameras=tiny.cameras(2)).adapt(0.5, recipe="mine", extra_views=2).report.settings.steps == 1
 
 
+def test_what_a_recipe_sets_wrong_is_told_by_its_name():
+    register_recipe("mine", lambda scale, network: {"steps": -4})
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(2))
+    with pytest.raises(SettingsError, match="recipe mine: setting steps: Input should be"):
+        base.adapt(0.5, recipe="mine")
+    with pytest.raises(SettingsError, match=r"^setting steps: Input should be"):
+        base.adapt(0.5, steps=-4)
+
+
 @pytest.mark.parametrize("name", ["", " ", "../kiosk", "our/kiosk", "x\ny", "-v", ".hidden"])
 def test_names_are_parts_of_file_names(name):
     with pytest.raises(SettingsError, match=r"a name is a text of a line|a name begins with a letter"):

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.models.places import LADDER
 
 Item = TypeVar("Item")
 
@@ -59,7 +60,7 @@ def _is_output(path: Path) -> bool:
     from mipmap_plugin.models import detect
     from mipmap_plugin.models.outputs import is_adapted
 
-    if is_adapted(path):
+    if is_adapted(path) or (path / LADDER).is_file():
         return True
     try:
         return path.is_dir() and is_adapted(detect(path).path)

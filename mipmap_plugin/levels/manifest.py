@@ -12,10 +12,10 @@ from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lo
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.yardstick import TRUTH
-from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.places import LADDER, REPORT
 from mipmap_plugin.wrap import Wrapped
 
-MANIFEST = "levels.json"
+MANIFEST = LADDER
 FORMAT = "mipmap_plugin levels 1"
 
 # What is written into the folder of a ladder, also by what converts one.

@@ -14,6 +14,9 @@ SPLATFACTO = ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")
 # What is appended to the name of an adapted file, for the report that lies beside it.
 REPORT = ".adaptation.json"
 
+# What lies in the folder of a ladder of levels.
+LADDER = "levels.json"
+
 # Which files of a model folder are the networks of a moving scene.
 NETWORKS = {"4dgs": "point_cloud/*iteration_*/deformation.pth", "deformable": "deform/iteration_*/deform.pth"}
 
