@@ -62,6 +62,11 @@ def decibel(mean_square: float) -> float:
     return -10 * math.log10(max(mean_square, 1e-12))  # 120 dB: beyond single precision
 
 
+def psnr_as_shown(image: torch.Tensor, truth: torch.Tensor) -> float:
+    """PSNR (dB) of two images, clamped to 0..1 as a display does. On their own device, and quicker than the metric of evaluations."""
+    return decibel(float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()))
+
+
 def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig) -> str | None:
     """Why a run ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue."""
     if config.time_budget_s is not None and seconds >= config.time_budget_s:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from typing import TypeVar
 
@@ -34,9 +34,9 @@ def max_threads(means: Tensor, camera: Camera) -> int:
     return threads.for_views() if small else 1
 
 
-def views_at_once(camera: Camera) -> int:
-    """The number of views of the size of `camera`'s that a step draws in one call."""
-    return max(1, min(VIEWS_AT_ONCE, PIXELS_AT_ONCE // (camera.width * camera.height)))
+def views_at_once(cameras: Iterable[Camera]) -> int:
+    """The number of views that a step draws in one call, if none is larger than the largest of `cameras`."""
+    return max(1, min(VIEWS_AT_ONCE, PIXELS_AT_ONCE // max(camera.width * camera.height for camera in cameras)))
 
 
 def large_for_torch(means: Tensor) -> AbstractContextManager[None]:

@@ -50,6 +50,15 @@ class Report(BaseModel):
         """PSNR (dB) of what the file holds, on the same views."""
         return next((psnr for state, psnr in self.validation.items() if self.returned.startswith(state)), None)
 
+    def gain(self) -> str:
+        """The PSNR before and after in a sentence, as far as it was measured."""
+        before, after = self.psnr_before(), self.psnr_after()
+        if before is None or after is None:
+            return f"holds {self.returned}"
+        if self.returned.startswith(AS_IT_IS):
+            return f"holds {AS_IT_IS}, for nothing was better: {before:.2f} dB on views that nothing was adapted to"
+        return f"{before:.2f} -> {after:.2f} dB on views that nothing was adapted to"
+
     def provenance(self) -> dict[str, Any]:
         """Return what the file's header records: viewer, base, scale, inputs, settings, versions. Nothing in it depends on the clock."""
         made_from = {"scale": self.scale, "viewer": self.viewer, "base": self.base, "inputs": self.inputs}

@@ -149,13 +149,13 @@ class Session:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
         began, most = time.perf_counter(), self.config.most_splats or sys.maxsize
         allowed = [name for name, model in states.items() if _rows(model) <= most]
-        last = allowed[-1]
+        (base, start, *_), last = states, allowed[-1]
         with self.phase("validation"):
             best, psnrs = self.validation.choose(states, allowed)
         self.seconds["total"] += time.perf_counter() - began
         if self.config.returns == "last":
             best = last
-        elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed[:2]) - HARM_DB:
+        elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
         curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=psnrs[last], gaussians=_rows(states[last]))]

@@ -203,22 +203,10 @@ def _say(saved: Path, adapted: Adapted) -> None:
     """Two lines, what and where; the rest goes to the log."""
     report = adapted.report
     splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
-    say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {_gain(report)}, {splats}")
+    say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {report.gain()}, {splats}")
     say(f"{saved}, {_made_for(report, adapted.model)}")
     for line in _details(report):
         detail(f"  {line}")
-
-
-def _gain(report: Report) -> str:
-    """The PSNR before and after, as far as it was measured."""
-    from mipmap_plugin.adaptation.report import AS_IT_IS
-
-    before, after = report.psnr_before(), report.psnr_after()
-    if before is None or after is None:
-        return f"holds {report.returned}"
-    if report.returned.startswith(AS_IT_IS):
-        return f"holds {AS_IT_IS}, for nothing was better: {before:.2f} dB on views that nothing was adapted to"
-    return f"{before:.2f} -> {after:.2f} dB on views that nothing was adapted to"
 
 
 def _details(report: Report) -> Iterator[str]:

@@ -69,11 +69,9 @@ def _jobs(checkpoint: Path, request: Request, base: Base) -> list[Job]:
 
 def _say(job: Job, tiles: int, joined: Joined) -> None:
     report = joined.report
-    before_db, after_db = report.psnr_before(), report.psnr_after()
-    gain = f"{before_db:.2f} -> {after_db:.2f} dB on views that nothing was adapted to" if before_db and after_db else f"holds {report.returned}"
     splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats"
     viewer = f" in {job.viewer}" if job.viewer else ""
-    say(f"x{job.scale:g}{viewer}, {tiles} tiles: {gain}, {splats}, {report.seconds['total']:.1f} s")
+    say(f"x{job.scale:g}{viewer}, {tiles} tiles: {report.gain()}, {splats}, {report.seconds['total']:.1f} s")
     say(str(joined.file))
     detail(f"  holds {report.returned}; {report.views}; {report.filters}; backend {report.backend}")
 

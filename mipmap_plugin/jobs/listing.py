@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TypeVar
 
 from mipmap_plugin.errors import CheckpointError, SettingsError
-from mipmap_plugin.models.places import LADDER
 
 Item = TypeVar("Item")
 
@@ -59,6 +58,7 @@ def without_outputs(checkpoints: Iterable[Path]) -> tuple[list[Path], list[Path]
 def _is_output(path: Path) -> bool:
     from mipmap_plugin.models import detect
     from mipmap_plugin.models.outputs import is_adapted
+    from mipmap_plugin.models.places import LADDER
 
     if is_adapted(path) or (path / LADDER).is_file():
         return True

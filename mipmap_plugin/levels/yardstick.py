@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.curve import psnr_as_shown
 from mipmap_plugin.adaptation.optimization.validation import WINDOW
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
@@ -44,20 +44,16 @@ class Yardstick:
 
     def psnr(self, level: Adapted, zoom: float) -> float:
         """Mean PSNR (dB) of a level at a zoom."""
-        return self._mean(lambda camera, truth: _psnr(level.render(camera).image, truth), zoom)
+        return self._mean(lambda camera, truth: psnr_as_shown(level.render(camera).image, truth), zoom)
 
     def psnr_of_base(self, base: Wrapped, viewer: str, zoom: float) -> float:
         """Mean PSNR (dB) of the base itself, as a viewer draws it at a zoom."""
-        return self._mean(lambda camera, truth: _psnr(base.render(camera, viewer=viewer).image, truth), zoom)
+        return self._mean(lambda camera, truth: psnr_as_shown(base.render(camera, viewer=viewer).image, truth), zoom)
 
     def likeness(self, one: Adapted, other: Adapted, zoom: float) -> float:
         """Mean PSNR (dB) between the images of two levels at a zoom."""
-        return self._mean(lambda camera, _: _psnr(one.render(camera).image, other.render(camera).image), zoom)
+        return self._mean(lambda camera, _: psnr_as_shown(one.render(camera).image, other.render(camera).image), zoom)
 
     def _mean(self, compare: Callable[[Camera, Tensor], float], zoom: float) -> float:
         cameras = {view: view.zoomed(zoom) for view in self._views}
         return fmean(compare(camera, resize(self._images[view], camera.size, RESIZE)) for view, camera in cameras.items())
-
-
-def _psnr(one: Tensor, other: Tensor) -> float:
-    return decibel(float((one.clamp(0, 1) - other.clamp(0, 1)).square().mean()))

@@ -13,16 +13,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.target.image_store import in_16_bits
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.tiles.cut import front_to_back
 from mipmap_plugin.tiles.folder import halo_file, layer_file
-from mipmap_plugin.tiles.layers import box_of, unrounded, within
+from mipmap_plugin.tiles.layers import box_of, on_black, within
 from mipmap_plugin.tiles.pictures import Album, Box, write_pictures
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.slabs import Layer
 from mipmap_plugin.tiles.steering import Steered, open_state
 from mipmap_plugin.tiles.sweeps import Sweep
-from mipmap_plugin.tiles.truth import in_16_bits, part_of
+from mipmap_plugin.tiles.truth import part_of
 
 # Blend weights of a pixel that are too small to be seen.
 INVISIBLE = 1 / 255
@@ -36,7 +37,7 @@ FINE = 255
 
 def draw_halos(scene: TiledScene, part: int, sweep: Sweep, folder: Path) -> None:
     """Draw the `part`-th of a sweep's views as it begins, and write the picture, NAME, and what each tile TILE has in it around it, NAME/TILE."""
-    splats, painter = open_state(scene, folder, Steered.before(folder, sweep.number)), scene.painter(unrounded(scene.target))
+    splats, painter = open_state(scene, folder, Steered.before(folder, sweep.number)), scene.painter(on_black(scene.target))
     layers = [Album([layer_file(folder, number, sweep.halos)]) for number in range(len(scene.cores))]
     background = torch.tensor(scene.target.background)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.renderers import unrounded
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.tiles.folder import layer_file
 from mipmap_plugin.tiles.pictures import Box, write_pictures
@@ -19,16 +20,16 @@ from mipmap_plugin.tiles.store import Store
 from mipmap_plugin.tiles.sweeps import Sweep
 
 
-def unrounded(effects: Effects) -> Effects:
-    """The effects on black, without the rounding of a viewer's file and picture, as the steps draw."""
-    return replace(effects, background=BLACK, settings=replace(effects.settings, packing=None, picture_step=None))
+def on_black(effects: Effects) -> Effects:
+    """The effects on black, as the steps draw."""
+    return replace(unrounded(effects), background=BLACK)
 
 
 @torch.no_grad()
 def draw_layers(scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> None:
     """Draw a tile in each of a sweep's views, and write [h, w, 4] half of each: the picture on black, and the transmittance."""
     splats = scene.kind(Store(Steered.before(folder, sweep.number).file(folder, number)).parameters()).gaussians()
-    effects = unrounded(scene.target)
+    effects = on_black(scene.target)
 
     def pictures() -> Iterator[tuple[str, Tensor, Box]]:
         for view in scene.sweep_views(sweep):

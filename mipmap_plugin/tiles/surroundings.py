@@ -17,16 +17,17 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
 from mipmap_plugin.adaptation.renderers import Comparison, SteppingRenderer
+from mipmap_plugin.adaptation.target.image_store import from_16_bits
 from mipmap_plugin.backends.base import Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.tiles.folder import halo_file, layer_file
 from mipmap_plugin.tiles.halo import FINE
-from mipmap_plugin.tiles.layers import unrounded, within
+from mipmap_plugin.tiles.layers import on_black, within
 from mipmap_plugin.tiles.pictures import Album, Box
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.sweeps import Sweep
-from mipmap_plugin.tiles.truth import Truths, from_16_bits, parts
+from mipmap_plugin.tiles.truth import Truths, parts
 
 # Views whose surroundings are kept: those of a step are needed twice.
 KEPT = 2 * VIEWS_AT_ONCE
@@ -50,7 +51,7 @@ class Surroundings:
 
     def __init__(self, scene: TiledScene, number: int, sweep: Sweep, folder: Path) -> None:
         self._scene, self._number = scene, number
-        self._effects = unrounded(scene.target)
+        self._effects = on_black(scene.target)
         self._truths = Truths(scene, folder)
         self._layers = Album([layer_file(folder, number, sweep.halos)])
         self._halos = Album(halo_file(folder, part, sweep.halos) for part in range(parts(scene.sweep_views(sweep))))

@@ -52,7 +52,7 @@ class Tile:
             student.parameters()["shN"].requires_grad_(False)
         task, keeper = self._task(), StateKeeper(resume, self._fingerprint())
         run = keeper.start_or_resume(student, task, self.config, 0.0)
-        if run.step < self.sweep.first or not run.step:
+        if run.step < self.sweep.first or not run.step:  # a run that begins: one that is resumed has made some of the sweep's steps
             self._continue(run)
 
         def after_step(run: Run) -> bool:

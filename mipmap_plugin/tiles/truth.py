@@ -7,11 +7,10 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.base_images import facts
-from mipmap_plugin.adaptation.target.image_store import MOST, STEPS
+from mipmap_plugin.adaptation.target.image_store import from_16_bits, in_16_bits
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.tiles.folder import truth_file
@@ -70,16 +69,6 @@ def resized(scene: TiledScene, view: Camera, image: Tensor) -> Tensor:
     """The pseudo ground truth [h, w, 3] of a view at the new scale, from the base's picture of it."""
     target = resize(image, view.zoomed(scene.scale).size, scene.config.resize)
     return target.clamp(0, 1).mul(255).round().div(255) if scene.config.quantize_truth else target
-
-
-def in_16_bits(image: Tensor) -> Tensor:
-    """An image as it is stored (`image_store`)."""
-    return (image * STEPS).round().clamp(-MOST, MOST).to(torch.int16)
-
-
-def from_16_bits(stored: Tensor) -> Tensor:
-    """An image that was stored."""
-    return stored.float() / STEPS
 
 
 class Truths:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.curve import psnr_as_shown
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.viewing.around import views_for_screen
@@ -145,14 +145,14 @@ class Adapter:
         judged = wish.screen.window(max(1, int(side * wish.screen.width)), max(1, int(side * wish.screen.height)))
         request = Request(judged, wish.zoom, wish.viewer)
         truth, measured = self._reference.render(request).clamp(0, 1), -math.inf
-        self._set(base_db=psnr(self._shown.render(request), truth))
+        self._set(base_db=psnr_as_shown(self._shown.render(request), truth))
 
         @torch.no_grad()
         def observe(step: int, seconds: float, render: Callable[[Camera], Tensor]) -> bool:
             nonlocal measured
             self._answer_with(render)
             if step == 0 or time.monotonic() - measured > MEASURED_EVERY_S:
-                self._set(step=step, curve=(*self.progress.curve, (seconds, psnr(render(judged), truth))))
+                self._set(step=step, curve=(*self.progress.curve, (seconds, psnr_as_shown(render(judged), truth))))
                 measured = time.monotonic()
             return self._stopping.is_set()
 
@@ -178,11 +178,6 @@ class Adapter:
 def alike(one: Camera, other: Camera) -> bool:
     """Whether two cameras give the same picture."""
     return one.size == other.size and (one.fx, one.fy) == (other.fx, other.fy) and torch.equal(one.viewmat, other.viewmat)
-
-
-def psnr(image: Tensor, truth: Tensor) -> float:
-    """PSNR (dB) of an image as a display shows it."""
-    return decibel(float((image.clamp(0, 1) - truth).square().mean()))
 
 
 class Live:

@@ -169,10 +169,12 @@ def _grow(
 
 
 def reset_opacities(optimizer: Adam) -> None:
-    """Clamp every opacity to at most `RESET_OPACITY`, and reset Adam's state of the opacities."""
+    """Clamp every opacity to at most `RESET_OPACITY`, and clear Adam's moments of the opacities; its steps go on (INRIA's gaussian_model.py)."""
     for group in optimizer.param_groups:
         if group["name"] == "opacities":
             logits = group["params"][0]
             with torch.no_grad():
                 logits.clamp_(max=torch.logit(torch.tensor(RESET_OPACITY)).item())
-            optimizer.state[logits] = {}
+            state = optimizer.state_of(logits)
+            state["exp_avg"].zero_()
+            state["exp_avg_sq"].zero_()

@@ -93,7 +93,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
         density.reset_opacities(run.optimizer)
     progress = run.progress(config)
     set_rates(run.optimizer, config, progress, run.steering.rate_factor(run.step, config), frozen=frozen_parameters(run))
-    at_once = views_at_once(cameras[views[0]]) if run.gradients is None else 1
+    at_once = views_at_once(cameras[view] for view in views) if run.gradients is None else 1
     run.by_rows = ByRows.of(run.student, task.render_to_step, run.by_rows) if len(views) <= at_once else None
     if run.by_rows is not None:
         _step_by_rows(run, run.by_rows, task, config, views, cameras)

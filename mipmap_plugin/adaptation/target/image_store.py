@@ -19,6 +19,16 @@ MOST = torch.iinfo(torch.int16).max
 LEFT_FREE = 0.5
 
 
+def in_16_bits(image: Tensor) -> Tensor:
+    """An image of -2..2 as it is stored."""
+    return (image * STEPS).round().clamp(-MOST, MOST).to(torch.int16)
+
+
+def from_16_bits(stored: Tensor) -> Tensor:
+    """An image that was stored, of floats or whole numbers."""
+    return stored / STEPS
+
+
 class ImageStore:
     """Images by key, each made once while there is room. What is returned does not depend on whether there was."""
 
@@ -32,9 +42,9 @@ class ImageStore:
         """Return the image `key`, [H, W, 3] in -2..2, or else make it."""
         stored = self._images.get(key)
         if stored is None:
-            stored = (make() * STEPS).round().clamp(-MOST, MOST).to(torch.int16)
+            stored = in_16_bits(make())
             self._keep(key, stored)
-        return stored.to(self._like, non_blocking=True) / STEPS
+        return from_16_bits(stored.to(self._like, non_blocking=True))
 
     def _keep(self, key: Hashable, image: Tensor) -> None:
         if self._bytes + image.nbytes <= self._limit:
