@@ -47,6 +47,7 @@ from mipmap_plugin.tiles.steering import Steered, open_state, sweep_of
 from mipmap_plugin.tiles.store import Store, write_store
 from mipmap_plugin.tiles.surroundings import Surroundings, nothing
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
+from mipmap_plugin.tiles.tile import Tile
 from mipmap_plugin.tiles.truth import Truths, draw_truths, parts
 
 needs_numba = pytest.mark.skipif(not importlib.util.find_spec("numba"), reason="numba is not installed")
@@ -329,6 +330,14 @@ def test_a_view_without_the_core_shows_nothing(halved):
     [image] = around[0].render_views(core, [away])
     (image - around[0].wanted(away)).square().mean().backward()
     assert image.shape == (1, 1, 3) and not image.any() and not core.means.grad.any()
+
+
+def test_views_without_the_core_have_the_pixels_of_the_new_scale(halved, monkeypatch):
+    """Means move by pixels, which are those of the closest view if none shows a splat."""
+    scene, folder = halved
+    monkeypatch.setattr(Surroundings, "crop", lambda self, view: None)
+    tile = Tile(scene, 0, scene.sweeps[0], folder)
+    assert {view.fx for view in tile._task().views} == {view.zoomed(scene.scale).fx for view in scene.views.adapted}
 
 
 @needs_numba

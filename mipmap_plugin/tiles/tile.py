@@ -84,7 +84,7 @@ class Tile:
     def _task(self) -> Task:
         """What the loop optimizes. The views are those of the new scale, so that there is nothing left to zoom."""
         around = self.surroundings
-        views = [crop or nothing(view) for view, crop in zip(self.scene.views.adapted, self.crops, strict=True)]
+        views = [crop or nothing(view.zoomed(self.scene.scale)) for view, crop in zip(self.scene.views.adapted, self.crops, strict=True)]
         white = self.scene.target.background == (1.0, 1.0, 1.0)
         validation = no_validation(around.wanted, around.render)
         return Task(views, 1.0, around.wanted, around.render, white, validation, render_views=around.render_views, render_to_step=around.to_step)

@@ -50,7 +50,8 @@ AREA_POWER = 1.25
 # The closed form keeps variances this many times above the threshold at which a viewer leaves splats out, since foreshortening reduces them.
 CULL_MARGIN = 2.0
 
-# Number of views from which the distance and the area of a splat are computed; more views make no difference at this accuracy.
+# Number of views from which the distance and the area of a splat are computed. From all of them pixels of flowers and bird are a tenth smaller,
+# zoom-outs are as good (0.1 dB), and zoom-ins a little worse (0.2 to 0.6 dB).
 MAX_VIEWS = 12
 
 
