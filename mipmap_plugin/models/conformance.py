@@ -107,6 +107,13 @@ class ModelSuite:
         images = [adapted.render(view).image, wrap_model(again, cameras=base.cameras, backend="reference").render(view).image]
         assert (images[0] - images[1]).abs().max() <= SAME
 
+    def test_what_exists_is_not_replaced_unasked(self, base: Wrapped, tmp_path: Path) -> None:
+        saved = base.model.copy().save(tmp_path / self.saved_as, provenance={})
+        before = _digests(tmp_path)
+        with pytest.raises(OutputExists):
+            base.model.copy().save(tmp_path / self.saved_as, provenance={"again": True})
+        assert saved.is_file() and _digests(tmp_path) == before
+
     def test_goes_to_another_device(self, base: Wrapped) -> None:
         moved = base.model.to(self.device)
         assert {tensor.device.type for tensor in moved.parameters().values()} == {torch.device(self.device).type}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import pytest
 import torch
 
@@ -31,6 +33,16 @@ class BackendSuite:
         if outcome.skipped:
             pytest.skip(outcome.message)
         assert outcome.passed, outcome.message
+
+    def test_leaves_its_input_as_it_is(self) -> None:
+        """The splats may be the base's own tensors."""
+        case = CASES["sh-degree-3"]()
+        splats = case.gaussians.to(self.device, self.dtype)
+        before = {field.name: getattr(splats, field.name) for field in fields(splats)}
+        copies = {name: tensor.clone() for name, tensor in before.items() if tensor is not None}
+        with torch.no_grad():
+            self.backend.render(splats, case.camera, case.effects)
+        assert [name for name, tensor in copies.items() if not torch.equal(before[name], tensor)] == []
 
     def test_views_in_one_call_are_those_drawn_alone(self) -> None:
         if not hasattr(self.backend, "render_views"):
