@@ -222,7 +222,7 @@ def test_a_run_interrupted_twice_equals_an_uninterrupted_one(tmp_path, ctrl_c):
 
 
 def test_a_resumed_run_merges_as_the_whole_one_did(tmp_path, ctrl_c):
-    merging = {**BRIEF, "merge_to": 0.5}
+    merging = {**BRIEF, "merge_to": 0.5, "merging_costs": 9.0}
     whole = wrapped().adapt(1 / 4, **merging)
     ctrl_c(5)
     with pytest.raises(Interrupted):
@@ -498,7 +498,7 @@ def test_an_adapted_model_can_be_adapted_again():
 
 
 def test_the_loss_is_what_was_asked_for_and_the_curve_is_in_decibel_all_the_same():
-    squares, absolutes = (wrapped().adapt(1 / 4, **{**BRIEF, "loss": loss, "steps": 2}) for loss in ("l2", "l1"))
+    squares, absolutes = (wrapped().adapt(1 / 4, **{**BRIEF, "loss": loss, "steps": 2, "returns": "last"}) for loss in ("l2", "l1"))
     assert not torch.equal(shown(squares), shown(absolutes))
     assert absolutes.report.curve[0].psnr_db == pytest.approx(squares.report.curve[0].psnr_db, abs=3)
 
@@ -540,6 +540,15 @@ def test_cameras_that_show_nothing_are_refused():
     away = replace(tiny.cameras(1)[0], viewmat=behind)
     with pytest.raises(SettingsError, match="none of the 1 views shows a splat"):
         wrap_model(tiny.model(), cameras=[away], backend="reference").adapt(0.5, steps=0, views="given")
+
+
+def test_a_scene_of_which_most_is_before_the_near_plane_is_told_of():
+    """What is left is adapted all the same."""
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    depths = torch.stack([camera.to_camera(base.model.parameters()["means"].detach())[:, 2] for camera in base.cameras])
+    base.trained = replace(base.trained, near_plane=float(depths.amax(0).median()))
+    with pytest.warns(UserWarning, match=r"splats in view lie nearer than .* units, where renderers of 3DGS draw none"):
+        base.adapt(1 / 2, recipe="instant")
 
 
 def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():

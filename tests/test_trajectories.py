@@ -200,6 +200,22 @@ def test_a_single_camera_is_rotated_in_place():
     assert not torch.equal(poses(views)[0], poses(views)[1])
 
 
+@pytest.mark.parametrize("places", [1, 20])
+def test_cameras_in_one_place_have_views_from_there(places):
+    """Panoramas from a tripod, and rigs of several cameras; where the lines of sight meet is then the eye itself, up to rounding."""
+    eyes = torch.tensor([[0.2, -0.3, 1.5]], dtype=torch.float64) + torch.arange(places, dtype=torch.float64)[:, None]
+    cameras = []
+    for number in range(24 * places):
+        rotation = rotation_matrix(torch.tensor([0.1, 2 * math.pi * number / 24, 0.0], dtype=torch.float64))
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ eyes[number // 24]
+        cameras.append(Camera(80, 60, 70.0, 70.0, 40.0, 30.0, pose))
+    views = jittered(cameras, 50, seeded())
+    assert len(views) == 50 and all(view.viewmat.isfinite().all() for view in views)
+    if places == 1:
+        assert all((view.center - eyes[0]).norm() < 1e-9 for view in views)
+
+
 def test_no_camera_is_refused():
     with pytest.raises(SettingsError, match="need cameras"):
         jittered([], 3, seeded())

@@ -2,6 +2,7 @@
 
 import math
 import signal
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, restore_snapshot
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.validation import (
@@ -20,6 +22,7 @@ from mipmap_plugin.adaptation.optimization.validation import (
     RATE_REDUCTION,
     TIE_DB,
     VALIDATION_EVERY,
+    VISIBLE_ERROR,
     WINDOW,
     Steering,
     Validation,
@@ -138,8 +141,28 @@ def shows(*brightness):
 
 
 def test_decibels_are_the_mean_of_each_view_as_it_is_displayed():
-    by_hand = (-10 * math.log10(0.1**2) - 10 * math.log10(0.5**2)) / 2  # 1.7 is displayed as 1
+    by_hand = (-10 * math.log10(0.1**2 + VISIBLE_ERROR) - 10 * math.log10(0.5**2 + VISIBLE_ERROR)) / 2  # 1.7 is displayed as 1
     assert judge(0.5).steer(shows(0.6, 1.7)) == pytest.approx(by_hand, abs=1e-4)
+
+
+def test_what_nobody_sees_outweighs_nothing():
+    """A view of a plain sky that falls from 90 dB to 60, beside one that rises from 20 to 30."""
+    sky, better = (10 ** (-db / 20) for db in (90, 60))
+    states = {"base": shows(sky, 0.1), "last": shows(better, 10**-1.5)}
+    name, found = judge(0.0).choose(states)
+    assert name == "last" and judge(0.0).steer(states["last"]) > judge(0.0).steer(states["base"]) + 4
+    most = -10 * math.log10(INVISIBLE_ERROR)
+    assert found == pytest.approx({"base": (most + 20) / 2, "last": (most + 30) / 2}, abs=1e-3)
+
+
+def test_validation_views_are_as_typical_as_the_cameras():
+    """One camera far from all others would have most of the views that fill gaps."""
+    cameras = tiny.cameras(MANY)
+    away = torch.eye(4, dtype=torch.float64)
+    away[:3, 3] = 50.0
+    cameras.append(replace(cameras[0], viewmat=away))
+    _, judged = held_back(cameras, "jittered")
+    assert sum(bool(view.center.norm() > 25) for view in judged) <= 2
 
 
 def test_splats_that_are_the_same_for_all_views_are_activated_once():

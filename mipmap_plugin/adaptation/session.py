@@ -6,6 +6,7 @@ import hashlib
 import json
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -34,7 +35,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, showing, with_times
+from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, showing, too_near, with_times
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
@@ -118,7 +119,10 @@ class Session:
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self.copy_of_base(), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        refuse_blind(self.base_views, self.base.parameters()["means"], self.base_effects.near_plane, self.truth)
+        seen_by = self.base_views, self.base.parameters()["means"], self.base_effects.near_plane
+        refuse_blind(*seen_by, self.truth)
+        if lost := too_near(*seen_by):
+            warnings.warn(lost, stacklevel=2)
         began = time.perf_counter()
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())

@@ -23,8 +23,9 @@ ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
 
 
-# Views that are looked at to see whether they show anything.
-LOOKED_AT = 16
+# Views that are looked at to see whether they show anything; and the fraction of splats before the near plane in all of them that is worth a word:
+# floaters lie before a camera.
+LOOKED_AT, TOO_MANY = 16, 0.1
 
 # Views take their places in a band at multiples of the golden ratio, so that any number of consecutive ones is spread evenly.
 GOLDEN = (math.sqrt(5) - 1) / 2
@@ -148,6 +149,23 @@ def refuse_blind(views: Sequence[Camera], means: Tensor, near: float, image_of: 
         if showing(some, means, 0.0):
             wrong = f"all splats lie nearer than {near:g} units, where renderers of 3DGS draw none; scale the scene and its cameras up"
         raise SettingsError(f"none of the {len(views)} views shows a splat: {wrong}")
+
+
+def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
+    """How many of the splats with these `means` [N, 3] no view draws because they are too near, in a sentence; "" if few.
+
+    `near`: the near plane, in world units.
+    """
+    looked_at, drawn = (torch.zeros(len(means), dtype=torch.bool, device=means.device) for _ in range(2))
+    for view in evenly(views, LOOKED_AT):
+        points = view.to_camera(means.detach())
+        looked_at |= view.in_picture(points)
+        drawn |= view.in_picture(points, near)
+    lost, count = int((looked_at & ~drawn).sum()), int(looked_at.sum())
+    if lost <= TOO_MANY * count:
+        return ""
+    where = f"{lost:,} of {count:,} splats in view lie nearer than {near:g} units"
+    return f"{where}, where renderers of 3DGS draw none; scale the scene and its cameras up"
 
 
 def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:

@@ -14,7 +14,6 @@ from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
     from mipmap_plugin.effects import Effect
-    from mipmap_plugin.models.health import Health
     from mipmap_plugin.wrap import Wrapped
 
 
@@ -58,6 +57,7 @@ def inspect(
 
 def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]:
     """What is known of a loaded model without a picture, by name; `whole`: with the effects that are off."""
+    from mipmap_plugin.adaptation.views import too_near
     from mipmap_plugin.effects import explain
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
@@ -68,14 +68,15 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         gaussians = model.gaussians(wrapped.views()[0])
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
+        lost = [sentence] if (sentence := too_near(wrapped.views(), gaussians.means, wrapped.effects().near_plane)) else []
     return {
-        "verdict": _verdict(checkpoint, health, model.notes),
+        "verdict": _verdict(checkpoint, [*health.sentences(), *lost], bool(lost) or health.spoilt(), model.notes),
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
         "cameras": summary(wrapped.cameras),
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
-        "health": health.sentences() or ["nothing found"],
+        "health": [*health.sentences(), *lost] or ["nothing found"],
     }
 
 
@@ -85,16 +86,16 @@ def _differences(wrapped: Wrapped) -> str:
     return viewer_differences(wrapped)
 
 
-def _verdict(checkpoint: Path, health: Health, notes: Sequence[str]) -> str:
-    """Whether the checkpoint is sound, and what to do with it. `notes`: on loading it."""
+def _verdict(checkpoint: Path, health: Sequence[str], spoilt: bool, notes: Sequence[str]) -> str:
+    """Whether the checkpoint is sound, and what to do with it. `health`: remarks; `spoilt`: one says that it is not; `notes`: on loading it."""
     from mipmap_plugin.models.health import DROPPED
 
     if lost := next((note for note in notes if DROPPED in note), None):
         return f"doubtful: {lost}; train or export it again, or adapt what is left"
     advice = f"mipmap-plugin adapt {shlex.quote(str(checkpoint))} --scale 1/4"
-    remarks = len(health.sentences())
+    remarks = len(health)
     noted = f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""
-    if health.spoilt():
+    if spoilt:
         return "doubtful: read health before you adapt it"
     return f"sound{noted}; next: {advice}"
 

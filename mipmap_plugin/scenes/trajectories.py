@@ -69,14 +69,16 @@ def guess_up(means: Tensor) -> Tensor:
     return means.new_tensor((0.0, -1.0, 0.0) if spread[1] < FLATTER * spread[2] else (0.0, 0.0, 1.0))
 
 
-def jittered(cameras: Sequence[Camera], count: int, generator: torch.Generator, amount: float = 0.05) -> list[Camera]:
+def jittered(
+    cameras: Sequence[Camera], count: int, generator: torch.Generator, amount: float = 0.05, *, spread: bool = True
+) -> list[Camera]:
     """`count` training views near the given cameras, looking in similar directions.
 
     Each has the intrinsics, size and time of one of `cameras`. It is interpolated at random towards a near camera that looks in a
     similar direction, or extrapolated a little (`BEYOND`): centers on an arc around the point that both look at, rotations on an
     arc. Then the center is moved by `amount` of the distance between the two, and the view rotated by `amount` of its field of
-    view, one standard deviation each. Of `CANDIDATES` times as many views, those farthest from the cameras and from each other are
-    kept. Raises SettingsError without cameras.
+    view, one standard deviation each. `spread`: of `CANDIDATES` times as many views, those farthest from the cameras and from each other
+    are kept, which fill gaps; otherwise they are as typical as the cameras. Raises SettingsError without cameras.
     """
     if not cameras or count < 0 or amount < 0:
         raise SettingsError(f"jittered views need cameras, but got {len(cameras)} cameras, count={count} and amount={amount}")
@@ -84,8 +86,9 @@ def jittered(cameras: Sequence[Camera], count: int, generator: torch.Generator, 
     rotations = torch.stack([camera.viewmat[:3, :3].T for camera in cameras])  # camera to world
     fovs = centers.new_tensor([2 * math.atan(camera.width / (2 * camera.fx)) for camera in cameras])
     times = centers.new_tensor([camera.time or 0.0 for camera in cameras])
-    order = torch.cat([torch.randperm(len(cameras), generator=generator) for _ in range(count * CANDIDATES // len(cameras) + 1)])
-    index = order[: count * CANDIDATES]
+    tried = count * CANDIDATES if spread else count
+    order = torch.cat([torch.randperm(len(cameras), generator=generator) for _ in range(tried // len(cameras) + 1)])
+    index = order[:tried]
     pairs = torch.stack([index, _neighbors(centers, rotations, index, generator)])
     along = (1 + 2 * BEYOND) * torch.rand(len(index), 1, generator=generator, dtype=torch.float64) - BEYOND
     shift, turn = torch.randn((2, len(index), 3), generator=generator, dtype=torch.float64) * amount / math.sqrt(3)  # over three axes
@@ -93,7 +96,9 @@ def jittered(cameras: Sequence[Camera], count: int, generator: torch.Generator, 
     turned = rotations[index] @ rotation_matrix(way * along) @ rotation_matrix(turn * fovs[index, None])
     gap = (centers[pairs[1]] - centers[pairs[0]]).norm(dim=1, keepdim=True)
     moved = _on_arc(centers[pairs], rotations[pairs][..., 2], along) + shift * gap
-    far = _farthest(_places(moved, turned, times[index], centers), _places(centers, rotations, times, centers), count)
+    far = list(range(count))
+    if spread:
+        far = _farthest(_places(moved, turned, times[index], centers), _places(centers, rotations, times, centers), count)
     poses = [(cameras[int(index[i])], _viewmat(turned[i], moved[i])) for i in far]
     return [replace(camera, viewmat=pose, name=f"jittered_{n:04d}", split="train") for n, (camera, pose) in enumerate(poses)]
 
@@ -118,8 +123,8 @@ def rotation_matrix(vector: Tensor) -> Tensor:
 def _on_arc(centers: Tensor, forwards: Tensor, along: Tensor) -> Tensor:
     """Points [V, 3] at fractions `along` [V, 1] (0..1, or beyond) of the arcs between eyes [2, V, 3] around the point that both look at.
 
-    That point is where their lines of sight, in the directions `forwards` [2, V, 3], come closest. If it is not in front of both, the
-    path is straight.
+    That point is where their lines of sight, in the directions `forwards` [2, V, 3], come closest. If it is not in front of both, or at
+    one of them, the path is straight.
     """
     gap = centers[1] - centers[0]
     sights = torch.stack([forwards[0], -forwards[1]], dim=-1)
@@ -132,7 +137,8 @@ def _on_arc(centers: Tensor, forwards: Tensor, along: Tensor) -> Tensor:
     angle = torch.atan2(axis.norm(dim=-1, keepdim=True), (start * end).sum(-1, keepdim=True))
     turn = rotation_matrix(axis / axis.norm(dim=-1, keepdim=True).clamp_min(PARALLEL) * angle * along)
     arc = focus + (turn @ start[..., None])[..., 0] * radii[0] ** (1 - along) * radii[1] ** along
-    return torch.where(parallel | (depths.amin(0) <= 0), centers[0] + gap * along, arc)
+    undefined = ~arc.isfinite().all(dim=-1, keepdim=True)  # both eyes are in one place, which is then what they look at
+    return torch.where(parallel | (depths.amin(0) <= 0) | undefined, centers[0] + gap * along, arc)
 
 
 def _neighbors(centers: Tensor, rotations: Tensor, index: Tensor, generator: torch.Generator) -> Tensor:

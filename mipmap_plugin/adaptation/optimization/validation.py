@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import fmean
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.parallel import max_threads
 from mipmap_plugin.adaptation.target.resize import difference_from
@@ -40,6 +42,10 @@ SEED_OFFSET = 7919
 
 # dB: a state that is worse than the start by more than this is undone. Rounding and the choice of views make smaller differences.
 HARM_DB = 0.1
+
+# The square of two steps of 8 bits, 42 dB, about where differences begin to be seen. It is added to the errors that states are compared by: otherwise
+# views of a plain sky that fall from 90 dB to 50 would outweigh others that rise from 20 to 30.
+VISIBLE_ERROR = (2 / 255) ** 2
 
 # dB: states whose PSNR differs by less count as equal; of these the later is preferred, because it has learned more.
 TIE_DB = 0.01
@@ -69,38 +75,50 @@ class Validation:
     further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
 
     def viewer_psnrs(self, model: SplatModel, views: Sequence[Camera]) -> list[float]:
-        """The mean PSNR over views, per viewer, of images clamped as a display does; 0 without views."""
-        return [self._mean_psnr(render, model, views) for render in (self.render, *self.further_renders)]
+        """The mean PSNR (dB) over views, per viewer, of images clamped as a display does, each at most 54 (INVISIBLE_ERROR); 0 without views."""
+        return [_mean_db(errors) for errors in self._errors(model, views)]
 
     @torch.no_grad()
-    def _mean_psnr(self, render: Callable[[Gaussians, Camera], Tensor], model: SplatModel, views: Sequence[Camera]) -> float:
+    def _errors(self, model: SplatModel, views: Sequence[Camera]) -> list[list[float]]:
+        """The mean square error of each view, per viewer."""
         shared = model.gaussians(views[0]) if views and model.traits.same_for_all_views else None
+        threads = max_threads(model.parameters()["means"], views[0].zoomed(self.scale)) if views else 1
 
-        def psnr(view: Camera) -> float:
+        def error(render: Callable[[Gaussians, Camera], Tensor], view: Camera) -> float:
             camera = view.zoomed(self.scale)
             image = render(shared or model.gaussians(camera), camera).clamp(0, 1)
-            return decibel(float(difference_from(self.truth(view), image, self.resize).square().mean()))
+            return float(difference_from(self.truth(view), image, self.resize).square().mean())
 
-        threads = max_threads(model.parameters()["means"], views[0].zoomed(self.scale)) if views else 1
-        return sum(side_by_side(psnr, views, threads)) / max(1, len(views))
+        return [list(side_by_side(partial(error, render), views, threads)) for render in (self.render, *self.further_renders)]
 
     def steer(self, model: SplatModel) -> float:
-        """PSNR on the steering views, of the mean square error over viewers, in which the worst viewer counts most.
+        """Visible quality (dB) on the steering views, of the mean square error over viewers, in which the worst viewer counts most.
 
         The worst viewer alone would be too strict, as it may fall a little while all others improve; the mean PSNR would hide it.
         """
-        return decibel(fmean(10 ** (-psnr / 10) for psnr in self.viewer_psnrs(model, self.steering)))
+        return decibel(fmean(10 ** (-_visible_db(errors) / 10) for errors in self._errors(model, self.steering)))
 
     def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float]]:
-        """Return the name of the best state, of those that are `allowed`, and the PSNR of each state in its worst viewer.
+        """Return the name of the state of the best visible quality, of those that are `allowed`, and the PSNR of each state in its worst viewer.
 
         Of states that are equal the last, but none that is worse than the first of `states`, which is what went in.
         """
-        psnrs = {name: min(self.viewer_psnrs(model, self.choosing)) for name, model in states.items()}
+        errors = {name: self._errors(model, self.choosing) for name, model in states.items()}
+        quality = {name: min(map(_visible_db, each)) for name, each in errors.items()}
         among = [name for name in states if allowed is None or name in allowed]
-        best, first = max(psnrs[name] for name in among), next(iter(states))
-        least = max(best - TIE_DB, psnrs[first]) if first in among else best - TIE_DB
-        return [name for name in among if psnrs[name] >= least][-1], psnrs
+        best, first = max(quality[name] for name in among), next(iter(states))
+        least = max(best - TIE_DB, quality[first]) if first in among else best - TIE_DB
+        return [name for name in among if quality[name] >= least][-1], {name: min(map(_mean_db, each)) for name, each in errors.items()}
+
+
+def _mean_db(errors: Sequence[float]) -> float:
+    """The mean PSNR (dB) over views of these mean square errors; what is invisible is not told."""
+    return fmean(decibel(max(error, INVISIBLE_ERROR)) for error in errors) if errors else 0.0
+
+
+def _visible_db(errors: Sequence[float]) -> float:
+    """The mean PSNR (dB) over views as far as differences are visible: of good views it hardly changes."""
+    return fmean(decibel(error + VISIBLE_ERROR) for error in errors) if errors else 0.0
 
 
 def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians, Camera], Tensor]) -> Validation:
@@ -137,7 +155,7 @@ def _validation_views(cameras: Sequence[Camera], views: Sequence[Camera], means:
     if config.views in ("train", "jittered"):
         kept = evenly(originals[VALIDATION_EVERY // 2 :], min(count // 2, len(originals) // VALIDATION_EVERY))
     adapted = [view for view in views if view not in set(kept)]
-    random = jittered(originals or list(views), count - len(kept), generator)
+    random = jittered(originals or list(views), count - len(kept), generator, spread=False)
     return adapted, [view for pair in zip(random, kept, strict=False) for view in pair] + random[len(kept) :]
 
 
