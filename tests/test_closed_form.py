@@ -5,10 +5,23 @@ from dataclasses import replace
 
 import pytest
 import samples
+import tiny
 import torch
 
 from mipmap_plugin import threads
-from mipmap_plugin.adaptation.start.closed_form import CULL_MARGIN, MIN_AXIS, FormSettings, closed_form, filter_suffices, pixel_size
+from mipmap_plugin.adaptation.start.closed_form import (
+    CULL_MARGIN,
+    LEAST_VIEWS,
+    MIN_AXIS,
+    MOST_VIEWS,
+    SEEN,
+    FormSettings,
+    closed_form,
+    enough_views,
+    filter_suffices,
+    pixel_size,
+    views_for,
+)
 from mipmap_plugin.adaptation.start.surfel_form import visible_area
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -242,3 +255,19 @@ def test_parts_that_threads_share_make_the_same_whole(monkeypatch):
     with threads.limited(3, shared=True):
         parts = closed_form(g, views, 1 / 4, Effects(1), Effects(1))
     assert all(torch.equal(part, each) for part, each in zip(parts, whole, strict=True))
+
+
+# How many views
+
+
+@pytest.mark.parametrize(("share", "count"), [(1.0, LEAST_VIEWS), (SEEN / LEAST_VIEWS, LEAST_VIEWS), (0.2, 2 * LEAST_VIEWS), (0.05, 8 * LEAST_VIEWS)])
+def test_views_are_doubled_until_they_show_a_splat_often_enough(share, count):
+    assert views_for(share) == count
+    assert views_for(0.0) == MOST_VIEWS
+
+
+def test_of_a_walk_through_rooms_more_views_are_looked_at_than_of_an_object():
+    ring, means = tiny.cameras(40), tiny.gaussians(60).means
+    assert enough_views(means, ring) == LEAST_VIEWS
+    rooms = torch.cat([means + torch.tensor([100.0 * room, 0.0, 0.0]) for room in range(9)])
+    assert enough_views(rooms, ring) > LEAST_VIEWS

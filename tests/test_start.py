@@ -123,3 +123,16 @@ def test_phases_are_named():
     assert seconds["total"] == pytest.approx(sum(seconds[phase] for phase in phases), rel=0.2)
     assert "merging" not in adapted().report.seconds
     assert "closed form" not in adapted(closed_form=False).report.seconds
+
+
+def test_a_start_is_computed_from_as_many_views_as_show_enough(monkeypatch):
+    """By what they show: splats behind others do not count."""
+    counts, real = [], start.weighed
+
+    def weighed(gaussians, views, *rest):
+        counts.append(len(views))
+        return real(gaussians, views, *rest)[0], 0.1 if len(counts) == 1 else 1.0
+
+    monkeypatch.setattr(start, "weighed", weighed)
+    wrap_model(tiny.model(COUNT), cameras=tiny.cameras(60), backend="reference").adapt(SCALE, recipe="instant", extra_views=0)
+    assert counts == [12, 48]

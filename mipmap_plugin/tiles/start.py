@@ -12,8 +12,8 @@ from torch import Tensor
 from mipmap_plugin import pool
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.adaptation.report import AS_IT_IS
-from mipmap_plugin.adaptation.start.candidates import WEIGHT_VIEWS, start_name
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, filter_suffices, pixel_size
+from mipmap_plugin.adaptation.start.candidates import start_name
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, enough_views, filter_suffices, pixel_size
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.camera import evenly
@@ -37,7 +37,7 @@ class StartSearch:
         self.scene, self.folder = scene, folder
         self.truths = Truths(scene, folder)
         self.matches = scene.scale <= 1 and not filter_suffices(scene.scale, scene.base_effects, scene.target)
-        self.views = evenly(scene.views.adapted, WEIGHT_VIEWS)
+        self.views = evenly(scene.views.adapted, enough_views(scene.base.places[:, :3], scene.views.adapted))
 
     @torch.no_grad()
     def run(self) -> None:

@@ -16,9 +16,17 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.threads import side_by_side
 
+# Pixels: the blend weight from which on a view shows a splat.
+SHOWN = 0.1
+
 
 def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Tensor:
-    """The blend weight of each splat, summed over the pixels of a view and averaged over `views`: [N] in pixels; 0 for an invisible splat.
+    """The blend weight of each splat, summed over the pixels of a view and averaged over `views`: [N] in pixels; 0 for an invisible splat."""
+    return weighed(gaussians, views, backend, effects)[0]
+
+
+def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> tuple[Tensor, float]:
+    """`blend_weights`, and the fraction of the splats that a view shows: not those behind others.
 
     An image is linear in the splats' colors, so that the weights are the gradient of the image's sum with respect to the colors. Works
     with any backend that has gradients, and faster with one that computes them itself (`Backend.blend_weights`).
@@ -31,10 +39,11 @@ def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backen
         known: Tensor | None = None if weigh is None else weigh(gray, view, plain)
         return _color_gradient(gray, view, backend, plain) if known is None else known
 
-    total, *further = side_by_side(weights, views, max_threads(gaussians.means, views[0]))
-    for each in further:
+    total, shown = torch.zeros_like(gaussians.opacities), 0.0
+    for each in side_by_side(weights, views, max_threads(gaussians.means, views[0])):
         total += each
-    return total / len(views)
+        shown += float((each > SHOWN).float().mean())
+    return total / len(views), shown / len(views)
 
 
 @torch.enable_grad()

@@ -11,8 +11,8 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, filter_suffices, pixel_size
+from mipmap_plugin.adaptation.start.blend_weights import blend_weights, weighed
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, LEAST_VIEWS, FormSettings, closed_form, filter_suffices, pixel_size, views_for
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge, merge_down
 from mipmap_plugin.backends.base import Backend
@@ -21,9 +21,6 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import Rebuilt, SplatModel
-
-# Views from which blend weights are computed.
-WEIGHT_VIEWS = 12
 
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)
@@ -88,7 +85,8 @@ class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
     def __init__(self, problem: StartProblem) -> None:
-        self._problem, self._weight_views, self._rounds = problem, evenly(problem.views, WEIGHT_VIEWS), Rounds()
+        self._problem, self._rounds = problem, Rounds()
+        self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
         unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
         self._matches_weights = problem.has_blend_weights and problem.scale <= 1 and not unchanged
 
@@ -157,7 +155,7 @@ class StartSearch:
         problem, merged_weights = self._problem, []
 
         def pixel_of(means: Tensor) -> Tensor:
-            return pixel_size(means, problem.views) / problem.scale
+            return pixel_size(means, problem.views, self._count) / problem.scale
 
         def merged(gaussians: Gaussians) -> Gaussians:
             most = problem.config.most_splats or (math.ceil(fraction * len(gaussians)) if coarsely else None)
@@ -174,11 +172,11 @@ class StartSearch:
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
         problem = self._problem
-        settings = FormSettings(1.0 if self._matches_weights else AREA_POWER, problem.config.crispness)
+        settings = FormSettings(1.0 if self._matches_weights else AREA_POWER, problem.config.crispness, self._count)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if not self._matches_weights or weights is None:
             return scales, opacities
-        views = [view.zoomed(problem.scale) for view in self._weight_views]
+        views = [view.zoomed(problem.scale) for view in evenly(problem.views, self._count)]
 
         def weights_of(opacities: Tensor) -> Tensor:
             return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, problem.target)
@@ -186,6 +184,14 @@ class StartSearch:
         return scales, matched_opacities(opacities, weights, weights_of)
 
     def _base_weights(self, base: SplatModel) -> Tensor:
-        """[N]: the blend weights of the base's splats, in target pixels of a view."""
-        gaussians = base.gaussians(self._weight_views[0]).detach()
-        return blend_weights(gaussians, self._weight_views, self._problem.backend, self._problem.base_effects) * self._problem.scale**2
+        """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them."""
+        problem, gaussians = self._problem, base.gaussians(self._problem.views[0]).detach()
+
+        def over(count: int) -> tuple[Tensor, float]:
+            return weighed(gaussians, evenly(problem.views, count), problem.backend, problem.base_effects)
+
+        weights, shown = over(LEAST_VIEWS)
+        self._count = views_for(shown)
+        if self._count > LEAST_VIEWS:
+            weights, _ = over(self._count)
+        return weights * problem.scale**2

@@ -24,8 +24,7 @@ from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import Validation, split_validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.candidates import WEIGHT_VIEWS
-from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.start.closed_form import enough_views, pixel_size
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
@@ -207,7 +206,7 @@ class LevelRun:
         """The student, and what it is called: as few splats as a ladder by zoom would keep, or more where merging would cost too much."""
         scene, pixels = self.scene, self.scene.pixel_of(self.scene.splats.means)
         kept, moved = kept_splats(pixels, self.size, scene.rule.ratio), int((scene.pixel_of(self.finest.means) < self.size).sum())
-        views = evenly(scene.views, WEIGHT_VIEWS)
+        views = evenly(scene.views, enough_views(scene.splats.means, scene.views))
         weights = blend_weights(self.finest, views, scene.backend, scene.target)
         formed_db = self.validation.steer(self._coarser(None, moved))
         for root in (1, 2, 4):
