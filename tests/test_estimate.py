@@ -11,7 +11,7 @@ from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.adaptation.optimization.estimate import Costs, Forecast
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
@@ -49,7 +49,7 @@ def run_and_estimates(clock, monkeypatch, **settings):
         clock(VIEW)
         return backend.render(gaussians, camera, effects).image
 
-    monkeypatch.setattr(Validation, "steer", lambda self, model: clock(CHECK) or 20.0)
+    monkeypatch.setattr(Validation, "quality", lambda self, model: clock(CHECK) or Quality(20.0, 20.0))
     monkeypatch.setattr(loop.Bar, "update", lambda bar, *_: told.append((run.watch.seconds, bar.seconds_left)))
     task = Task(views, SCALE, truth, render, False, Validation([], [], SCALE, truth, render, config.resize))
     run = Run.start(student, task, config)

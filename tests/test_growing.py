@@ -11,7 +11,7 @@ import torch
 
 from mipmap_plugin.adaptation.optimization.growing import frozen_parameters
 from mipmap_plugin.adaptation.optimization.run import Task, Trial
-from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -155,7 +155,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(judged, monkeypatch, tmp_path
 def test_rows_that_are_as_many_but_others_have_no_columns_of_the_base(monkeypatch):
     """Pruned after the first step, and grown to as many as the base has, which is where growing ends, after the second."""
     found = iter([30.0, 40.0, 39.0])  # in the beginning, after step 2, after step 4
-    monkeypatch.setattr(Validation, "steer", lambda self, model: next(found))
+    monkeypatch.setattr(Validation, "quality", lambda self, model: Quality(*[next(found)] * 2))
     monkeypatch.setattr(Validation, "choose", lambda self, states, allowed: (list(states)[2], dict.fromkeys(states, 0.0)))
     base = VanillaModel(tiny.model(40).parameters(), origin=Origin(extras={"confidence": np.arange(40, dtype=np.float32)}))
     rates = LearningRates(means=0.05, scales=0.02, quats=0.004, opacities=0.05, sh0=0.015, shN=0.02)  # with which one splat is pruned

@@ -155,6 +155,11 @@ def test_what_nobody_sees_outweighs_nothing():
     assert found == pytest.approx({"base": (most + 20) / 2, "last": (most + 30) / 2}, abs=1e-3)
 
 
+def test_what_is_told_is_the_psnr_and_what_is_compared_what_can_be_seen():
+    quality = judge(0.0).quality(shows(0.01, 0.01))
+    assert quality.psnr == pytest.approx(40.0, abs=1e-3) and quality.visible == pytest.approx(-10 * math.log10(1e-4 + VISIBLE_ERROR), abs=1e-3)
+
+
 def test_validation_views_are_as_typical_as_the_cameras():
     """One camera far from all others would have most of the views that fill gaps."""
     cameras = tiny.cameras(MANY)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin import pool
-from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.optimization.validation import mean_db
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, enough_views, filter_suffices, pixel_size
@@ -135,10 +134,7 @@ def _set_opacities(model: VanillaModel, opacities: Tensor) -> None:
 
 @torch.no_grad()
 def psnr(scene: TiledScene, splats: Splats, truths: Truths, views: Any) -> float:
-    """The mean PSNR (dB) of splats as the target shows them over views, of images clamped as a display does."""
+    """The mean PSNR (dB) of splats as the target shows them over views, of images clamped as a display does (`validation.mean_db`)."""
     painter = scene.painter(scene.target)
-    psnrs = []
-    for view in views:
-        image = painter.image(splats, view.zoomed(scene.scale)).clamp(0, 1)
-        psnrs.append(decibel(float((image - truths(view)).square().mean())))
-    return fmean(psnrs) if psnrs else 0.0
+    images = ((painter.image(splats, view.zoomed(scene.scale)).clamp(0, 1), truths(view)) for view in views)
+    return mean_db([float((image - truth).square().mean()) for image, truth in images])

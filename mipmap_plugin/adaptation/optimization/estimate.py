@@ -10,7 +10,7 @@ import time
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from torch import Tensor
 from tqdm import tqdm
@@ -19,6 +19,8 @@ from mipmap_plugin import threads
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
+
+Result = TypeVar("Result")
 
 
 @dataclass
@@ -35,7 +37,7 @@ class Costs:
         self.truths.setdefault(view, (time.perf_counter() - began) / threads.side_by_side_now())
         return image
 
-    def check(self, validate: Callable[[], float]) -> float:
+    def check(self, validate: Callable[[], Result]) -> Result:
         """Return the result of a validation, and note how long it took."""
         began = time.perf_counter()
         result = validate()

@@ -174,21 +174,22 @@ def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule,
 def _check(run: Run, task: Task, config: AdaptConfig) -> None:
     """Measure the run on validation views: keep its state or undo the last steps, and append a point to the curve."""
     steering, steps = run.steering, run.step - run.curve[-1].step
-    validation_db = run.costs.check(lambda: task.validation.steer(run.student))
+    quality = run.costs.check(lambda: task.validation.quality(run.student))
     growing = run.trial is not None and run.trial.before is not None  # a growth gets some steps before it is assessed
     factor, rising = steering.rate_factor(run.step, config), run.step <= config.warm_up_steps
-    harmful = config.returns == "best" and not growing and steering.is_harmful(validation_db, rising=rising)
+    harmful = config.returns == "best" and not growing and steering.is_harmful(quality.visible, rising=rising)
     if harmful:
         steering.reduce_rates(factor, rising=rising)
         run.rows_changed |= len(steering.best.rows["means"]) != len(run.student.parameters()["means"])
         restore_snapshot(run.student, run.optimizer, steering.best)
         run.gradients = None if run.gradients is None else density.ScreenGradients.of(run.student.parameters()["means"], config)
     else:
-        steering.update_best(validation_db, run.step, run.student, run.rows_changed, factor)
+        steering.update_best(quality.visible, run.step, run.student, run.rows_changed, factor)
     mean = float(run.square_error) / max(1, steps)  # this waits for a GPU, so that the clock counts its work
+    best_db = next((point.validation_db for point in reversed(run.curve) if point.step == steering.best_step), quality.psnr)
     point = CurvePoint(
         step=run.step, seconds=run.watch.read(), psnr_db=decibel(mean) if steps else None,
-        validation_db=steering.best_db if harmful else validation_db, gaussians=len(run.student.parameters()["means"]), taken_back=harmful,
+        validation_db=best_db if harmful else quality.psnr, gaussians=len(run.student.parameters()["means"]), taken_back=harmful,
     )  # fmt: skip
     run.curve.append(point)
     run.square_error = 0.0

@@ -112,8 +112,9 @@ class Run:
         optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch(seconds=spent)
         with watch:
             trial, costs = Trial.begin(student, task, config), Costs()
-            steering = Steering.begin(student, costs.check(lambda: task.validation.steer(student)))
-        first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=steering.start_db, gaussians=len(means))
+            quality = costs.check(lambda: task.validation.quality(student))
+            steering = Steering.begin(student, quality.visible)
+        first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=len(means))
         return cls(student, optimizer, watch, ScreenGradients.of(means, config), steering, trial, curve=[first], costs=costs)
 
     def progress(self, config: AdaptConfig) -> float:

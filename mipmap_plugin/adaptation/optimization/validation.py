@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from statistics import fmean
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -62,6 +63,13 @@ LOST_FRACTION, LOST_DB = 0.25, 0.25
 FIRST_RATE_FACTOR = 1 / 32
 
 
+class Quality(NamedTuple):
+    """How good a state is on some views, in dB."""
+
+    visible: float  # as far as differences are visible: states are compared by it
+    psnr: float  # what is told
+
+
 @dataclass(frozen=True)
 class Validation:
     """Views of the base scale, the truth of each, and the comparison of a model with it."""
@@ -76,7 +84,7 @@ class Validation:
 
     def viewer_psnrs(self, model: SplatModel, views: Sequence[Camera]) -> list[float]:
         """The mean PSNR (dB) over views, per viewer, of images clamped as a display does, each at most 54 (INVISIBLE_ERROR); 0 without views."""
-        return [_mean_db(errors) for errors in self._errors(model, views)]
+        return [mean_db(errors) for errors in self._errors(model, views)]
 
     @torch.no_grad()
     def _errors(self, model: SplatModel, views: Sequence[Camera]) -> list[list[float]]:
@@ -92,11 +100,16 @@ class Validation:
         return [list(side_by_side(partial(error, render), views, threads)) for render in (self.render, *self.further_renders)]
 
     def steer(self, model: SplatModel) -> float:
-        """Visible quality (dB) on the steering views, of the mean square error over viewers, in which the worst viewer counts most.
+        """The visible quality (dB) on the steering views."""
+        return self.quality(model).visible
+
+    def quality(self, model: SplatModel) -> Quality:
+        """The quality on the steering views, of the mean square error over viewers, in which the worst viewer counts most.
 
         The worst viewer alone would be too strict, as it may fall a little while all others improve; the mean PSNR would hide it.
         """
-        return decibel(fmean(10 ** (-_visible_db(errors) / 10) for errors in self._errors(model, self.steering)))
+        errors = self._errors(model, self.steering)
+        return Quality(*(decibel(fmean(10 ** (-mean(each) / 10) for each in errors)) for mean in (_visible_db, mean_db)))
 
     def choose(self, states: dict[str, SplatModel], allowed: Collection[str] | None = None) -> tuple[str, dict[str, float]]:
         """Return the name of the state of the best visible quality, of those that are `allowed`, and the PSNR of each state in its worst viewer.
@@ -108,10 +121,10 @@ class Validation:
         among = [name for name in states if allowed is None or name in allowed]
         best, first = max(quality[name] for name in among), next(iter(states))
         least = max(best - TIE_DB, quality[first]) if first in among else best - TIE_DB
-        return [name for name in among if quality[name] >= least][-1], {name: min(map(_mean_db, each)) for name, each in errors.items()}
+        return [name for name in among if quality[name] >= least][-1], {name: min(map(mean_db, each)) for name, each in errors.items()}
 
 
-def _mean_db(errors: Sequence[float]) -> float:
+def mean_db(errors: Sequence[float]) -> float:
     """The mean PSNR (dB) over views of these mean square errors; what is invisible is not told."""
     return fmean(decibel(max(error, INVISIBLE_ERROR)) for error in errors) if errors else 0.0
 
