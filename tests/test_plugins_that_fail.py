@@ -1,5 +1,6 @@
 """Plug-ins that break their contract while they are used: a sentence names them, the base stays as it was, and nothing wrong passes for a result."""
 
+import copy
 import sys
 from dataclasses import replace
 
@@ -112,6 +113,13 @@ def test_a_backend_that_fails_ends_a_command_in_a_sentence(tmp_path, capsys):
     assert main(["adapt", str(folder), "--scale", "1/2", "--backend", "odd", "--output", str(tmp_path / "new.ply")]) == 2
     assert capsys.readouterr().err.strip().endswith("mipmap-plugin: backend 'odd' failed: ZeroDivisionError: division by zero")
     assert not (tmp_path / "new.ply").exists()
+
+
+def test_what_is_wrapped_with_a_backend_of_ones_own_can_be_copied():
+    base = backend(lambda rendered, _: rendered)
+    before = base.adapt(0.5, recipe="instant")
+    copied = copy.deepcopy(base)
+    assert torch.equal(copied.render(base.cameras[0]).image, base.render(base.cameras[0]).image) and before.backend.name == "odd"
 
 
 def family(**methods):

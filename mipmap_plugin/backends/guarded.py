@@ -29,6 +29,8 @@ class Guarded:
 
     def __getattr__(self, name: str) -> Any:
         """An attribute of the backend itself; what it may have beside `render` is looked at, too."""
+        if name == "theirs" or name.startswith("__"):  # which copying asks an empty object for
+            raise AttributeError(name)
         part = getattr(self.theirs, name)
         return partial(getattr(self, f"_{name}"), part) if name in OPTIONAL else part
 
