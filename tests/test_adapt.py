@@ -14,6 +14,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.report import PeakMemory
 from mipmap_plugin.adaptation.target.resize import resize
@@ -22,6 +23,7 @@ from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of, render_mode
+from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
@@ -219,6 +221,18 @@ def test_a_run_interrupted_twice_equals_an_uninterrupted_one(tmp_path, ctrl_c):
             wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
     resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
     assert torch.equal(shown(resumed), shown(whole))
+
+
+def test_a_resumed_run_tells_the_seconds_of_both_processes(tmp_path, ctrl_c, monkeypatch):
+    """By what they were spent on: what the first made counts as no step."""
+    truth = Costs.truth
+    monkeypatch.setattr(Costs, "truth", lambda self, *request: (truth(self, *request), self.truths.__setitem__(request[0], 100.0))[0])
+    ctrl_c(5)
+    with pytest.raises(Interrupted):
+        wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF)
+    first = load_torch(tmp_path / "state")["costs"][0]
+    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **BRIEF).report
+    assert first >= 200 and resumed.seconds["pseudo truth"] >= first + 100
 
 
 def test_a_resumed_run_merges_as_the_whole_one_did(tmp_path, ctrl_c):

@@ -197,8 +197,8 @@ class Session:
         run.optimizer.state.clear()
         pool.release_to_system()
         self.state = keeper.remaining_file()
-        self.seconds["pseudo truth"] = sum(run.costs.truths.values())
-        self.seconds["validation"] = self.seconds.get("validation", 0.0) + sum(run.costs.checks)
+        self.seconds["pseudo truth"], checks = run.costs.sums()
+        self.seconds["validation"] = self.seconds.get("validation", 0.0) + checks
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
         return run, ended_by + fewer_note(self.asked_steps, self.config) + growth_note(run)

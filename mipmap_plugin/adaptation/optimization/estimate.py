@@ -25,10 +25,11 @@ Result = TypeVar("Result")
 
 @dataclass
 class Costs:
-    """Seconds, by what they were spent on. Work in parallel counts as the time that passed."""
+    """Seconds of this process, by what they were spent on. Work in parallel counts as the time that passed."""
 
     truths: dict[Camera, float] = field(default_factory=dict)  # of making the truth of each view
     checks: list[float] = field(default_factory=list)  # of each comparison with the validation views
+    earlier: tuple[float, float] = (0.0, 0.0)  # of truths and of checks, in the processes that a run was interrupted in
 
     def truth(self, view: Camera, make: Callable[[Camera], Tensor]) -> Tensor:
         """Return the truth of a view; the first time, note how long it took."""
@@ -44,9 +45,13 @@ class Costs:
         self.checks.append(time.perf_counter() - began)
         return result
 
+    def sums(self) -> tuple[float, float]:
+        """The seconds of all truths, and of all checks, of the whole run."""
+        return self.earlier[0] + sum(self.truths.values()), self.earlier[1] + sum(self.checks)
+
     def seconds(self) -> float:
         """All that is noted."""
-        return sum(self.truths.values()) + sum(self.checks)
+        return sum(self.sums())
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import torch
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
+from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
@@ -111,6 +112,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "fingerprint": fingerprint,
         "step": run.step,
         "seconds": run.watch.seconds,
+        "costs": run.costs.sums(),
         "square_error": float(run.square_error),
         "rows_changed": run.rows_changed,
         "curve": [point.model_dump() for point in run.curve],
@@ -149,7 +151,7 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     steering = Steering(**{**state["steering"], "best": Snapshot(**state["steering"]["best"]).to(device)})
     return Run(
         student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, steering, _trial(state["trial"], device), state["step"],
-        [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"],
+        [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"], Costs(earlier=tuple(state["costs"])),
     )  # fmt: skip
 
 
