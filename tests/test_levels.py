@@ -14,6 +14,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, load_model, recipes, wrap_model
+from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -113,8 +114,8 @@ def test_splats_that_share_no_pixel_are_merged_where_enough_is_left_to_see(monke
 def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypatch, coarse_db, base_db, coarsely):
     """The finer level has 38 dB and may lose 9, as the closed form may; the base itself may lose 3."""
 
-    def steer(model):
-        return {"finer": 38.0, "base": base_db, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)
+    def quality(model):
+        return Quality(*[{"finer": 38.0, "base": base_db, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)] * 2)
 
     def candidate(_, weights, fraction, coarsely=False):
         return ("formed",) if fraction == 1 else ("merged", fraction, coarsely)
@@ -125,8 +126,8 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
 
     config = SimpleNamespace(most_splats=None, closed_form=True, merge_to=0.1, merging_costs=9.0, returns="best")
     problem = SimpleNamespace(
-        base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, steer=steer, may_lose=9.0, name="the finer level", views=[],
-        scale=0.5, phase=lambda _: nullcontext(), base_effects=None, target=None, has_blend_weights=False,
+        base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, quality=quality, may_lose=9.0, name="the finer level",
+        views=[], scale=0.5, phase=lambda _: nullcontext(), base_effects=None, target=None, has_blend_weights=False,
     )  # fmt: skip
     monkeypatch.setattr(candidates, "filter_suffices", lambda *_: False)
     monkeypatch.setattr(candidates.StartSearch, "_base_weights", lambda *_: None)

@@ -4,7 +4,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.wrap import wrap_model
 
@@ -67,11 +67,11 @@ def a_decibel_a_splat(monkeypatch):
     """Every splat less costs 1 dB; the base is worse than anything."""
     tried = []
 
-    def steer(self, model):
+    def quality(self, model):
         tried.append(len(model))
-        return -100.0 if len(tried) == 1 else float(len(model))
+        return Quality(*[-100.0 if len(tried) == 1 else float(len(model))] * 2)
 
-    monkeypatch.setattr(Validation, "steer", steer)
+    monkeypatch.setattr(Validation, "quality", quality)
     return tried
 
 
@@ -93,7 +93,7 @@ def test_merging_is_done_as_far_as_it_may_cost(a_decibel_a_splat):
 
 
 def test_merged_splats_that_are_worse_than_the_base_are_not_begun_with(monkeypatch):
-    monkeypatch.setattr(Validation, "steer", lambda self, model: float(len(model)))
+    monkeypatch.setattr(Validation, "quality", lambda self, model: Quality(float(len(model)), float(len(model))))
     report = adapted(merge_to=0.5, merging_costs=COUNT).report
     assert (start_of(report), report.gaussians_after) == ("the closed form", COUNT)
 
@@ -102,17 +102,18 @@ def test_what_is_merged_furthest_without_being_worse_than_the_base_is_begun_with
     """Also where the closed form of all splats is worse than both."""
     tried = []
 
-    def steer(self, model):
+    def quality(self, model):
         tried.append(len(model))
-        return [30.0, 20.0, 35.0, 25.0, 32.0][len(tried) - 1]  # the base, the closed form, and merging mildly, strongly, and in between
+        # The base, the closed form, and merging mildly, strongly, and in between.
+        return Quality(*[[30.0, 20.0, 35.0, 25.0, 32.0][len(tried) - 1]] * 2)
 
-    monkeypatch.setattr(Validation, "steer", steer)
+    monkeypatch.setattr(Validation, "quality", quality)
     report = adapted(merge_to=0.5, merging_costs=COUNT).report
     assert (start_of(report), report.gaussians_after) == ("the closed form of merged splats", tried[4])
 
 
 def test_merging_without_a_closed_form_is_called_so(monkeypatch):
-    monkeypatch.setattr(Validation, "steer", lambda self, model: float(-len(model)))
+    monkeypatch.setattr(Validation, "quality", lambda self, model: Quality(float(-len(model)), float(-len(model))))
     assert start_of(adapted(merge_to=0.5, closed_form=False).report) == "merged splats"
 
 

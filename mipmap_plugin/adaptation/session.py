@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
-from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Validation, split_validation
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import SteppingRenderer, renderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
 from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch
@@ -144,7 +144,7 @@ class Session:
     def _start_problem(self) -> StartProblem:
         from_base = StartProblem(
             lambda: self._for_target(self.base, shared=True), self.base_views, self.scale, self.base_effects, self.start_target, self.config,
-            self.backend, self._has_blend_weights, self.steer, self.phase,
+            self.backend, self._has_blend_weights, self.quality, self.phase,
         )  # fmt: skip
         finer = self.finer
         return from_base if finer is None else from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
@@ -221,10 +221,10 @@ class Session:
             yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
-    def steer(self, model: SplatModel) -> float:
-        """PSNR (dB) of a model on the views that steer the run."""
+    def quality(self, model: SplatModel) -> Quality:
+        """That of a model on the views that steer the run."""
         with self.phase("validation"):
-            return self.validation.steer(model)
+            return self.validation.quality(model)
 
     @property
     def _takes_steps(self) -> bool:

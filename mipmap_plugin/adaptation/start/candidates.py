@@ -6,11 +6,12 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights, weighed
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, LEAST_VIEWS, FormSettings, closed_form, filter_suffices, pixel_size, views_for
 from mipmap_plugin.adaptation.start.matching import matched_opacities
@@ -53,7 +54,7 @@ class StartProblem:
     config: AdaptConfig
     backend: Backend
     has_blend_weights: bool  # whether splats are the same for all views, and the backend has the gradients that blend weights need
-    steer: Callable[[SplatModel], float]  # PSNR (dB) of a model on the views that steer the run
+    quality: Callable[[SplatModel], Quality]  # of a model on the views that steer the run
     phase: Callable[[str], AbstractContextManager[None]]  # counts the seconds spent inside under a phase of that name
     name: str = "the base"  # what the base is called in the report
     may_lose: float = 0.0  # dB by which merged splats may be worse than the base as it is
@@ -71,6 +72,17 @@ class StartProblem:
             self, base=model, views=views, scale=self.scale / finer.scale, base_effects=self.target, config=config, name="the finer level",
             may_lose=config.merging_costs, coarse_base=self.base,
         )  # fmt: skip
+
+
+class Bounds(NamedTuple):
+    """The least dB of a candidate."""
+
+    psnr: float
+    visible: float
+
+    def hold_for(self, quality: Quality) -> bool:
+        """Whether a candidate of this quality is good enough."""
+        return quality.psnr >= self.psnr and quality.visible >= self.visible
 
 
 def start_name(config: AdaptConfig, *, merged: bool = False) -> str:
@@ -104,40 +116,43 @@ class StartSearch:
         formed = self._candidate(weights, 1.0)
         if config.merge_to == 1 and config.returns == "last":
             return formed, start_name(config)
-        base_db, formed_db = problem.steer(base), problem.steer(formed)
-        least_db = max(formed_db - config.merging_costs, base_db - problem.may_lose)
-        least_coarse_db = math.inf if problem.coarse_base is None else self._least_coarse_db(base_db, problem.coarse_base())
-        merged = self._merged(weights, least_db, least_coarse_db) if config.merge_to < 1 else None
+        before, after = problem.quality(base), problem.quality(formed)
+        bounds = Bounds(after.psnr - config.merging_costs, before.visible - problem.may_lose)
+        merged = self._merged(weights, bounds, self._coarse_bounds(bounds, before)) if config.merge_to < 1 else None
         if merged is not None:
             return merged, start_name(config, merged=True)
-        return (formed, start_name(config)) if formed_db >= base_db and config.closed_form else (base, problem.name)
+        return (formed, start_name(config)) if after.visible >= before.visible and config.closed_form else (base, problem.name)
 
-    def _merged(self, weights: Tensor | None, least_db: float, least_coarse_db: float) -> SplatModel | None:
-        """What is merged furthest and shows at least so many dB; None if merging costs too much.
+    def _merged(self, weights: Tensor | None, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
+        """What is merged furthest within bounds; None if merging costs too much.
 
         Splats that can hardly be merged lose too much by the mildest merging already, as those of captures do: then no other is tried.
         """
-        for power in COARSE_POWERS if self._problem.coarse_base else ():
-            coarse, coarse_db = self._tried(weights, power, coarsely=True)
-            if coarse_db >= max(least_db, least_coarse_db):
+        for power in COARSE_POWERS if coarse_bounds else ():
+            coarse, quality = self._tried(weights, power, coarsely=True)
+            if coarse_bounds and coarse_bounds.hold_for(quality):
                 return coarse
-        mildest, mildest_db = self._tried(weights, POWERS[-1])
-        if mildest_db < least_db:
+        mildest, quality = self._tried(weights, POWERS[-1])
+        if not bounds.hold_for(quality):
             return None
         for power in POWERS[:-1]:
-            merged, merged_db = self._tried(weights, power)
-            if merged_db >= least_db:
+            merged, quality = self._tried(weights, power)
+            if bounds.hold_for(quality):
                 return merged
         return mildest
 
-    def _tried(self, weights: Tensor | None, power: float, coarsely: bool = False) -> tuple[SplatModel, float]:
-        """A candidate and its PSNR."""
+    def _tried(self, weights: Tensor | None, power: float, coarsely: bool = False) -> tuple[SplatModel, Quality]:
+        """A candidate and its quality."""
         candidate = self._candidate(weights, self._problem.config.merge_to**power, coarsely)
-        return candidate, self._problem.steer(candidate)
+        return candidate, self._problem.quality(candidate)
 
-    def _least_coarse_db(self, finer_db: float, base: SplatModel) -> float:
-        """The PSNR that a coarsely merged candidate has to show. `finer_db`: that of the finer level."""
-        return max(LEAST_DB, finer_db - self._problem.may_lose, self._problem.steer(base) - COARSE_COSTS)
+    def _coarse_bounds(self, bounds: Bounds, finer: Quality) -> Bounds | None:
+        """The bounds of a coarsely merged candidate; None where there are none of these. `finer`: the quality of the finer level."""
+        problem = self._problem
+        if problem.coarse_base is None:
+            return None
+        base = problem.quality(problem.coarse_base())
+        return bounds._replace(psnr=max(bounds.psnr, LEAST_DB, finer.psnr - problem.may_lose, base.psnr - COARSE_COSTS))
 
     def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
         """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""
