@@ -35,7 +35,7 @@ class Report(BaseModel):
     seconds: dict[str, float]  # by phase; "total": all of them but "loading"
     ended_by: str
     returned: str  # which of the run's states the file holds, and why if it is not the last
-    validation: dict[str, float]  # dB of each state on views that nothing was adapted to and that did not steer the run
+    validation: dict[str, float]  # dB of each state on views that nothing was adapted to and that did not steer the run, at most 54 of a view
     viewers: dict[str, float] = {}  # of a file for several viewers: dB in each on the same views; `validation` is the worst of the extreme viewers
     peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without a GPU
     curve: list[CurvePoint]

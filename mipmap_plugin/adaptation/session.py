@@ -106,7 +106,7 @@ class Session:
         views, validation = split_validation(cameras, chosen, means, self.scale, self.config)
         note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
         if len(shown := showing(validation, means, self.base_effects.near_plane)) > 1:  # one to steer by, and one to choose by
-            validation = shown  # others are at 120 dB, which would hide what these show
+            validation = shown  # others are the same in every state
         if self.base.traits.moves:
             views, times = with_times(views, self.config.seed)
             validation, _ = with_times(validation, self.config.seed)

@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 @dataclass
 class Costs:
-    """Seconds of this process, by what they were spent on. Work in parallel counts as the time that passed."""
+    """Seconds, by what they were spent on. Work in parallel counts as the time that passed."""
 
     truths: dict[Camera, float] = field(default_factory=dict)  # of making the truth of each view
     checks: list[float] = field(default_factory=list)  # of each comparison with the validation views

@@ -44,8 +44,9 @@ SEED_OFFSET = 7919
 # dB: a state that is worse than the start by more than this is undone. Rounding and the choice of views make smaller differences.
 HARM_DB = 0.1
 
-# The square of two steps of 8 bits, 42 dB, about where differences begin to be seen. It is added to the errors that states are compared by: otherwise
-# views of a plain sky that fall from 90 dB to 50 would outweigh others that rise from 20 to 30.
+# The square of two steps of 8 bits, 42 dB, below which differences are hardly seen. It is added to the errors that states are compared by: otherwise
+# views of a plain sky that fall from 90 dB to 50 would outweigh others that rise from 20 to 30. With one step (48 dB) an object among such views
+# has 1 dB less, for their small losses still take its steps back.
 VISIBLE_ERROR = (2 / 255) ** 2
 
 # dB: states whose PSNR differs by less count as equal; of these the later is preferred, because it has learned more.

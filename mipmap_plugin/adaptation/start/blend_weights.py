@@ -26,7 +26,7 @@ def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backen
 
 
 def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> tuple[Tensor, float]:
-    """`blend_weights`, and the fraction of the splats that a view shows: not those behind others.
+    """`blend_weights`, and the fraction of the splats that a view shows, mean over `views`; what is hidden behind others does not count.
 
     An image is linear in the splats' colors, so that the weights are the gradient of the image's sum with respect to the colors. Works
     with any backend that has gradients, and faster with one that computes them itself (`Backend.blend_weights`).
