@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from functools import cache
+from operator import index
 from typing import SupportsIndex, TypeVar
 
 import torch
@@ -47,16 +48,26 @@ def for_views() -> int:
     return _shared.get() or 1
 
 
+def checked(threads: object) -> int:
+    """A number of threads that may be asked for. Raises SettingsError for less than one, and for far more than the processor has."""
+    most = MOST_PER_CORE * (os.cpu_count() or 1)
+    if not (isinstance(threads, SupportsIndex) and 1 <= index(threads) <= most):
+        raise SettingsError(f"threads must be at least 1, got {threads!r}; more than {most} are of no use on this machine")
+    return index(threads)
+
+
+def limit_torch(threads: int) -> None:
+    """Give torch this many threads for the rest of the process. Raises SettingsError, as `limited` does."""
+    torch.set_num_threads(checked(threads))
+
+
 @contextmanager
 def limited(threads: int | None, *, shared: bool) -> Iterator[None]:
     """Use `threads` threads inside, or as many as torch has. `shared`: by kernels and parallel views, with one for torch; else by torch.
 
     Raises SettingsError for less than one, and for far more than the processor has.
     """
-    most = MOST_PER_CORE * (os.cpu_count() or 1)
-    if threads is not None and not (isinstance(threads, SupportsIndex) and 1 <= threads <= most):
-        raise SettingsError(f"threads must be at least 1, got {threads!r}; more than {most} are of no use on this machine")
-    count = threads or for_kernels()
+    count = for_kernels() if threads is None else checked(threads)
     token = _shared.set(count if shared else None)
     try:
         with _torch_threads(1 if shared else count):

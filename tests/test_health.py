@@ -116,3 +116,9 @@ def test_real_checkpoints(shared_data):
     flowers = examine(load_model(shared_data / "checkpoints/flowers_r8"))
     assert (flowers.tiny, flowers.invisible, flowers.scales_look_linear) == (9_878, 4_838, False)
     assert examine(load_model(shared_data / "checkpoints/vanilla_iter7000")).sentences() == []
+
+
+def test_a_checkpoint_of_which_nothing_is_drawn_is_spoilt():
+    faint = healthy()
+    faint.parameters()["opacities"][:] = -20
+    assert examine(faint).spoilt() and not examine(spoiled("opacities", 0, -20.0)).spoilt()

@@ -132,7 +132,7 @@ def test_a_start_is_computed_from_as_many_views_as_show_enough(monkeypatch):
 
     def weighed(gaussians, views, *rest):
         counts.append(len(views))
-        return real(gaussians, views, *rest)[0], 0.1 if len(counts) == 1 else 1.0
+        return real(gaussians, views, *rest)[0], 0.2 if len(counts) == 1 else 1.0
 
     monkeypatch.setattr(start, "weighed", weighed)
     wrap_model(tiny.model(COUNT), cameras=tiny.cameras(60), backend="reference").adapt(SCALE, recipe="instant", extra_views=0)

@@ -33,9 +33,13 @@ def wrap(
     threads: int | None = None,
 ) -> Wrapped:  # fmt: skip
     from mipmap_plugin.jobs.base import Base
+    from mipmap_plugin.threads import limit_torch
 
     with announced(f"reading {checkpoint.name}"):
-        return Base(checkpoint, cameras, background, backend, screen_filter).load(threads)
+        wrapped = Base(checkpoint, cameras, background, backend, screen_filter).load(threads)
+        if threads is not None:
+            limit_torch(threads)  # what is measured beside adapting too: torch's threads may cost small images a hundred times what they gain
+        return wrapped
 
 
 def scene(path: Path) -> Scene:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.errors import SettingsError
@@ -65,6 +66,12 @@ def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None
         raise SettingsError(f"{base.model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
     if by_distance(base, request):
         return make_levels_by_distance(base, request, resume)
+    with threads.limited(base.threads, shared=False):
+        return _make_levels(base, request, resume)
+
+
+def _make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None) -> Ladder:
+    """`make_levels` by zoom."""
     band = request.first_band(base.target(request.viewer), base.effects())
     store = LevelStore(None if resume is None else Path(resume), base, request)
     with announced("rendering the base"):

@@ -24,6 +24,10 @@ TILES, TILESET = "tiles", "tileset.json"
 # px: Cesium's default.
 SCREEN_ERROR = 16
 
+# A point (x, y, z) of a PLY lies at (-x, -z, -y) of a tile: splat-transform turns PLYs by half a turn about z on their way to glTF, whose y is up,
+# and 3D Tiles, whose z is up, read a glTF's (x, y, z) as (x, -z, y).
+AXES = (0, 2, 1)
+
 # Standard deviations at which a splat ends, for bounding boxes.
 REACH = 3.0
 
@@ -50,7 +54,8 @@ def bounding_box(model: SplatModel) -> list[float]:
     splats = model.gaussians(wrap_model(model).any_camera()).detach()
     reach: Tensor = REACH * splats.scales.max(dim=1).values[:, None]
     low, high = (splats.means - reach).amin(dim=0), (splats.means + reach).amax(dim=0)
-    return [*((low + high) / 2).tolist(), *torch.diag((high - low) / 2).flatten().tolist()]
+    center, half = (each[list(AXES)] for each in ((low + high) / -2, (high - low) / 2))
+    return [*center.tolist(), *torch.diag(half).flatten().tolist()]
 
 
 def write_tiles(folder: Path, *, overwrite: bool = False) -> Path:

@@ -12,6 +12,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import psnr_as_shown
 from mipmap_plugin.adaptation.optimization.validation import WINDOW
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.views import showing
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.scenes.trajectories import jittered
@@ -34,7 +35,9 @@ class Yardstick:
 
     def __init__(self, base: Wrapped, seed: int) -> None:
         generator = torch.Generator().manual_seed(derived_seed(seed, DRAW))
-        self._views = [view.window(WINDOW, WINDOW) for view in jittered(base.views(), VIEWS, generator)]
+        views = jittered(base.views(), VIEWS, generator, spread=False)
+        shown = showing(views, base.model.parameters()["means"], base.effects().near_plane) or views  # between far objects there is nothing
+        self._views = [view.window(WINDOW, WINDOW) for view in shown]
         self._images = {view: base.render(view).image.clamp(0, 1) for view in self._views}
 
     def example(self) -> tuple[Camera, Tensor]:

@@ -80,8 +80,8 @@ class Health:
         return remarks
 
     def spoilt(self) -> bool:
-        """Whether some splats spoil images, or stored values look like those of another convention."""
-        return bool(self.invalid.any()) or self.scales_look_linear or self.opacities_look_activated
+        """Whether some splats spoil images, none is drawn, or stored values look like those of another convention."""
+        return bool(self.invalid.any()) or 0 < self.splats == self.invisible or self.scales_look_linear or self.opacities_look_activated
 
     def non_finite(self) -> list[str]:
         """The sentences on NaN and infinity."""

@@ -156,7 +156,7 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
     """
     checkpoint = detect_as(path, tuple(SCREEN_FILTERS), iteration=iteration)
     splats = read_vanilla(checkpoint)
-    invalid = torch.from_numpy(~(splats.extras[COLUMN] >= 0) | (splats.extras[COLUMN] == torch.inf))
+    invalid = torch.from_numpy(~((splats.extras[COLUMN] >= 0) & (splats.extras[COLUMN] <= LARGEST)))
     if invalid.all():
         raise CheckpointError(f"{checkpoint.path}: none of its {len(splats):,} splats has a valid {COLUMN}; export it again")
     if invalid.any():

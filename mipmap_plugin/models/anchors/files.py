@@ -26,6 +26,9 @@ from mipmap_plugin.models.vanilla import Origin
 
 OFFSET, FEATURE = "f_offset_", "f_anchor_feat_"
 
+# Carried columns that a family reads: those of Octree-GS.
+LEVELS = ("level", "extra_level")
+
 # The first three scale an anchor's offsets, the others its splats.
 SCALES = tuple(f"scale_{i}" for i in range(6))
 
@@ -54,7 +57,7 @@ def read_anchors(path: str | Path, family: str, iteration: int | None) -> Anchor
     ply = read_ply(checkpoint.path)
     parameters, carried = to_parameters(ply.columns, checkpoint.path)
     weights, companions = read_networks(checkpoint.path.parent)
-    parameters, dropped = _checked(parameters, weights, checkpoint.path)
+    parameters, dropped = _checked(parameters, carried, weights, checkpoint.path)
     first = {name: column[:2].copy() for name, column in ply.columns.items()}
     options, notes = read_options(checkpoint.folder)
     origin = _origin(checkpoint, ply.comments)
@@ -64,7 +67,7 @@ def read_anchors(path: str | Path, family: str, iteration: int | None) -> Anchor
 
 def anchors_in_memory(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, name: str) -> AnchorFile:
     """As `read_anchors`, but from tensors of the live object `name`. Raises CheckpointError."""
-    parameters, dropped = _checked(parameters, weights, name)
+    parameters, dropped = _checked(parameters, carried, weights, name)
     return AnchorFile(parameters, carried, weights, {}, {}, trained_scale({}, None), Origin(), notes=(f"copied from a live {name}", *dropped))
 
 
@@ -138,16 +141,19 @@ def _origin(checkpoint: Checkpoint, comments: tuple[str, ...]) -> Origin:
     return Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, comments)
 
 
-def _checked(parameters: dict[str, Tensor], weights: Weights, where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
+def _checked(
+    parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, where: Path | str
+) -> tuple[dict[str, Tensor], list[str]]:
     """The finite anchors, after a check that the networks fit them, and a note if some were dropped."""
     folder = where.parent if isinstance(where, Path) else where
     check_networks(weights, parameters["features"].shape[1], parameters["offsets"].shape[1], folder)
-    return _finite(parameters, where)
+    return _finite(parameters, carried, where)
 
 
-def _finite(parameters: dict[str, Tensor], where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
-    """The anchors that are finite and at most LARGEST once activated, and a note if some were dropped."""
-    values = [*parameters.values(), parameters["scales"].exp()]
+def _finite(parameters: dict[str, Tensor], carried: tuple[str, ...], where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
+    """The anchors that are finite and at most LARGEST once activated, and a note if some were dropped; columns that no family reads do not count."""
+    read = [number for number, name in enumerate(carried) if name in LEVELS]
+    values = [*(parameters | {CARRIED: parameters[CARRIED][:, read]}).values(), parameters["scales"].exp()]
     valid = torch.stack([(value.flatten(1).abs() <= LARGEST).all(1) for value in values]).all(0)  # False for NaN
     if valid.all():
         return parameters, []

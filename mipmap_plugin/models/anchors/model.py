@@ -145,7 +145,8 @@ class AnchorModel(ABC):
         self.refuse_output(path, overwrite=overwrite)
         for name, state in self._weights.items():
             refuse_infinite(name, state)
-        columns = to_columns(finite(self._parameters, LARGEST), self._read.carried, self._second_columns())
+        decoded = finite({name: tensor for name, tensor in self._parameters.items() if name != CARRIED}, LARGEST)
+        columns = to_columns({**decoded, CARRIED: self._parameters[CARRIED]}, self._read.carried, self._second_columns())
         comments = with_tags(self._read.origin.comments, self.trained.screen_filter, provenance)
         write = partial(write_ply, columns=columns, comments=comments)
         if path.suffix.lower() == ".ply":
