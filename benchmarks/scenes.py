@@ -154,13 +154,13 @@ def _orientations(rng: Generator, normals: np.ndarray, world_to_camera: np.ndarr
     first -= (first * normals).sum(1, keepdims=True) * normals
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     axes = np.stack([first, np.cross(normals, first), normals], axis=2)
-    quats = _quaternions(world_to_camera.T @ axes)
+    quats = quaternions(world_to_camera.T @ axes)
     loose = rng.random(count) < 0.10
     quats[loose] = rng.standard_normal((loose.sum(), 4))
     return quats * np.exp(rng.normal(0, 0.2, (count, 1)))
 
 
-def _quaternions(rotations: np.ndarray) -> np.ndarray:
+def quaternions(rotations: np.ndarray) -> np.ndarray:
     """Rotation matrices [N, 3, 3] -> unit quaternions wxyz [N, 4]."""
     m = np.moveaxis(rotations, 0, -1)
     trace = np.trace(rotations, axis1=1, axis2=2)
