@@ -32,7 +32,7 @@ HEAD = ["capture", "zoom", "base", "scaled", "2 x 2", "instant", "default", "wor
 INTRO = """# Captures of every kind
 
 Made by `python benchmarks/captures.py`: captures of our own making, each with one thing that is hard about its cameras
-([made_captures.py](../made_captures.py)). Mean PSNR (dB) of views that nothing was adapted to, against the base's own image, averaged; a zoom-in is
+(`benchmarks/made_captures.py`). Mean PSNR (dB) of views that nothing was adapted to, against the base's own image, averaged; a zoom-in is
 averaged itself and compared with it. *2 x 2*: the mean of so many samples a pixel, for a renderer that can. *Worst view*: the least that `default`
 changes any view of the base's by, in dB as far as differences can be seen (below two steps of 8 bits, 42 dB, they hardly count). One thread of a
 shared machine.

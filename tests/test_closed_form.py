@@ -158,14 +158,14 @@ def test_a_pixel_is_the_depth_over_the_focal_length():
 def test_a_pixel_is_that_of_the_closest_view_that_sees_the_splat():
     closer = VIEW.looking_from(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]]), "closer")
     means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [30.0, 0.0, 4.0]])  # both see it; only the first does; none does
-    torch.testing.assert_close(pixel_size(means, [VIEW, closer]), torch.tensor([2.0, 1.0, 2.0]) / FOCAL)
+    torch.testing.assert_close(pixel_size(means, [VIEW, closer]), torch.tensor([2.0, 1.0, math.hypot(30, 2)]) / FOCAL)
 
 
 def test_a_pixel_has_a_size_in_the_plane_of_the_camera_too():
     """Else weights over it are infinite, and merged colors NaN."""
     size = pixel_size(torch.tensor([[1.0, 0.0, 0.0]]), [VIEW])
-    assert size.item() > 0
-    assert (size**-2).isfinite().all()
+    assert size.item() == pytest.approx(1 / FOCAL)
+    assert pixel_size(VIEW.center[None].float(), [VIEW]).pow(-2).isfinite().all()
 
 
 @pytest.mark.parametrize("scale", [2, 4])

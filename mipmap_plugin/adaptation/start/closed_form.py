@@ -181,10 +181,10 @@ def _pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
     finest, anywhere = (torch.full_like(means[:, 0], torch.inf) for _ in range(2))
     for view in views:
         points = view.to_camera(means)
-        # A mean in the camera's own plane would have pixels of size 0.
-        size = points[:, 2].abs().clamp_min(torch.finfo(points.dtype).eps) / (view.fx * view.fy) ** 0.5
-        finest = torch.where(view.in_picture(points), torch.minimum(finest, size), finest)
-        anywhere = torch.minimum(anywhere, size)
+        focal = (view.fx * view.fy) ** 0.5
+        finest = torch.where(view.in_picture(points), torch.minimum(finest, points[:, 2] / focal), finest)
+        # Of what is in no picture by its distance: in the camera's own plane a depth is 0.
+        anywhere = torch.minimum(anywhere, points.norm(dim=1).clamp_min(torch.finfo(points.dtype).eps) / focal)
     return torch.where(finest.isfinite(), finest, anywhere)
 
 
