@@ -4,11 +4,14 @@
     python benchmarks/captures.py --only board --scale 0.25 --seed 0 --seed 1
 
 Captures are made up (made_captures.py), so that the base's own image, averaged over N x N samples a pixel, is the truth; a zoom-in is averaged
-itself and compared with it. Prints a Markdown table and writes captures.md and captures.json. Three minutes.
+itself and compared with it. Prints a Markdown table and writes captures.md and captures.json; rows that
+are not measured again are kept. Three minutes.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,7 +31,7 @@ from mipmap_plugin.formats.atomic import new_file, write_json
 from mipmap_plugin.wrap import Wrapped
 
 SCALES = (1 / 4, 1 / 8, 2.0)
-HEAD = ["capture", "zoom", "base", "scaled", "2 x 2", "instant", "default", "worst view", "splats", "seconds"]
+HEAD = ["capture", "zoom", "seed", "base", "scaled", "2 x 2", "instant", "default", "worst view", "splats", "seconds"]
 INTRO = """# Captures of every kind
 
 Made by `python benchmarks/captures.py`: captures of our own making, each with one thing that is hard about its cameras
@@ -56,20 +59,20 @@ class Row:
 
     def cells(self) -> list[str]:
         quality = [f"{value:.1f}" for value in self.psnrs_db.values()]
-        return [self.capture, f"x{self.scale:g}", *quality, f"{self.least_change_db:+.1f}", f"{self.share:.0%}", f"{self.seconds:.0f}"]
+        facts = [f"{self.least_change_db:+.1f}", f"{self.share:.0%}", f"{self.seconds:.0f}"]
+        return [self.capture, f"x{self.scale:g}", str(self.seed), *quality, *facts]
 
 
 class Views:
     """The held-out views of a capture at one scale, and their truth."""
 
     def __init__(self, base: Wrapped, cameras: Sequence[Camera], scale: float) -> None:
-        self._cameras, self._scale = cameras, scale
-        self._size = min(scale, 1.0)
+        self._cameras, self._shown_at = cameras, min(scale, 1.0)
         with torch.no_grad():
             self._truths = [self._shrunk(base.render(camera).image, camera) for camera in cameras]
 
     def _shrunk(self, image: Tensor, camera: Camera) -> Tensor:
-        return resize(image.clamp(0, 1), camera.zoomed(self._size).size, "area")
+        return resize(image.clamp(0, 1), camera.zoomed(self._shown_at).size, "area")
 
     @torch.no_grad()
     def errors(self, show: Show) -> list[float]:
@@ -96,6 +99,13 @@ def measure(name: str, capture: Capture, scale: float, seed: int) -> Row:
     return Row(name, scale, seed, psnrs, least, report.gaussians_after / report.gaussians_before, report.seconds["total"], report.returned)
 
 
+def joined(file: Path, rows: Sequence[Row]) -> list[Row]:
+    """These rows, and those of an earlier run that were not measured again."""
+    earlier = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
+    known = {(row.capture, row.scale, row.seed): row for row in (*earlier, *rows)}
+    return sorted(known.values(), key=lambda row: (list(CAPTURES).index(row.capture), abs(math.log2(row.scale)), row.scale, row.seed))
+
+
 def main(
     only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     scale: tyro.conf.UseAppendAction[tuple[float, ...]] = (),
@@ -113,12 +123,13 @@ def main(
     if unknown := set(only) - CAPTURES.keys():
         raise SystemExit(f"there is no capture {', '.join(sorted(unknown))}; known are {', '.join(CAPTURES)}")
     torch.set_num_threads(1)
-    rows = []
+    rows: list[Row] = []
     for name in only or CAPTURES:
         capture = CAPTURES[name]()
         for each in scale or SCALES:
             rows += [measure(name, capture, each, number) for number in seed or (0,)]
             print(*rows[-1].cells(), rows[-1].returned, sep="  ", flush=True)
+    rows = joined(output / "captures.json", rows)
     text = INTRO + "\n" + markdown(HEAD, [row.cells() for row in rows]) + "\n"
     print(f"\n{text}")
     with new_file(output / "captures.md", overwrite=True) as file:

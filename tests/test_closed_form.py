@@ -284,3 +284,10 @@ def test_opacities_follow_the_views_in_which_a_splat_is_large():
 def test_an_area_beyond_the_type_leaves_the_opacity_as_it_is():
     large = disc(4e10, 4e10).to(dtype=torch.float32)
     assert closed_form(large, [VIEW], 1 / 4, Effects(0), Effects(0))[1].isfinite().all()
+
+
+def test_the_closest_view_is_looked_for_among_more_views():
+    """Of 40 views one is twice as close: every third does not show it."""
+    closer = VIEW.looking_from(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]]), "closer")
+    views = [closer if number == 1 else VIEW for number in range(40)]
+    torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), views, 12), torch.tensor([2.0]) / FOCAL)

@@ -28,11 +28,14 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import OutputExists, SceneError, SettingsError
 from mipmap_plugin.evaluation.tradeoff.points import on_backend
+from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.ladder import make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
 from mipmap_plugin.levels.switching import most_even, switching_zoom, zooms_between
+from mipmap_plugin.levels.yardstick import Yardstick
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, state_path
 
@@ -401,3 +404,20 @@ def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     assert "2 levels" in said and "level_1.ply  x0.5, shown up to" in said and "at worst" in said
     assert not state_path(tmp_path / "ladder").exists() and not (tmp_path / "ladder" / "report.html").exists()
     assert cli.main(words) == 2 and "--overwrite" in capsys.readouterr().err
+
+
+def test_levels_are_measured_by_views_that_show_something():
+    """Between objects far apart most random views show nothing."""
+    one, other = tiny.gaussians(40), tiny.gaussians(40, seed=2)
+    away = torch.tensor([1000.0, 0.0, 0.0])
+    both = Gaussians(*(torch.cat(pair) for pair in zip(_columns(one), _columns(replace(other, means=other.means + away)), strict=True)))
+    there = torch.eye(4, dtype=torch.float64)
+    there[:3, 3] = away.double()
+    cameras = [*tiny.cameras(3), *(view.moved(there) for view in tiny.cameras(3))]
+    base = wrap_model(VanillaModel.from_gaussians(both), cameras=cameras, backend="reference")
+    yardstick = Yardstick(base, seed=0)
+    assert len(yardstick._images) == 4 and all(image.std() > 0 for image in yardstick._images.values())
+
+
+def _columns(gaussians):
+    return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh

@@ -8,11 +8,12 @@ import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))  # its modules import one another by bare names, as scripts do
 
-from captures import main
+from captures import Row, joined, main
 from made_captures import CAPTURES
 
 from mipmap_plugin.adaptation.views import showing
 from mipmap_plugin.evaluation.measure import views_seen
+from mipmap_plugin.formats.atomic import write_json
 
 
 @pytest.mark.parametrize("name", CAPTURES)
@@ -27,4 +28,7 @@ def test_what_few_views_show_is_adapted_too(tmp_path):
     main(only=("board",), scale=(0.25,), output=tmp_path)
     (row,) = json.loads((tmp_path / "captures.json").read_text())
     assert row["psnrs_db"]["default"] > row["psnrs_db"]["base"] + 8 and row["least_change_db"] > 5
-    assert "| board   | x0.25 |" in (tmp_path / "captures.md").read_text()
+    write_json(tmp_path / "captures.json", [row | {"seed": 7}, row | {"psnrs_db": {}}], overwrite=True)
+    kept = joined(tmp_path / "captures.json", [Row(**row)])
+    assert [each.seed for each in kept] == [0, 7] and kept[0].psnrs_db == row["psnrs_db"]
+    assert "| board   | x0.25 | 0    |" in (tmp_path / "captures.md").read_text()

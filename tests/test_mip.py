@@ -22,6 +22,7 @@ from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import CARRIED, TrainedScale
+from mipmap_plugin.models.health import LARGEST
 from mipmap_plugin.models.mip import MipModel, filter_3d_of, sharpen_3d, smooth_3d
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
@@ -166,9 +167,9 @@ def seen_depth(mean, view):
 
 def test_rows_whose_filter_is_no_length_are_dropped(tmp_path):
     columns = splats()
-    columns["filter_3D"][[3, 7, 9]] = np.nan, np.inf, -1
+    columns["filter_3D"][[3, 7, 8, 9]] = np.nan, np.inf, 2 * LARGEST, -1
     model = load_model(folder(tmp_path / "model", columns=columns))
-    assert len(model) == 37 and any("3 of 40 splats were dropped" in note for note in model.notes)
+    assert len(model) == 36 and any("4 of 40 splats were dropped" in note for note in model.notes)
     columns["filter_3D"][:] = np.nan
     with pytest.raises(CheckpointError, match="none of its 40 splats"):
         load_model(folder(tmp_path / "broken", columns=columns))

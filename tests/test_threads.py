@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from mipmap_plugin import progress, threads
 from mipmap_plugin.adaptation.target.base_images import BaseImages
+from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
@@ -172,3 +173,18 @@ def test_the_clock_of_a_bar_goes_on_while_nothing_is_counted(monkeypatch):
     with tqdm(total=2, file=silent, disable=None) as bar, progress.ticking(bar):
         time.sleep(0.05)
     assert not silent.getvalue()
+
+
+@pytest.mark.parametrize("wrong", [0, -1, 1.5, 10**9])
+def test_numbers_of_threads_that_are_none_are_refused(wrong):
+    with pytest.raises(SettingsError, match="threads must be at least 1"):
+        threads.limit_torch(wrong)
+
+
+def test_what_a_command_measures_has_the_threads_that_were_asked_for(tmp_path):
+    before = torch.get_num_threads()
+    try:
+        wrap(tiny.folder(tmp_path / "base"), None, None, "auto", threads=before + 1)
+        assert torch.get_num_threads() == before + 1
+    finally:
+        torch.set_num_threads(before)

@@ -38,7 +38,7 @@ def wrap(
     with announced(f"reading {checkpoint.name}"):
         wrapped = Base(checkpoint, cameras, background, backend, screen_filter).load(threads)
         if threads is not None:
-            limit_torch(threads)  # what is measured beside adapting too: torch's threads may cost small images a hundred times what they gain
+            limit_torch(threads)  # also for what is measured: on a busy machine small images take many times as long on torch's threads
         return wrapped
 
 

@@ -18,8 +18,8 @@ from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.scenes.trajectories import jittered
 from mipmap_plugin.wrap import Wrapped
 
-# Random views; of large images only the middle is used, as for validation.
-VIEWS = 4
+# Random views, of so many times as many the first that show something; of large images only the middle is used, as for validation.
+VIEWS, TRIED = 4, 4
 
 # Number of the random draw, apart from those of views that are adapted to and of validation.
 DRAW = 104_729
@@ -27,7 +27,7 @@ DRAW = 104_729
 # The filter that shrinks the base's images, as for the pseudo truth.
 RESIZE = "pil-bicubic"
 
-TRUTH = f"mean PSNR over {VIEWS} random views that no level was adapted to, against the base's own images at x1, shrunk by {RESIZE}"
+TRUTH = f"mean PSNR over at most {VIEWS} random views that no level was adapted to, against the base's own images at x1, shrunk by {RESIZE}"
 
 
 class Yardstick:
@@ -35,9 +35,9 @@ class Yardstick:
 
     def __init__(self, base: Wrapped, seed: int) -> None:
         generator = torch.Generator().manual_seed(derived_seed(seed, DRAW))
-        views = jittered(base.views(), VIEWS, generator, spread=False)
-        shown = showing(views, base.model.parameters()["means"], base.effects().near_plane) or views  # between far objects there is nothing
-        self._views = [view.window(WINDOW, WINDOW) for view in shown]
+        views = jittered(base.views(), TRIED * VIEWS, generator, spread=False)
+        shown = showing(views, base.model.parameters()["means"], base.effects().near_plane)  # between objects far apart there is nothing
+        self._views = [view.window(WINDOW, WINDOW) for view in (shown or views)[:VIEWS]]
         self._images = {view: base.render(view).image.clamp(0, 1) for view in self._views}
 
     def example(self) -> tuple[Camera, Tensor]:

@@ -141,9 +141,7 @@ def _origin(checkpoint: Checkpoint, comments: tuple[str, ...]) -> Origin:
     return Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, comments)
 
 
-def _checked(
-    parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, where: Path | str
-) -> tuple[dict[str, Tensor], list[str]]:
+def _checked(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, where: Path | str) -> tuple[dict[str, Tensor], list[str]]:
     """The finite anchors, after a check that the networks fit them, and a note if some were dropped."""
     folder = where.parent if isinstance(where, Path) else where
     check_networks(weights, parameters["features"].shape[1], parameters["offsets"].shape[1], folder)
