@@ -147,8 +147,10 @@ class Effects:
     exposure: bool = False  # the exposure of the view's photograph is applied (`models.exposure`)
 
     def __post_init__(self) -> None:
-        if unknown := [name for name in self.outputs if name not in OUTPUTS]:
+        if unknown := [name for name in self.outputs if name not in list(OUTPUTS)]:
             raise SettingsError(f"there is no output {unknown[0]!r}; choose from {', '.join(OUTPUTS)}")
+        if not isinstance(self.screen_filter, str):
+            raise SettingsError(f"a screen filter is a name, such as 'classic', got {self.screen_filter!r}")
         if len(self.background) != 3 or not all(map(math.isfinite, self.background)):
             raise SettingsError(f"background must be three finite numbers, got {self.background!r}")
         if not 0 <= self.eps2d < math.inf or self.sh_degree < 0 or self.supersampling < 1:
@@ -208,7 +210,7 @@ def _rendering_effects(effects: Effects, gaussians: Gaussians) -> list[Effect]:
     return [
         _view_dependent_color(effects.sh_degree, gaussians),
         Effect("screen filter", effects.eps2d > 0 or integrates, f"{effects.screen_filter}, {size}", filter_cost),
-        Effect("compensation", effects.screen_filter in COMPENSATED, f"the screen filter is {effects.screen_filter}", "a square root per splat"),
+        Effect("compensation", *_compensation(effects), "a square root per splat"),
         Effect("supersampling", n > 1, f"{n * n} sample{'s' if n > 1 else ''} per pixel", f"{n * n if n > 1 else 'N x N'} times the pixels"),
         *_viewer_effects(effects.settings),
         Effect(
@@ -217,6 +219,12 @@ def _rendering_effects(effects: Effects, gaussians: Gaussians) -> list[Effect]:
         ),
         *(Effect(name, name in effects.outputs, "requested" if name in effects.outputs else "not requested", cost) for name, cost in OUTPUTS.items()),
     ]  # fmt: skip
+
+
+def _compensation(effects: Effects) -> tuple[bool, str]:
+    if effects.screen_filter in COMPENSATED and effects.eps2d == 0:
+        return False, "the dilation is 0, so there is nothing to compensate"
+    return effects.screen_filter in COMPENSATED, f"the screen filter is {effects.screen_filter}"
 
 
 def _viewer_effects(settings: RenderSettings) -> list[Effect]:

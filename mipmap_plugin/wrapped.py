@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
 from importlib import import_module
@@ -94,8 +95,8 @@ class Wrapped:
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
-        eps2d = USUAL_EPS2D.get(screen_filter, DILATION)
-        if screen_filter in INTEGRALS and trained.screen_filter == "classic":
+        eps2d = USUAL_EPS2D.get(str(screen_filter), DILATION)
+        if screen_filter in list(INTEGRALS) and trained.screen_filter == "classic":
             eps2d = trained.eps2d * scale**2
         return Effects(degree, screen_filter, eps2d, self.background, supersampling, trained.near_plane)
 
@@ -140,7 +141,8 @@ class Wrapped:
         effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(outputs), exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
-        return render_model(self.read_by(viewer), backend, camera, effects, form)
+        with threads.limited(self.threads, shared=False) if self.threads is not None else nullcontext():
+            return render_model(self.read_by(viewer), backend, camera, effects, form)
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
         """Apply Mip-Splatting's 3D filter. Raises SettingsError without cameras, and for splats that it cannot be applied to."""

@@ -86,6 +86,12 @@ def test_p1_truncates_the_mean_of_blocks():
     torch.testing.assert_close(view.truth(1 / 4, PROTOCOLS["P1"]) * 255, means.floor(), atol=1e-3, rtol=0)
 
 
+def test_p1_of_a_photograph_without_whole_blocks_says_what_to_do():
+    view = protocols.TestView(tiny.cameras(1)[0], noise(25, 33, 3), Path("photograph.png"))
+    with pytest.raises(SettingsError, match=r"P1 takes means of whole blocks .*33 x 25 px is not a whole multiple of 8 x 6 px; evaluate by P3"):
+        view.truth(1 / 4, PROTOCOLS["P1"])
+
+
 def test_p3_is_pillows_bicubic_on_bytes_and_not_on_floats():
     stored = (noise(24, 32, 3) > 0.5).byte().mul(255)  # black and white: Pillow clamps between its two passes
     view = protocols.TestView(tiny.cameras(1)[0], stored / 255, Path("photograph.png"))

@@ -175,6 +175,13 @@ def test_rows_whose_filter_is_no_length_are_dropped(tmp_path):
         load_model(folder(tmp_path / "broken", columns=columns))
 
 
+def test_a_filter_of_zeros_is_an_effect_that_is_off():
+    model = ball()
+    assert [effect.on for effect in model.traits.effects] == [True]
+    model.filter_3d.data.zero_()
+    assert [effect.on for effect in model.traits.effects] == [False] and "0 for every splat" in model.traits.effects[0].reason
+
+
 def test_filters_that_no_camera_sees_are_refused():
     with pytest.raises(CheckpointError, match="no training camera"):
         ball().refilter([])

@@ -188,3 +188,17 @@ def test_what_a_command_measures_has_the_threads_that_were_asked_for(tmp_path):
         assert torch.get_num_threads() == before + 1
     finally:
         torch.set_num_threads(before)
+
+
+def test_a_wrapped_model_renders_with_its_own_threads():
+    before, seen = torch.get_num_threads(), []
+
+    class Watched(type(tiny.model(2))):
+        def gaussians(self, camera=None):
+            seen.append(torch.get_num_threads())
+            return super().gaussians(camera)
+
+    model = tiny.model(20)
+    model.__class__ = Watched
+    wrap_model(model, cameras=tiny.cameras(1), backend="cpu", threads=before + 1).render(tiny.cameras(1)[0])
+    assert seen[-1] == before + 1 and torch.get_num_threads() == before

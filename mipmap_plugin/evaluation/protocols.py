@@ -107,6 +107,9 @@ class TestView:
         if size[0] > photograph.shape[0]:
             original = f"{photograph.shape[1]} x {photograph.shape[0]}"
             raise SettingsError(f"x{scale:g} needs {size[1]} x {size[0]} px, but the photographs have only {original}; evaluate a smaller scale")
+        if protocol.resize == "box" and any(pixels % new for pixels, new in zip(photograph.shape, size, strict=False)):
+            blocks = f"{photograph.shape[1]} x {photograph.shape[0]} px is not a whole multiple of {size[1]} x {size[0]} px"
+            raise SettingsError(f"{protocol.name} takes means of whole blocks of pixels, and {blocks}; evaluate by P3, or another scale")
         return protocol.shrunk(photograph, size)
 
 

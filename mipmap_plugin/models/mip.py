@@ -70,8 +70,12 @@ class MipModel:
 
     @property
     def traits(self) -> Traits:
-        reason = f"the file gives one for each of {len(self):,} splats" if self._smooths else "the file gives one, but its project does not apply it"
-        effect = Effect("3D filter", self._smooths, reason, "three roots a splat")
+        on, reason = self._smooths, f"the file gives one for each of {len(self):,} splats"
+        if not on:
+            reason = "the file gives one, but its project does not apply it"
+        elif not self.filter_3d.any():
+            on, reason = False, "the file gives one, but it is 0 for every splat"
+        effect = Effect("3D filter", on, reason, "three roots a splat")
         return Traits(filtered=True, exposures=self.splats.traits.exposures, effects=(effect,))
 
     def gaussians(self, camera: Camera | None = None) -> Gaussians:

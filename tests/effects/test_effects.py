@@ -16,6 +16,7 @@ from tiny import with_bands
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.effects import MODEL_EFFECTS, Effect, Effects, Packing, RenderSettings, explain
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel, load_mip
@@ -80,6 +81,20 @@ def test_everything_on():
     assert reasons["upsampler"] == "bicubic enlarges the base's image to the truth"
     assert reasons["densification statistics"] == "splats with gradients above 0.0002 are cloned or split"
     assert not states(Effects(eps2d=0.0), splats)["screen filter"][0]
+
+
+def test_without_dilation_nothing_is_compensated():
+    assert states(Effects(screen_filter="mip", eps2d=0.0), tiny.gaussians(2))["compensation"] == (
+        False, "the dilation is 0, so there is nothing to compensate",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"), [(dict(screen_filter=["mip"]), "a screen filter is a name"), (dict(outputs=[["depth"]]), "there is no output")]
+)
+def test_names_of_another_type_are_refused(wrong, sentence):
+    with pytest.raises(SettingsError, match=sentence):
+        wrapped(tiny.gaussians(2)).render(tiny.cameras(1)[0], **wrong)
 
 
 def test_the_line_of_an_effect_names_its_cost():
