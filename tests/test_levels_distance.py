@@ -10,7 +10,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, load_model, wrap_model
-from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.start.closed_form import pixel_size, seen_pixel_size
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.commands.levels import print_summary
@@ -99,8 +99,33 @@ def test_the_rule_follows_from_the_nearest_parts():
 
 def test_scenes_with_a_background_are_unbounded_and_objects_are_not():
     views = tiny.cameras(6)
-    assert is_unbounded(with_background().means, views)
-    assert not is_unbounded(tiny.gaussians(200).means, views)
+    assert is_unbounded(with_background().means, views, 0.01)
+    assert not is_unbounded(tiny.gaussians(200).means, views, 0.01)
+
+
+def test_splats_in_no_picture_have_no_part_in_the_rule():
+    """A third of the splats here lie right behind a camera, and one in ten right before it, nearer than the near plane."""
+    views, ball = tiny.cameras(1, width=48, height=36), tiny.gaussians(300, degree=0)
+    eye = views[0].center.float()
+    away = eye / eye.norm()
+    behind, before = (tiny.gaussians(count, degree=0, spread=1e-4, seed=count) for count in (150, 45))
+    hidden = [replace(behind, means=behind.means + eye + 0.2 * away), replace(before, means=before.means + eye - 0.005 * away)]
+    base, cluttered = (wrap_model(VanillaModel.from_gaussians(together(parts), tiny.model(1).trained), cameras=views, backend="cpu", threads=1)
+                       for parts in ([ball], [ball, *hidden]))  # fmt: skip
+    request = LadderRequest("playcanvas", coarsest=1 / 8)
+    rules = [scene_of(each, request, request.first_band(each.target("playcanvas"), each.effects())) for each in (base, cluttered)]
+    assert rules[0].rule == rules[1].rule and rules[0].near == rules[1].near and rules[0].extent == rules[1].extent
+    assert not by_distance(cluttered, replace(request, viewer="supersplat", by="auto"))
+
+
+def test_a_scene_that_no_camera_sees_is_not_unbounded():
+    assert not is_unbounded(torch.cat([torch.zeros(5, 3), torch.full((5, 3), 100.0)]), [from_x(1e6)], 0.01)
+
+
+def test_the_nearest_parts_are_found_where_few_of_many_views_see_something():
+    blind, view = [from_x(1e6)] * 99, tiny.cameras(1)[0]
+    means = tiny.gaussians(20).means
+    assert torch.equal(seen_pixel_size(means, [*blind, view], 0.01), seen_pixel_size(means, [view], 0.01))
 
 
 # Chunks

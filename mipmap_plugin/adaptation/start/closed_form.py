@@ -172,20 +172,40 @@ def pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None)
 
     Of many views only some are used, evenly spread: CLOSEST_OF times `count`, or else `enough_views`.
     """
-    views = every_nth(views, min(MOST_VIEWS, CLOSEST_OF * (count or enough_views(means, views))))
-    return torch.cat(in_chunks(lambda chunk: _pixel_size(means[chunk], views), means))
+    seen, unseen = _pixel_sizes(means, every_nth(views, _closest_of(means, views, count)))
+    return torch.where(seen.isfinite(), seen, unseen)
 
 
-def _pixel_size(means: Tensor, views: Sequence[Camera]) -> Tensor:
-    """`pixel_size` of some of the means, in all views."""
+def seen_pixel_size(means: Tensor, views: Sequence[Camera], near: float) -> Tensor:
+    """`pixel_size` of those of the means [N, 3] that are in a picture, beyond `near` (world units): [M], M at most N; 0 if nothing is seen."""
+    seen, _ = _pixel_sizes(means, every_nth(views, _closest_of(means, views)), near)
+    if not seen.isfinite().any():  # few of many views may show something
+        seen, _ = _pixel_sizes(means, views, near)
+    return seen[seen.isfinite()]
+
+
+def _closest_of(means: Tensor, views: Sequence[Camera], count: int | None = None) -> int:
+    """Among how many views the closest is looked for."""
+    return min(MOST_VIEWS, CLOSEST_OF * (count or enough_views(means, views)))
+
+
+def _pixel_sizes(means: Tensor, views: Sequence[Camera], near: float = 0.0) -> tuple[Tensor, Tensor]:
+    """The size of a pixel at each mean in the closest view that sees it, infinity if none does, and in the closest of all views, [N] both."""
+    chunks = in_chunks(lambda chunk: _sizes_of_chunk(means[chunk], views, near), means)
+    seen, anywhere = zip(*chunks, strict=True)
+    return torch.cat(seen), torch.cat(anywhere)
+
+
+def _sizes_of_chunk(means: Tensor, views: Sequence[Camera], near: float) -> tuple[Tensor, Tensor]:
+    """`_pixel_sizes` of some of the means."""
     finest, anywhere = (torch.full_like(means[:, 0], torch.inf) for _ in range(2))
     for view in views:
         points = view.to_camera(means)
         focal = (view.fx * view.fy) ** 0.5
-        finest = torch.where(view.in_picture(points), torch.minimum(finest, points[:, 2] / focal), finest)
+        finest = torch.where(view.in_picture(points, near), torch.minimum(finest, points[:, 2] / focal), finest)
         # Of what is in no picture by its distance: in the camera's own plane a depth is 0.
         anywhere = torch.minimum(anywhere, points.norm(dim=1).clamp_min(torch.finfo(points.dtype).eps) / focal)
-    return torch.where(finest.isfinite(), finest, anywhere)
+    return finest, anywhere
 
 
 def min_variance(effects: Effects) -> float:

@@ -10,7 +10,7 @@ import torch
 
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.start.closed_form import seen_pixel_size
 from mipmap_plugin.effects import INTEGRATED
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.distance.chunks import Chunks
@@ -80,8 +80,9 @@ def by_distance(base: Wrapped, request: LadderRequest) -> bool:
         return request.by == "distance"
     if request.least_db is not None or request.until_splats is not None:
         return False
-    mergeable = base.model.traits.same_for_all_views and base.effects().screen_filter not in INTEGRATED
-    return mergeable and request.viewer in STREAMING and is_unbounded(base.model.parameters()["means"].detach(), base.views())
+    effects, means = base.effects(), base.model.parameters()["means"].detach()
+    mergeable = base.model.traits.same_for_all_views and effects.screen_filter not in INTEGRATED
+    return mergeable and request.viewer in STREAMING and is_unbounded(means, base.views(), effects.near_plane)
 
 
 def refuse(base: Wrapped, request: LadderRequest) -> None:
@@ -104,7 +105,7 @@ def scene_of(base: Wrapped, request: LadderRequest, band: Band) -> Scene:
     backend, note = base.backend(gradients=True, viewer=request.viewer)
     with torch.no_grad():
         splats, views = base.model.gaussians(base.any_camera()).detach(), base.views()
-        pixels = pixel_size(splats.means, views)
+        pixels = seen_pixel_size(splats.means, views, base.effects().near_plane)
         rule = DistanceRule.of(pixels, request, band)
         extent = chunk_extent(nearest(pixels) * focal_of(views[0]))
         return Scene(base, request, rule, Chunks.of(splats, extent), extent, base.target(request.viewer), backend, note)

@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import Validation, split_validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.closed_form import enough_views, pixel_size
+from mipmap_plugin.adaptation.start.closed_form import enough_views, pixel_size, seen_pixel_size
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
@@ -94,8 +94,8 @@ class Scene:
 
     @cached_property
     def near(self) -> float:
-        """The size of a pixel of the training at the nearest parts of the scene, in world units."""
-        return nearest(self.pixel_of(self.splats.means))
+        """The size of a pixel of the training at the nearest parts of the scene that are seen, in world units."""
+        return nearest(seen_pixel_size(self.splats.means, self.views, self.base.effects().near_plane))
 
     def scale(self, level: int) -> float:
         """The scale of a level at the nearest parts of the scene."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.start.closed_form import seen_pixel_size
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.levels.request import Band, LadderRequest
 
@@ -36,7 +36,7 @@ class DistanceRule:
 
     @classmethod
     def of(cls, pixels: Tensor, request: LadderRequest, band: Band) -> DistanceRule:
-        """The rule for splats that training saw with pixels of these sizes [N]. `band`: the zooms that level 0 was adapted to.
+        """The rule for splats that training saw with pixels of these sizes [N], at least one. `band`: the zooms that level 0 was adapted to.
 
         The nearest parts of the scene leave level 0 where its band ends; the last level is the one that has them at the coarsest scale.
         """
@@ -64,14 +64,17 @@ class DistanceRule:
 
 
 def nearest(pixels: Tensor) -> float:
-    """The size of a pixel at the nearest parts of a scene, of the sizes [N] at its splats."""
+    """The size of a pixel at the nearest parts of a scene, of the sizes [N] at its splats that are seen, at least one."""
     return float(_quantile(pixels, NEAREST))
 
 
-def is_unbounded(means: Tensor, views: Sequence[Camera]) -> bool:
-    """Whether the near and the far parts of a scene need scales of their own. `means` [N, 3]; `views`: of its training."""
-    pixels = pixel_size(means, views)
-    return bool(_quantile(pixels, 1 - NEAREST) > UNBOUNDED * _quantile(pixels, NEAREST))
+def is_unbounded(means: Tensor, views: Sequence[Camera], near: float) -> bool:
+    """Whether the near and the far parts of a scene need scales of their own; not if nothing is seen.
+
+    `means` [N, 3]; `views`: of its training; `near`: its near plane, in world units.
+    """
+    pixels = seen_pixel_size(means, views, near)
+    return len(pixels) > 0 and bool(_quantile(pixels, 1 - NEAREST) > UNBOUNDED * _quantile(pixels, NEAREST))
 
 
 def focal(camera: Camera) -> float:
