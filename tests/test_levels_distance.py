@@ -4,6 +4,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import tiny
@@ -306,6 +307,16 @@ def test_walks_begin_where_something_is_seen(small_chunks, monkeypatch):
     assert walks.views and not any(view is away for view in walks.views)
 
 
+def test_a_place_is_measured_once_where_levels_end_before_walks_begin(small_chunks):
+    """The nearest parts of this scene are nearer than what most views have before them."""
+    base, request = wrapped(), LadderRequest("classic", coarsest=1 / 4, ratio=1.3, by="distance")
+    scene = scene_of(base, request, request.first_band(base.target("classic"), base.effects()))
+    walks = Walks(scene, [base.model] * scene.rule.count)
+    pixels = [[walks.seen(view, size).pixel for view in walks.views] for size in walks.places()]
+    assert len(walks.places()) < 1 + 2 * scene.rule.count and walks.places()[0] == 0
+    assert all(any(one < other for one, other in zip(*pair, strict=True)) for pair in pairwise(pixels))
+
+
 def test_cameras_that_see_nothing_are_refused():
     base = wrap_model(wrapped().model, cameras=[from_x(1e6)])
     with pytest.raises(SettingsError, match="no camera sees a splat"):
@@ -334,7 +345,10 @@ def test_a_ladder_from_end_to_end(tmp_path, small_chunks, capsys):
     assert [level["scale"] for level in manifest["levels"]] == [level.report.scale for level in ladder.contents.levels]
     near, pixels = manifest["base_pixel"], [level["pixel_from"] for level in manifest["levels"][1:]]
     assert [level["scale"] for level in manifest["levels"][1:]] == pytest.approx([near / (pixel * 2**0.5) for pixel in pixels])
-    assert [point["pixel"] for point in manifest["curve"]] == sorted(point["pixel"] for point in manifest["curve"])
+    assert [point["pixel"] for point in manifest["curve"]] == sorted({point["pixel"] for point in manifest["curve"]})
+    assert [point["zoom"] for point in manifest["curve"]] == pytest.approx([near / point["pixel"] for point in manifest["curve"]])
+    keyed = {zoom: psnr for level in manifest["levels"] for zoom, psnr in level["psnr_db"].items()}
+    assert keyed == {f"{point['zoom']:.4g}": point["psnr_db"] for point in manifest["curve"]}
     print_summary(folder, manifest)
     assert "3 levels by distance" in capsys.readouterr().out
 

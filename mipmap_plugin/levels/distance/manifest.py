@@ -52,7 +52,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
         "lodMultiplier": multiplier,
         "canvas": CANVAS,
         "chunk_extent": scene.extent,
-        "curve": [asdict(point) for point in ladder.curve],
+        "curve": [{"zoom": scene.near / point.pixel, **asdict(point)} for point in ladder.curve],
         "worst_db": min(point.psnr_db for point in ladder.curve),
         "mean_db": fmean(point.psnr_db for point in ladder.curve),
         "measured": TRUTH,
@@ -78,5 +78,5 @@ def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:
         "sha256": sha256(file),
         "seconds": level.report.seconds.get("total", 0.0),
         "holds": level.report.returned,
-        "psnr_db": {f"{point.pixel:.4g}": point.psnr_db for point in ladder.curve if point.level == number},
+        "psnr_db": {f"{ladder.scene.near / point.pixel:.4g}": point.psnr_db for point in ladder.curve if point.level == number},
     }

@@ -55,7 +55,7 @@ class DistanceRule:
         return (self.first * float(self.ratio ** (level - 1)) if level else 0.0), self.first * float(self.ratio**level)
 
     def middle(self, level: int) -> float:
-        """The size of a pixel that a level below 0 is merged for: the middle of its ends."""
+        """The size of a pixel that a level is merged for: the middle of its ends; of level 0, which has but one, as far before that."""
         return self.first * float(self.ratio ** (level - 0.5))
 
     def playcanvas(self, canvas: int) -> tuple[float, float]:

@@ -28,6 +28,10 @@ TRUTH = (
 )
 
 
+# The end of a level, as a part of the size of a pixel there: just before the next one is shown.
+WITHIN = 0.999
+
+
 @dataclass(frozen=True)
 class WalkPoint:
     """The quality at one place of the walks."""
@@ -65,12 +69,20 @@ class Walks:
     @torch.no_grad()
     def seen(self, view: Camera, size: float) -> Seen:
         """Where a pixel at what is nearest has this size, or where the walk from a view begins."""
-        depth = self._depth(view, self._scene)
-        way = max(0.0, size * focal_of(view) - depth)
+        depth, way = self._depth(view, self._scene), self._way(view, size)
         camera = backed(view, way)
         shown = self._mixture.splats(camera)
         truth, mixture, base = self._truth.make(camera, view), self._draw(shown, camera), self._draw(self._scene.splats, camera)
         return Seen((depth + way) / focal_of(view), way, truth, mixture, base, len(shown))
+
+    def places(self) -> list[float]:
+        """Where walks are looked at: sizes of a pixel at what is nearest, rising; 0, where they begin, then the middle and the end of each level, but
+        not where a walk has yet to begin: the first levels may end before, and it would be the same picture again."""
+        return [0.0, *(size for size in places(self._scene.rule) if any(self._way(view, size) for view in self.views))]
+
+    def _way(self, view: Camera, size: float) -> float:
+        """How far back, in world units, a pixel at what is nearest has this size; 0 where it has at least that as the walk begins."""
+        return max(0.0, size * focal_of(view) - self._depth(view, self._scene))
 
     @staticmethod
     def _depth(view: Camera, scene: Scene) -> float:
@@ -81,15 +93,14 @@ class Walks:
 
 
 def places(rule: DistanceRule) -> list[float]:
-    """Where walks are looked at: sizes of a pixel at what is nearest, rising; where they begin, and in the middle of each level and at its end."""
-    ends = [rule.ends(number)[1] for number in range(rule.count)]
-    return [0.0, *(size for end in ends for size in (end / rule.ratio**0.5, end * 0.999))]
+    """The middle and the end of each level: sizes of a pixel at what is nearest, rising."""
+    return [size for number in range(rule.count) for size in (rule.middle(number), rule.ends(number)[1] * WITHIN)]
 
 
 def measured(scene: Scene, levels: Sequence[SplatModel]) -> list[WalkPoint]:
-    """The quality at all `places`, in their order."""
+    """The quality at all places of the walks, in their order."""
     walks, points = Walks(scene, levels), []
-    for size in places(scene.rule):
+    for size in walks.places():
         rows = [_compared(walks.seen(view, size)) for view in walks.views]
         nearest, dbs, base_dbs, counts = (fmean(column) for column in zip(*rows, strict=True))
         points.append(WalkPoint(nearest, int(scene.rule.level(torch.tensor([nearest]))), dbs, base_dbs, counts))
