@@ -15,6 +15,7 @@ import torch
 
 from mipmap_plugin import cli, load_model, recipes, wrap_model
 from mipmap_plugin.adaptation.optimization.validation import Quality
+from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -29,8 +30,8 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import OutputExists, SceneError, SettingsError
 from mipmap_plugin.evaluation.tradeoff.points import on_backend
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.levels.contents import Contents
-from mipmap_plugin.levels.ladder import make_levels
+from mipmap_plugin.levels.contents import Contents, LeftOut, Level
+from mipmap_plugin.levels.ladder import MORE_SPLATS, NOT_BETTER, UNSHOWN, _no_use, _shown, make_levels
 from mipmap_plugin.levels.manifest import MANIFEST, write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
 from mipmap_plugin.levels.switching import most_even, switching_zoom, zooms_between
@@ -280,6 +281,47 @@ def test_levels_of_a_bound_are_made_again_for_narrower_bands():
     ladder = make_levels(wrapped(), request(coarsest=0.6, ratio=2.0, least_db=99.0))
     assert [level.band.scale for level in ladder.levels] == pytest.approx([1, (2 * FINEST_RATIO) ** -0.5])
     assert [level.band.scale for level in make_levels(wrapped(), request(coarsest=0.6, ratio=2.0)).levels] == pytest.approx([1, 0.6])
+
+
+def test_a_level_that_is_the_base_again_is_left_out(tmp_path, monkeypatch, capsys):
+    """The next one is made from the level before, whose splats are fewer or as many."""
+    base, starts = wrapped(), []
+    adapt = base.adapt
+
+    def adapted(scale, **options):
+        starts.append(options.get("start"))
+        made = adapt(scale, **options)
+        held = f"{AS_IT_IS}: 30.00 dB on validation views" if len(starts) == 2 else made.report.returned
+        return replace(made, report=made.report.model_copy(update={"returned": held}))
+
+    monkeypatch.setattr(base, "adapt", adapted)
+    ladder = make_levels(base, request(), resume=tmp_path / "state")
+    assert [level.band.scale for level in ladder.levels] == pytest.approx([1, 1 / 4]) and starts[2].scale == 1
+    assert [(left.scale, left.reason) for left in ladder.contents.left_out] == [(pytest.approx(1 / 2), NOT_BETTER)]
+    manifest = json.loads((ladder.save(tmp_path / "ladder") / MANIFEST).read_text())
+    assert len(manifest["left_out"]) == 1 and 0.24 < manifest["switches"][0]["zoom"] <= 1
+    assert [level["file"] for level in manifest["levels"]] == ["level_0.ply", "level_1.ply"] and not (tmp_path / "ladder/level_2.ply").exists()
+    print_summary(tmp_path, manifest)
+    assert f"no level of its own at x0.5, where a neighbor is shown: {NOT_BETTER}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("returned", "splats", "reason"),
+    [("merged splats", 9, None), ("merged splats", 10, None), ("step 3", 11, MORE_SPLATS), (f"{AS_IT_IS}: 30 dB", 9, NOT_BETTER)],
+)
+def test_a_coarser_level_has_no_more_splats_than_a_finer_one(returned, splats, reason):
+    level = SimpleNamespace(adapted=SimpleNamespace(report=SimpleNamespace(returned=returned)), splats=splats)
+    assert _no_use(level, SimpleNamespace(splats=10)) == reason
+
+
+def test_a_level_that_is_shown_at_no_zoom_is_left_out():
+    """Level 1 is worse than both neighbors, so that each of its switches lies at its own scale."""
+    levels = [Level(SimpleNamespace(number=number, model=tiny.model(3 - number)), Band(0.5**number, 0, 1, 2)) for number in range(3)]
+    dbs = [lambda zoom: 40 + 10 * math.log2(zoom), lambda _: 10, lambda zoom: 30 - 5 * math.log2(zoom / 0.25)]
+    yardstick = SimpleNamespace(psnr=lambda level, zoom: dbs[level.number](zoom), likeness=lambda *_: 30)
+    shown, switches, left_out = _shown(levels, yardstick)
+    assert shown == [levels[0], levels[2]] and len(switches) == 1 and 0.25 < switches[0].zoom < 1
+    assert left_out == [LeftOut(0.5, 2, UNSHOWN)]
 
 
 def test_a_ladder_ends_with_few_enough_splats():

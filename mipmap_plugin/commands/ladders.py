@@ -56,7 +56,7 @@ class Exports:
 
 def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
     """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once, but for
-    Streamed SOG of a ladder that comes out as a single level because that has few enough splats."""
+    Streamed SOG of a ladder that comes out as a single level, because that has few enough splats or no other is of use."""
     from mipmap_plugin import threads
     from mipmap_plugin.levels.ladder import make_levels
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
@@ -68,7 +68,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
         raise SettingsError(SINGLE_LEVEL)
     ladder = make_levels(wrapped, request, resume=state_path(output))
     if exports.streamed_sog and len(ladder.levels) == 1:
-        raise SettingsError(SINGLE_LEVEL)
+        raise SettingsError(f"{SINGLE_LEVEL}, or leave --streamed-sog out, which goes on from what is made")
     folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
     try:
         with threads.limited(wrapped.threads, shared=getattr(wrapped.backend()[0], "own_threads", False)):
@@ -96,6 +96,7 @@ def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path
     lines = _distances(folder, manifest) if manifest.get("by") == "distance" else _zooms(folder, manifest)
     if missed := _below(manifest):
         lines.append(f"  {', '.join(missed)}: below the {manifest['least_db']:g} dB that were asked for, in the narrowest band that is tried")
+    lines += _left_out(manifest)
     base = min(point["base_db"] for point in manifest["curve"])
     lines.append(f"  at worst {manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} on average; the base alone falls to {base:.1f} dB")
     lines.append(f"  {manifest['measured']}")
@@ -106,6 +107,14 @@ def _below(manifest: dict[str, Any]) -> list[str]:
     """The levels that are shown with fewer dB than were asked for, which a ladder by distance is not asked for."""
     least = manifest.get("least_db")
     return [] if least is None else [level["file"] for level in manifest["levels"] if min(level["psnr_db"].values(), default=least) < least]
+
+
+def _left_out(manifest: dict[str, Any]) -> list[str]:
+    """A line for each reason why levels are left out, which those of a ladder by distance are not."""
+    scales = dict[str, list[str]]()
+    for level in manifest.get("left_out", []):
+        scales.setdefault(level["reason"], []).append(f"x{level['scale']:.3g}")
+    return [f"  no level of its own at {', '.join(of)}, where a neighbor is shown: {reason}" for reason, of in scales.items()]
 
 
 def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:

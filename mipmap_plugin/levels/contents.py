@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mipmap_plugin.adaptation.adapted import Adapted
@@ -19,6 +20,15 @@ class Level:
     @property
     def splats(self) -> int:
         return len(self.adapted.model.parameters()["means"])
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A level that was made, but is not in the ladder: its neighbors are shown at its zooms."""
+
+    scale: float
+    splats: int
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -49,3 +59,4 @@ class Contents:
     levels: list[Level]
     switches: list[Switch]  # between a level and the next: falling zooms
     curve: list[CurvePoint]  # by falling zoom
+    left_out: Sequence[LeftOut] = ()  # by falling scale

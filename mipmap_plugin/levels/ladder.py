@@ -13,9 +13,10 @@ from pathlib import Path
 
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.levels.contents import Contents, CurvePoint, Level, Switch
+from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, Switch
 from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, make_levels_by_distance
 from mipmap_plugin.levels.manifest import write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, SAME, Band, LadderRequest
@@ -28,6 +29,11 @@ from mipmap_plugin.wrap import Wrapped
 
 # Two neighboring zooms of the curve of dB are at most this factor apart.
 CURVE_STEP = 2**0.25
+
+# Why a level is left out. The first may come after levels that are merged, which have fewer splats than the base.
+NOT_BETTER = "adapting gave nothing better than the base as it is"
+MORE_SPLATS = "more splats than the finer level has"
+UNSHOWN = "at every zoom a neighbor is as good"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,15 +83,13 @@ def _make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | Non
     with announced("rendering the base"):
         yardstick = Yardstick(base, request.seed)
     work = _Work(base, request, store, yardstick)
-    levels, ratio = [work.first(band)], band.ratio
-    while not work.ends(levels[-1]):
-        level, ratio = work.next(levels, ratio)
-        levels.append(level)
+    made, unused, lowest = work.levels(band)
     with announced("measuring the levels"):
-        switches = _switches(levels, yardstick)
-        edges = [1.0, *(switch.zoom for switch in switches), max(request.coarsest, levels[-1].band.low)]
+        levels, switches, unshown = _shown(made, yardstick)
+        edges = [1.0, *(switch.zoom for switch in switches), max(request.coarsest, lowest)]
         curve = _curve(levels, edges, yardstick, lambda zoom: yardstick.psnr_of_base(base, request.viewer, zoom))
-    return Ladder(Contents(request, base, levels, switches, curve), store)
+    left_out = sorted([*unused, *unshown], key=lambda level: -level.scale)
+    return Ladder(Contents(request, base, levels, switches, curve, left_out), store)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,23 +106,35 @@ class _Work:
         as_it_is = self.base.target(self.request.viewer) == self.base.effects()
         return self._made("level_0", band, {} if as_it_is else band.settings())
 
-    def next(self, levels: Sequence[Level], ratio: float) -> tuple[Level, float]:
-        """The level below the last one, and the ratio of its band; a level that is not good enough is made again for a narrower band."""
-        last = levels[-1]
-        start, ratio = FinerLevel(last.adapted.model, last.band.scale), self.request.next_ratio(last.band.low, ratio)
+    def levels(self, band: Band) -> tuple[list[Level], list[LeftOut], float]:
+        """The levels, those that are left out because they are no use as coarser ones, and the zoom down to which there was one made."""
+        levels, left_out, ratio = [self.first(band)], list[LeftOut](), band.ratio
+        while not self._ends(levels[-1], band):
+            level, ratio = self._next(levels[-1], band, len(levels) + len(left_out), ratio)
+            band, reason = level.band, _no_use(level, levels[-1])
+            if reason is None:
+                levels.append(level)
+            else:
+                left_out.append(LeftOut(band.scale, level.splats, reason))
+        return levels, left_out, band.low
+
+    def _next(self, finer: Level, above: Band, number: int, ratio: float) -> tuple[Level, float]:
+        """The level for the band below `above`, made from the finer one, and its ratio; one that is not good enough is made again for a narrower
+        band."""
+        start, ratio = FinerLevel(finer.adapted.model, finer.band.scale), self.request.next_ratio(above.low, ratio)
         while True:
-            band = last.band.next(ratio, self.request.coarsest)
+            band = above.next(ratio, self.request.coarsest)
             settings = band.settings() | {"start": start, **self.request.steps(band.scale)}
-            level = self._made(f"level_{len(levels)}_x{band.scale:.6g}", band, settings)
+            level = self._made(f"level_{number}_x{band.scale:.6g}", band, settings)
             narrower = ratio**0.5
             if self._suffices(level) or narrower * SAME < FINEST_RATIO:
                 return level, ratio
             ratio = narrower
 
-    def ends(self, last: Level) -> bool:
-        """Whether the ladder needs no further level."""
-        few = self.request.until_splats is not None and last.splats <= self.request.until_splats
-        return few or last.band.reaches(self.request.coarsest)
+    def _ends(self, coarsest: Level, last: Band) -> bool:
+        """Whether the ladder needs no level below its coarsest one, after the band that was the last to be adapted to."""
+        few = self.request.until_splats is not None and coarsest.splats <= self.request.until_splats
+        return few or last.reaches(self.request.coarsest)
 
     def _made(self, name: str, band: Band, settings: dict[str, object]) -> Level:
         request = self.request
@@ -133,6 +149,26 @@ class _Work:
         """Whether a level is as good as requested at the ends of its band."""
         least = self.request.least_db
         return least is None or min(self.yardstick.psnr(level.adapted, zoom) for zoom in (level.band.low, level.band.high)) >= least
+
+
+def _no_use(level: Level, finer: Level) -> str | None:
+    """Why a level is no use below a finer one, whose splats cost a viewer no more; None if it is."""
+    if level.adapted.report.returned.startswith(AS_IT_IS):
+        return NOT_BETTER
+    return MORE_SPLATS if level.splats > finer.splats else None
+
+
+def _shown(levels: list[Level], yardstick: Yardstick) -> tuple[list[Level], list[Switch], list[LeftOut]]:
+    """The levels that are shown at some zoom, the switches between them, and what is left out because its two switches are one."""
+    left_out = list[LeftOut]()
+    while True:
+        switches = _switches(levels, yardstick)
+        number = next((number for number, (to, start) in enumerate(pairwise(switches), 1) if to.zoom <= start.zoom * SAME), None)
+        if number is None:
+            return levels, switches, left_out
+        unshown = levels[number]
+        left_out.append(LeftOut(unshown.band.scale, unshown.splats, UNSHOWN))
+        levels = [level for level in levels if level is not unshown]
 
 
 def _switches(levels: Sequence[Level], yardstick: Yardstick) -> list[Switch]:

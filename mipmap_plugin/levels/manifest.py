@@ -59,6 +59,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
         "base": first.base,
         "base_pixel": base_pixel(ladder.base),
         "levels": [_entry(ladder, number, file) for number, file in enumerate(files)],
+        "left_out": [asdict(level) for level in ladder.left_out],
         "switches": [asdict(switch) for switch in ladder.switches],
         "curve": [asdict(point) for point in ladder.curve],
         "worst_db": min(point.psnr_db for point in ladder.curve),
