@@ -350,6 +350,13 @@ def test_a_saved_ladder_says_what_it_is(tmp_path):
         write_ladder(Contents(request(), base, [], [], []), saved, overwrite=True)
 
 
+def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):
+    base = tiny.ply(tmp_path / "base.ply", degree=0)
+    ladder = wrap_model(base, cameras=tiny.cameras(2, width=16, height=12), backend="reference").levels("classic", coarsest=1.0)
+    base.unlink()
+    assert (ladder.save(tmp_path / "ladder") / MANIFEST).is_file()
+
+
 def test_a_folder_that_is_no_ladder_is_never_replaced(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base")
     (tmp_path / "photos").mkdir()

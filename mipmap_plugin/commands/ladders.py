@@ -59,14 +59,15 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     Streamed SOG of a ladder that comes out as a single level, because that has few enough splats or no other is of use."""
     from mipmap_plugin import threads
     from mipmap_plugin.levels.ladder import make_levels
-    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
+    from mipmap_plugin.levels.manifest import level_name, read_manifest, refuse_ladder
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
     from mipmap_plugin.wrap import state_path
 
-    refuse_ladder(output, wrapped, overwrite=overwrite)
+    unfinished = state_path(output)
+    refuse_ladder(output, wrapped, overwrite=overwrite, twice=not (unfinished / level_name(0)).exists())
     if exports.streamed_sog and _is_single(wrapped, request):
         raise SettingsError(SINGLE_LEVEL)
-    ladder = make_levels(wrapped, request, resume=state_path(output))
+    ladder = make_levels(wrapped, request, resume=unfinished)
     if exports.streamed_sog and len(ladder.levels) == 1:
         raise SettingsError(f"{SINGLE_LEVEL}, or leave --streamed-sog out, which goes on from what is made")
     folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer

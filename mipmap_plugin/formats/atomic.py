@@ -128,8 +128,9 @@ def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_
         raise OutputExists(f"{path} exists already; pass --overwrite (overwrite=True) to replace it, or choose another path")
 
 
-def refuse_unwritable(path: Path, room: int = 0) -> None:
-    """Raise OutputError if `path` could not be written: no permission, a read-only disk, fewer than `room` bytes free."""
+def refuse_unwritable(path: Path, room: int = 0, *, twice: bool = False) -> None:
+    """Raise OutputError if `path` could not be written: no permission, a read-only disk, fewer than `room` bytes free, which the base takes; fewer
+    than twice as many with `twice`, for work that keeps a copy beside `path` until it is done."""
     with _as_output_error(path):
         place = absolute(path)
         if place.parent.is_dir():
@@ -140,8 +141,8 @@ def refuse_unwritable(path: Path, room: int = 0) -> None:
         if not os.access(there, os.W_OK | os.X_OK):
             raise OSError(errno.EACCES, f"no permission to write to {there}")
         free = shutil.disk_usage(there).free
-    if free < room:
-        reason = f"its disk has {free:,} bytes free, and the base takes {room:,}"
+    if free < room * (1 + twice):
+        reason = f"its disk has {free:,} bytes free, and the base takes {room:,}{', twice until all is done' if twice else ''}"
         raise OutputError(f"{path} cannot be written: {reason}; free some, or choose another disk")
 
 

@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import Any
 
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
-from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, sha256, write_json
+from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.yardstick import TRUTH
@@ -27,11 +27,16 @@ def level_name(number: int) -> str:
     return f"level_{number}.ply"
 
 
-def refuse_ladder(folder: Path, base: Wrapped, *, overwrite: bool) -> None:
-    """Raise what writing a ladder to `folder` would raise. A folder with other things in it is never replaced. Raises OutputExists, OutputError."""
+def refuse_ladder(folder: Path, base: Wrapped, *, overwrite: bool, twice: bool = False) -> None:
+    """Raise what writing a ladder to `folder` would raise. A folder with other things in it is never replaced. Raises OutputExists, OutputError.
+
+    The disk needs room for level 0, which is as large as the base. `twice`: and for the unfinished ladder's.
+    """
     source = base.model.source
     refuse_output(folder, overwrite, [] if source is None else [source])
     refuse_to_lose(folder, base.model.folder, MANIFEST, WRITTEN)
+    room = source.stat().st_size if source is not None and source.is_file() else 0  # it may be gone when the levels are finished
+    refuse_unwritable(folder, room, twice=twice)
 
 
 def write_ladder(ladder: Contents, folder: Path, overwrite: bool) -> Path:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.errors import CheckpointError, SettingsError
-from mipmap_plugin.formats.atomic import new_file, refuse_output, sha256, write_json
+from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.jobs.job import Job
@@ -28,8 +28,8 @@ FORMAT = 3
 
 
 def refuse(job: Job, tiles: int) -> None:
-    """Raise SettingsError for what cannot be done in tiles."""
-    find_splats(job.base.checkpoint)
+    """Raise SettingsError for what cannot be done in tiles, OutputExists and OutputError for a target that cannot be written."""
+    base = find_splats(job.base.checkpoint)[0].path
     config = job.config()
     if tiles < 2:
         raise SettingsError(f"tiles: give at least 2, got {tiles}; a scene that is not cut needs no tiles")
@@ -43,7 +43,8 @@ def refuse(job: Job, tiles: int) -> None:
         raise SettingsError(f"tiles are adapted for one viewer at a time, and {job.viewer} stands for several; give one of them")
     if is_written(job.target):
         raise SettingsError(f"{job.target}: tiles are joined to a .ply or a model folder; give one of these, and convert it afterwards")
-    refuse_output(job.target, job.overwrite, parts_of(find_splats(job.base.checkpoint)[0].path, None))
+    refuse_output(job.target, job.overwrite, parts_of(base, None))
+    refuse_unwritable(job.target, base.stat().st_size, twice=not (work_folder(job.target) / CUT).exists())
 
 
 def claim(jobs: Sequence[Job], tiles: int) -> None:

@@ -127,6 +127,28 @@ def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, monk
     assert "its disk has 10 bytes free, and the base takes" in refused("adapt", base, *words, tmp_path / "new.ply")
 
 
+def test_a_disk_without_room_for_levels_or_tiles_is_noticed_before_any_work(tmp_path, refused, monkeypatch):
+    """Both keep a copy until all is done; what goes on has made that one already."""
+    base = tiny.folder(tmp_path / "base")
+    size = next(base.rglob("*.ply")).stat().st_size
+    free = [size * 2 - 1]
+    monkeypatch.setattr(files.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 0, free[0]))
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
+    monkeypatch.setattr("mipmap_plugin.tiles.plan.make_cut", lambda *_: pytest.fail("worked in vain"))
+    ladder = ["levels", base, "--viewer", "classic", "--by", "zoom", "--output", tmp_path / "ladder"]
+    tiled = ["adapt", base, "--scale", "1/2", "--tiles", "2", "--output", tmp_path / "new.ply"]
+    for words in (ladder, tiled):
+        assert f"its disk has {free[0]:,} bytes free, and the base takes {size:,}, twice until all is done" in refused(*words)
+    assert [file.name for file in tmp_path.iterdir()] == ["base"]
+    for made in ("ladder.resume/level_0.ply", "new.ply.tiles/cut.pt"):
+        (tmp_path / made).parent.mkdir()
+        (tmp_path / made).touch()
+    assert "unfinished ladders are kept there" in refused(*ladder) and "holds other things" in refused(*tiled)
+    free[0] = size - 1
+    for words in (ladder, tiled):
+        assert refused(*words).endswith(f"and the base takes {size:,}; free some, or choose another disk\n")
+
+
 def test_a_format_that_nothing_here_writes_is_refused_before_any_work(tmp_path, refused, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", lambda *_, **__: pytest.fail("worked in vain"))
     monkeypatch.setenv("PATH", "")
