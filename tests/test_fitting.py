@@ -8,8 +8,11 @@ import tiny
 
 from mipmap_plugin import cli, load_model
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.levels.fitting import HEADER, fitting_scale, read_size, splats_within
+from mipmap_plugin.levels.fitting import UNKNOWN, fitting_scale, read_size, splats_within
 from mipmap_plugin.recipes import recipe, scale_of_fraction
+
+# Bytes of a splat with SH of degree 1, in float32: a mean and a normal, 4 coefficients of 3 colors, an opacity, scales and a quaternion.
+ROW = 4 * (3 + 3 + 12 + 1 + 3 + 4)
 
 
 @pytest.mark.parametrize(("text", "size"), [("20MB", 20_000_000), ("1.5 GB", 1_500_000_000), ("64kib", 65_536), ("4000", 4000)])
@@ -37,13 +40,22 @@ def test_as_many_splats_as_the_base_has_suit_its_own_scale():
 
 
 def test_as_many_splats_as_fit_into_a_file_do_fit(tmp_path):
-    model, size = tiny.model(500), 40_000
-    most = splats_within(model, size, "file.ply")
-    saved = tiny.model(most).save(tmp_path / "file.ply", provenance={"settings": "x" * (HEADER - 2000)})
-    assert saved.stat().st_size <= size < saved.stat().st_size * 500 / most
-    assert splats_within(model, 10**9, "file.ply") == 500
+    model, size, record = tiny.model(500), 40_000, {"settings": "x" * 3000}
+    most = splats_within(model, size, "file.ply", record)
+    for name in ("file.ply", "folder"):
+        saved = tiny.model(most).save(tmp_path / name, provenance=record)
+        assert size - UNKNOWN - ROW <= saved.stat().st_size <= size - UNKNOWN and splats_within(model, size, name, record) == most
+    assert splats_within(model, 10**9, "file.ply", {}) == 500
     with pytest.raises(SettingsError, match="hold no splat"):
-        splats_within(model, HEADER, "file.ply")
+        splats_within(model, 3000, "file.ply", record)
+
+
+@pytest.mark.parametrize("options", [[], ["--viewer", "spark"], ["--scale", "1/3"], ["--viewer", "portable", "--recipe", "thorough"]])
+def test_a_file_is_as_large_as_it_may_be_and_no_larger(tmp_path, options):
+    base, output, size = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "small.ply", 6_000
+    words = ["adapt", str(base), "--bytes", str(size), "--output", str(output), "--steps", "1", "--views", "given", "--backend", "reference"]
+    assert cli.main([*words, *options]) == 0
+    assert size - UNKNOWN - 2 * ROW <= output.stat().st_size <= size
 
 
 def test_a_file_of_fewer_splats_at_the_bases_own_scale_is_optimized():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -61,8 +61,12 @@ class Report(BaseModel):
 
     def provenance(self) -> dict[str, Any]:
         """Return what the file's header records: viewer, base, scale, inputs, settings, versions. Nothing in it depends on the clock."""
-        made_from = {"scale": self.scale, "viewer": self.viewer, "base": self.base, "inputs": self.inputs}
-        return made_from | {"settings": self.settings.model_dump(), "versions": self.versions}
+        return provenance({"scale": self.scale, "viewer": self.viewer, "base": self.base, "inputs": self.inputs}, self.settings, self.versions)
+
+
+def provenance(made_from: Mapping[str, Any], settings: AdaptConfig, versions: Mapping[str, str]) -> dict[str, Any]:
+    """What a file's header records. `made_from`: its scale, viewer, base and inputs."""
+    return {**made_from, "settings": settings.model_dump(), "versions": dict(versions)}
 
 
 class PeakMemory:

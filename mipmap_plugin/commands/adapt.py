@@ -100,12 +100,12 @@ def adapt(
         return adapt_many(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
     [checkpoint] = checkpoints
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
-    size, fitting = _fitting(wrapped.model, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False))
-    requests = _requests(scale or fitting, viewer)
+    most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)
+    settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
     targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]
-    _check(wrapped, requests, targets, settings | size, overwrite)
+    _check(wrapped, requests, targets, settings, overwrite)
     page = AdaptationPage(checkpoint, targets, overwrite) if report else None
-    models = _adapted(wrapped, requests, targets, settings | size | dict(images=images and scene(images)))
+    models = _adapted(wrapped, requests, targets, settings | dict(images=images and scene(images)))
     _save_all(wrapped, models, page, overwrite, json)
 
 
@@ -172,17 +172,26 @@ def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[f
     return [(scale, name) for scale in unique_scales(scales) for name in names]
 
 
-def _fitting(model: SplatModel, splats: int | None, size: str | None, output: Path) -> tuple[dict[str, int], Sequence[float]]:
-    """The setting for the smaller of a number of splats and of what fits into a size, and the scale that suits it; nothing if neither is given."""
-    if splats is None and size is None:
-        return {}, ()
-    from mipmap_plugin.levels.fitting import fitting_scale, read_size, splats_within
-
+def _most(
+    base: Wrapped, splats: int | None, size: str | None, output: Path, asked: tuple[Sequence[float], tuple[str, ...]], settings: dict[str, Any]
+) -> int | None:
+    """The smaller of a number of splats and of what fits into a size; None if neither is given. `asked`: scales and viewers."""
     if splats is not None and splats < 1:
         raise SettingsError(f"splats: must be at least 1, got {splats}")
-    within = [] if size is None else [splats_within(model, read_size(size), output.name)]
-    most = min([*within, *([] if splats is None else [splats])])
-    return {"most_splats": most}, (fitting_scale(most, model),)
+    if size is None:
+        return splats
+    from mipmap_plugin.levels.fitting import ANY_SCALE, read_size, recorded, splats_within
+
+    most, (scales, viewers) = read_size(size), asked
+    within = splats_within(base.model, most, output.name, recorded(base, _requests(scales or [ANY_SCALE], viewers), settings))
+    return within if splats is None else min(within, splats)
+
+
+def _fitting(model: SplatModel, most: int | None) -> Sequence[float]:
+    """The scale that suits so many splats; none if there is no limit to them."""
+    from mipmap_plugin.levels.fitting import fitting_scale
+
+    return () if most is None else (fitting_scale(most, model),)
 
 
 def _made_for(report: Report, model: SplatModel) -> str:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from mipmap_plugin.adaptation.report import provenance, versions
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
-from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.recipes import scale_of_fraction
+from mipmap_plugin.models.base import SplatModel, digest_of_parameters
+from mipmap_plugin.recipes import recipe, scale_of_fraction
+from mipmap_plugin.wrap import Wrapped
 
 UNITS = {"": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
 SIZE = re.compile(r"([0-9.]+)\s*([a-z]*)", re.IGNORECASE)
@@ -17,8 +23,15 @@ SIZE = re.compile(r"([0-9.]+)\s*([a-z]*)", re.IGNORECASE)
 # Compressed files have a few percent more bytes per splat where splats are fewer.
 COMPRESSED_MARGIN = 0.9
 
-# Bytes kept for a PLY's header with its provenance, which does not grow with the splats.
-HEADER = 8192
+# Bytes that a PLY's header may have beyond what is known of it before the run: digits of the scale and of settings that follow from it, the hash of
+# photographs, the tag of the viewer's filter. All together they have 160 at most, and a splat has 68 to 248.
+UNKNOWN = 256
+
+# Bytes kept for what a file of another project has besides its splats: a torch archive's own, and comments.
+ARCHIVE = 8192
+
+# A scale of as many digits as any, for settings that follow from a scale that is not chosen yet.
+ANY_SCALE = 1 / 3
 
 ENDINGS = (*WRITTEN, ".ply")
 
@@ -35,16 +48,36 @@ def read_size(text: str) -> int:
     return size
 
 
-def splats_within(model: SplatModel, size: int, name: str) -> int:
+def recorded(base: Wrapped, requests: Sequence[tuple[float, str | None]], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What the header of an adapted file will record, as far as it is known before the run; of several files, the longest.
+
+    `requests`: scales and viewers, at least one. `settings`: those of `Wrapped.adapt`, with the recipe's name. Raises SettingsError for one that is
+    unknown or out of range.
+    """
+    further = {**settings, "most_splats": len(base.model.parameters()["means"])}
+    name, digest = further.pop("recipe"), base.model.digest or digest_of_parameters(base.model)
+    records = [
+        provenance({"scale": scale, "viewer": viewer, "base": digest, "inputs": base.asked}, recipe(name, scale, **further), versions())
+        for scale, viewer in requests
+    ]
+    return max(records, key=lambda record: len(json.dumps(record, default=str)))
+
+
+def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any]) -> int:
     """How many splats of the model fit into `size` bytes of a file of that name, judged by the model's own splats in that format.
 
-    A model folder counts as the file of its splats. Raises SettingsError if not one splat fits, and what saving raises.
+    `record`: what its header will record, as far as it is known. A model folder counts as the file of its splats. Raises SettingsError if not
+    one splat fits, and what saving raises.
     """
     count = len(model.parameters()["means"])
     ending = next((each for each in ENDINGS if name.lower().endswith(each)), "")
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
-        own = model.save(Path(folder, f"all{ending}"), provenance={}).stat().st_size
-    fitting = int((COMPRESSED_MARGIN * size if ending in WRITTEN else size - HEADER) * count / own)
+        own = model.save(Path(folder, f"all{ending}"), provenance=record)
+        besides, all_of_them = read_header(own).body if own.suffix == ".ply" else 0, own.stat().st_size
+    if own.suffix == ".ply":
+        fitting = (size - besides - UNKNOWN) * count // (all_of_them - besides)
+    else:
+        fitting = int((COMPRESSED_MARGIN * size if ending in WRITTEN else size - ARCHIVE) * count / all_of_them)
     if fitting < 1:
         raise SettingsError(f"bytes: {size:,} bytes hold no splat of this checkpoint and a header; allow more")
     return min(count, fitting)
