@@ -389,6 +389,22 @@ def test_an_interrupted_ladder_goes_on_with_what_is_ready(tmp_path, monkeypatch)
         assert file.read_bytes() == (again / file.name).read_bytes()
 
 
+def test_an_interrupted_command_says_that_finished_levels_are_kept(tmp_path, monkeypatch, capsys):
+    base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
+    words = ["levels", str(base), "--viewer", "antialiased", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2", "--recipe", "instant"]
+    words += ["--views", "given", "--backend", "reference"]
+
+    def ends(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as first:
+        first.setattr("mipmap_plugin.levels.ladder._curve", ends)
+        assert cli.main(words) == 130
+        assert f"go on with the levels that {tmp_path / 'ladder.resume'} keeps" in capsys.readouterr().err
+    monkeypatch.setattr("mipmap_plugin.wrapped.Wrapped.adapt", None)
+    assert cli.main(words) == 0
+
+
 def interrupt():
     raise Interrupted("Ctrl-C")
 

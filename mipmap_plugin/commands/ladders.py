@@ -16,7 +16,9 @@ from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
     from mipmap_plugin.levels.contents import Contents as ZoomContents
+    from mipmap_plugin.levels.distance.ladder import DistanceLadder
     from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
+    from mipmap_plugin.levels.ladder import Ladder
     from mipmap_plugin.levels.request import LadderRequest
     from mipmap_plugin.wrapped import Wrapped
 
@@ -58,7 +60,6 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once, but for
     Streamed SOG of a ladder that comes out as a single level, because that has few enough splats or no other is of use."""
     from mipmap_plugin import threads
-    from mipmap_plugin.levels.ladder import make_levels
     from mipmap_plugin.levels.manifest import level_name, read_manifest, refuse_ladder
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
     from mipmap_plugin.wrap import state_path
@@ -67,7 +68,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     refuse_ladder(output, wrapped, overwrite=overwrite, twice=not (unfinished / level_name(0)).exists())
     if exports.streamed_sog and _is_single(wrapped, request):
         raise SettingsError(SINGLE_LEVEL)
-    ladder = make_levels(wrapped, request, resume=unfinished)
+    ladder = _made(wrapped, request, unfinished)
     if exports.streamed_sog and len(ladder.levels) == 1:
         raise SettingsError(f"{SINGLE_LEVEL}, or leave --streamed-sog out, which goes on from what is made")
     folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
@@ -79,6 +80,18 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
         raise type(error)(f"{str(error) or 'interrupted'}; {again}") from error
     ladder.forget()
     return read_manifest(folder), files
+
+
+def _made(wrapped: Wrapped, request: LadderRequest, unfinished: Path) -> Ladder | DistanceLadder:
+    """The ladder, whose levels `unfinished` keeps as they are made. Raises what `make_levels` raises; an interruption says that levels are kept."""
+    from mipmap_plugin.levels.ladder import make_levels
+
+    try:
+        return make_levels(wrapped, request, resume=unfinished)
+    except KeyboardInterrupt as interrupt:
+        if str(interrupt) or not any(unfinished.glob("level_*.ply")):  # within a level's steps it says more
+            raise
+        raise KeyboardInterrupt(f"interrupted; run the same command again to go on with the levels that {unfinished} keeps") from interrupt
 
 
 def _is_single(wrapped: Wrapped, request: LadderRequest) -> bool:
