@@ -32,7 +32,7 @@ from mipmap_plugin.evaluation.tradeoff.points import on_backend
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.contents import Contents, LeftOut, Level
 from mipmap_plugin.levels.ladder import MORE_SPLATS, NOT_BETTER, UNSHOWN, _no_use, _shown, make_levels
-from mipmap_plugin.levels.manifest import MANIFEST, write_ladder
+from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
 from mipmap_plugin.levels.switching import most_even, switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
@@ -348,6 +348,17 @@ def test_a_saved_ladder_says_what_it_is(tmp_path):
     (saved / "notes.txt").write_text("mine")
     with pytest.raises(OutputExists, match=r"has other things in it, such as notes.txt"):
         write_ladder(Contents(request(), base, [], [], []), saved, overwrite=True)
+
+
+def test_splats_in_no_picture_have_no_part_in_the_size_of_a_pixel():
+    """More than half of all lie right behind the camera, whose distances would follow from them."""
+    views, ball = tiny.cameras(1), tiny.gaussians(50)
+    behind = tiny.gaussians(60, spread=1e-4, seed=2)
+    eye = views[0].center.float()
+    hidden = replace(behind, means=behind.means + eye + 0.2 * eye / eye.norm())
+    both = Gaussians(*(torch.cat(pair) for pair in zip(_columns(ball), _columns(hidden), strict=True)))
+    sizes = [base_pixel(wrap_model(VanillaModel.from_gaussians(each), cameras=views, backend="reference")) for each in (ball, both, hidden)]
+    assert sizes[0] == sizes[1] and 0 < sizes[2] < sizes[0] / 5
 
 
 def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):

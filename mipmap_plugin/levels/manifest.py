@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.start.closed_form import pixel_size, seen_pixel_size
 from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.contents import Contents
@@ -75,8 +75,10 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
 
 
 def base_pixel(base: Wrapped) -> float:
-    """The size in world units of a pixel of the base at its median splat, in the closest view."""
-    return float(pixel_size(base.model.parameters()["means"].detach(), base.views()).median())
+    """The size in world units of a pixel of the base at its median splat of those in a picture, in the closest view; of all, if none is."""
+    means, views = base.model.parameters()["means"].detach(), base.views()
+    seen = seen_pixel_size(means, views, base.effects().near_plane)
+    return float((seen if len(seen) else pixel_size(means, views)).median())
 
 
 def _entry(ladder: Contents, number: int, file: Path) -> dict[str, Any]:
