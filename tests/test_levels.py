@@ -416,6 +416,14 @@ def test_an_interrupted_command_says_that_finished_levels_are_kept(tmp_path, mon
     assert cli.main(words) == 0
 
 
+@pytest.mark.parametrize("has_cameras", [True, False])
+def test_levels_of_generated_views_are_said_to_be(tmp_path, capsys, has_cameras):
+    base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)) if has_cameras else tiny.ply(tmp_path / "base.ply")
+    words = ["levels", str(base), "--viewer", "classic", "--output", str(tmp_path / "ladder"), "--coarsest", "1"]
+    assert cli.main([*words, "--backend", "cpu", "--threads", "1"]) == 0
+    assert ("no cameras are beside the checkpoint" in capsys.readouterr().err) is not has_cameras
+
+
 def interrupt():
     raise Interrupted("Ctrl-C")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     from mipmap_plugin.levels.ladder import Ladder
     from mipmap_plugin.levels.request import LadderRequest
     from mipmap_plugin.wrapped import Wrapped
+
+
+# An orbit has pixels of its own size, so that a viewer would change levels at other distances: of lego_100 at an eleventh of them.
+NO_CAMERAS = "no cameras are beside the checkpoint: levels and their distances are made for views of a generated orbit; give the scene's --cameras"
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,8 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     refuse_ladder(output, wrapped, overwrite=overwrite, twice=not (unfinished / level_name(0)).exists())
     if exports.streamed_sog and _is_single(wrapped, request):
         raise SettingsError(SINGLE_LEVEL)
+    if not wrapped.cameras:
+        warnings.warn(NO_CAMERAS, stacklevel=2)
     ladder = _made(wrapped, request, unfinished)
     if exports.streamed_sog and len(ladder.levels) == 1:
         raise SettingsError(f"{SINGLE_LEVEL}, or leave --streamed-sog out, which goes on from what is made")
