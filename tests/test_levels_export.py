@@ -201,6 +201,16 @@ def test_streamed_sog_of_one_level_is_refused_before_any_work(tmp_path, tool, ca
     assert "a single level" in capsys.readouterr().err and not (tmp_path / "ladder").exists()
 
 
+def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not_stream_it(tmp_path, tool, capsys, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.levels.ladder._no_use", lambda *_: "no better")
+    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
+    words += ["--by", "zoom", "--recipe", "instant", "--views", "given", "--backend", "reference"]
+    assert cli.main([*words, "--streamed-sog"]) == 2
+    assert "leave --streamed-sog out, which goes on from what is made" in capsys.readouterr().err and not (tmp_path / "ladder").exists()
+    monkeypatch.setattr("mipmap_plugin.wrapped.Wrapped.adapt", None)
+    assert cli.main(words) == 0 and (tmp_path / "ladder" / "level_0.ply").is_file()
+
+
 @pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt, 130), (lambda: OutputError("the disk is full"), 2)], ids=["Ctrl-C", "error"])
 def test_an_export_that_ends_early_loses_no_level(tmp_path, tool, capsys, monkeypatch, error, code):
     words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
