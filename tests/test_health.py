@@ -9,6 +9,7 @@ from ply_files import splat_columns, write
 
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.health import drop, examine
+from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 
 FIELDS = {"means": "x", "scales": "scale_1", "quats": "rot_2", "opacities": "opacity", "sh0": "f_dc_1", "shN": "f_rest_7"}
@@ -122,3 +123,26 @@ def test_a_checkpoint_of_which_nothing_is_drawn_is_spoilt():
     faint = healthy()
     faint.parameters()["opacities"][:] = -20
     assert examine(faint).spoilt() and not examine(spoiled("opacities", 0, -20.0)).spoilt()
+
+
+def far_away(kind: type) -> dict[str, np.ndarray]:
+    """A scene of some units in UTM coordinates, and splats of a hundredth of it."""
+    columns = splat_columns(200)
+    places = {axis: columns[axis].astype(np.float64) + offset for axis, offset in zip("xyz", (5e5, 5.5e6, 100.0), strict=True)}
+    return {**columns, **{axis: place.astype(kind) for axis, place in places.items()}, **{f"scale_{i}": columns[f"scale_{i}"] - 4 for i in range(3)}}
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_places_that_float32_does_not_hold_are_told_of_once(tmp_path, kind):
+    with pytest.warns(UserWarning, match=r"200 of 200 splats lie so far .* steps of 0.5 units") as caught:
+        model = load_vanilla(write(tmp_path / "utm.ply", far_away(kind)))
+    assert len(caught) == 1 and examine(model).spoilt() and examine(model).sentences() == model.notes
+    assert adopt(model) is model  # nor told of again
+
+
+def test_places_that_float32_holds_well_enough_are_not_told_of():
+    near, points = healthy(), spoiled("scales", slice(None), -20.0)
+    near.parameters()["means"].add_(1000)
+    assert examine(near).rounded == examine(points).rounded == 0  # nor is the place of a point rounded, in an image of all
+    stray = examine(spoiled("means", 0, 1e9))
+    assert stray.rounded == 1 and not stray.coarse()  # floaters lie anywhere

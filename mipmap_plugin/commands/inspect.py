@@ -51,7 +51,7 @@ def inspect(
         print_facts(facts, json)  # before pictures are drawn, which takes longer
     with announced("drawing as viewers do"):
         differences = _differences(wrapped) if viewers else "not requested"
-    last = {"viewers": differences, "notes": model.notes}
+    last = {"viewers": differences, "notes": [note for note in model.notes if note not in facts["health"]]}
     print_facts(known | facts | last if json else last, json)
 
 

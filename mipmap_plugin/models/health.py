@@ -11,9 +11,11 @@ from typing import Protocol, TypeVar
 import torch
 from torch import Tensor
 
+from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.models.base import SplatModel
 
 Model = TypeVar("Model", bound="HasRows")
+Read = TypeVar("Read", bound="IsRead")
 
 
 class HasRows(Protocol):
@@ -23,6 +25,13 @@ class HasRows(Protocol):
 
     def keep_rows(self: Model, keep: Tensor) -> Model:
         """A new model of the rows where `keep` [N] is True."""
+
+
+class IsRead(HasRows, SplatModel, Protocol):
+    """A model of splats that is checked when it is read."""
+
+    def noted(self: Read, note: str) -> Read:
+        """The same model with one more note."""
 
 
 # Below one 8-bit step no 3DGS rasterizer draws a splat (diff-gaussian-rasterization, forward.cu).
@@ -39,6 +48,10 @@ LARGEST = 1e12
 
 # Rows that are examined together, so that there is no second copy of all.
 CHUNK = 1 << 17
+
+# Steps of float32 at a splat's place, as a fraction of its longest standard deviation, above which rounding moves it visibly; and the fraction of
+# such splats that is worth a word: floaters lie anywhere.
+COARSE_STEP, COARSE_SHARE = 0.5, 0.1
 
 # The word in notes on rows that are left out.
 DROPPED = "dropped"
@@ -59,6 +72,8 @@ class Health:
     huge: int  # longest axis above `extent`: one standard deviation covers the whole scene
     tiny: int  # shortest axis below TINY_SHARE · extent
     invisible: int  # opacity below MIN_VISIBLE
+    rounded: int  # steps between the numbers that hold its place are above COARSE_STEP of its size, and seen in an image of the whole scene
+    step: float  # world units: the median of these steps, of the `rounded` splats; 0 without any
     scales_look_linear: bool  # stored scales should be log lengths, but all are positive and most below 1, as lengths are
     opacities_look_activated: bool  # stored opacities should be logits, but all lie within 0..1, as opacities do
     invalid: Tensor  # [N] bool: not finite or above LARGEST once activated; one such row may turn a whole image or gradient into NaN
@@ -73,6 +88,7 @@ class Health:
             (self.invisible, "have an opacity below 1/255 and are never drawn"),
         ]
         remarks = [*self.non_finite(), *(f"{count:,} of {self.splats:,} splats {what}" for count, what in counts if count)]
+        remarks += [sentence] if (sentence := self.coarse()) else []
         if self.scales_look_linear:
             remarks.append("the scales look like lengths, not like their logarithms; if the image is a fog, export the file again with log scales")
         if self.opacities_look_activated:
@@ -80,8 +96,17 @@ class Health:
         return remarks
 
     def spoilt(self) -> bool:
-        """Whether some splats spoil images, none is drawn, or stored values look like those of another convention."""
-        return bool(self.invalid.any()) or 0 < self.splats == self.invisible or self.scales_look_linear or self.opacities_look_activated
+        """Whether some splats spoil images, none is drawn, places are lost, or stored values look like those of another convention."""
+        spoilt = bool(self.invalid.any()) or 0 < self.splats == self.invisible or bool(self.coarse())
+        return spoilt or self.scales_look_linear or self.opacities_look_activated
+
+    def coarse(self) -> str:
+        """That many splats lie too far from the origin for float32, in a sentence; "" if few do."""
+        if self.rounded <= COARSE_SHARE * self.splats:
+            return ""
+        count, remedy = f"{self.rounded:,} of {self.splats:,} splats", "export the scene again, moved near the origin together with its cameras"
+        why = f"lie so far from the origin that float32 rounds their positions to steps of {self.step:.2g} units, which is much for their size"
+        return f"{count} {why}; {remedy}"
 
     def non_finite(self) -> list[str]:
         """The sentences on NaN and infinity."""
@@ -99,6 +124,7 @@ def examine(model: SplatModel) -> Health:
     raw = {name: tensor.detach() for name, tensor in model.parameters().items()}
     scales, opacities = raw["scales"].exp(), raw["opacities"].sigmoid()
     extent = _extent(raw["means"])
+    steps = _coarse_steps(raw["means"], scales, extent)
     return Health(
         splats=len(scales),
         nan={name: _rows_where(torch.isnan, tensor) for name, tensor in raw.items()},
@@ -108,6 +134,8 @@ def examine(model: SplatModel) -> Health:
         huge=_rows(scales > extent) if extent > 0 else 0,
         tiny=_rows(scales < TINY_SHARE * extent),
         invisible=_rows(opacities < MIN_VISIBLE),
+        rounded=len(steps),
+        step=float(steps.median()) if len(steps) else 0.0,
         scales_look_linear=_look_linear(raw["scales"]),
         opacities_look_activated=_look_activated(raw["opacities"]),
         invalid=_invalid(raw, scales, opacities),
@@ -119,6 +147,24 @@ def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Mod
     kept = model.keep_rows(~mask)
     kept.notes.append(dropped(mask, "splats", why, source))
     return kept
+
+
+def without_invalid(model: Read) -> Read:
+    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none is left.
+
+    Once for each model it warns of positions that float32 does not hold: a file of doubles loses them only here.
+    """
+    health = examine(model)
+    if (lost := health.coarse()) and lost not in model.notes:
+        warnings.warn(f"{model.source or 'this model'}: {lost}", stacklevel=2)
+        model = model.noted(lost)
+    if not health.invalid.any():
+        return model
+    if health.invalid.all():
+        what = f"none of its {health.splats:,} splats is finite once activated, and below {LARGEST:g}"
+        raise CheckpointError(f"{model.source or 'this model'}: {what}; the training or the export failed")
+    reasons = health.non_finite() or [f"not finite once activated, or above {LARGEST:g}"]
+    return drop(model, health.invalid, "; ".join(reasons), model.source)
 
 
 def dropped(mask: Tensor, rows: str, why: str, source: Path | str | None) -> str:
@@ -143,8 +189,20 @@ def _rows_where(test: Callable[[Tensor], Tensor], values: Tensor) -> int:
     return sum(_rows(test(part)) for part in values.split(CHUNK))
 
 
+def _each_row(marked: Tensor) -> Tensor:
+    """Which rows hold a True, [N] bool."""
+    return marked.flatten(1).any(1) if marked.dim() > 1 else marked
+
+
 def _rows(marked: Tensor) -> int:
-    return int(marked.flatten(1).any(1).sum()) if marked.dim() > 1 else int(marked.sum())
+    return int(_each_row(marked).sum())
+
+
+def _coarse_steps(means: Tensor, scales: Tensor, extent: float) -> Tensor:
+    """The steps between the numbers that hold the places of splats [M], world units, where they are too large (`Health.rounded`)."""
+    farthest = means.abs().amax(1)
+    steps = torch.finfo(means.dtype).eps * torch.ldexp(torch.ones_like(farthest), torch.frexp(farthest).exponent - 1)
+    return steps[farthest.isfinite() & (steps > COARSE_STEP * scales.amax(1)) & (steps > TINY_SHARE * extent)]
 
 
 def _extent(means: Tensor) -> float:

@@ -15,8 +15,9 @@ from mipmap_plugin.models.anchors.networks import Weights
 from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
 from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, lacking
 from mipmap_plugin.models.gsplat import model as gsplat
+from mipmap_plugin.models.health import without_invalid
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained
-from mipmap_plugin.models.vanilla import Origin, VanillaModel, without_invalid
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 # INRIA's GaussianModel and its descendants: name of the parameter here -> attribute.
 INRIA = {

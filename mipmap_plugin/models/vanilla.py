@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import CheckpointError, SettingsError, ShapeError
+from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, write_exchange
@@ -23,7 +23,7 @@ from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.columns import extra_columns, to_columns, to_parameters
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
-from mipmap_plugin.models.health import LARGEST, drop, examine
+from mipmap_plugin.models.health import LARGEST, without_invalid
 from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
 from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts
@@ -101,6 +101,12 @@ class VanillaModel:
     def with_extras(self: Model, extras: dict[str, np.ndarray]) -> Model:
         """The same splats, sharing tensors, with these columns [N] after those of 3DGS."""
         return self._with(self._parameters, replace(self._origin, extras=extras))
+
+    def noted(self: Model, note: str) -> Model:
+        """The same splats, sharing tensors, with one more note."""
+        model = self._with(self._parameters)
+        model.notes.append(note)
+        return model
 
     def with_source(self: Model, file: Path) -> Model:
         """The same splats, sharing tensors, with `file` as their source."""
@@ -273,15 +279,3 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     if "fused" in path.stem and model.trained.screen_filter == "classic" and screen_filter is None:
         model.notes.append(FUSED)
     return without_invalid(model)
-
-
-def without_invalid(model: Model) -> Model:
-    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none is left."""
-    health = examine(model)
-    if not health.invalid.any():
-        return model
-    if health.invalid.all():
-        what = f"none of its {health.splats:,} splats is finite once activated, and below {LARGEST:g}"
-        raise CheckpointError(f"{model.source or 'this model'}: {what}; the training or the export failed")
-    reasons = health.non_finite() or [f"not finite once activated, or above {LARGEST:g}"]
-    return drop(model, health.invalid, "; ".join(reasons), model.source)
