@@ -146,3 +146,11 @@ def test_places_that_float32_holds_well_enough_are_not_told_of():
     assert examine(near).rounded == examine(points).rounded == 0  # nor is the place of a point rounded, in an image of all
     stray = examine(spoiled("means", 0, 1e9))
     assert stray.rounded == 1 and not stray.coarse()  # floaters lie anywhere
+
+
+def test_only_what_dropped_splats_hold_is_told(tmp_path):
+    columns = splat_columns(8)
+    columns["x"][3], columns["opacity"][3:5], columns["f_dc_0"][6], columns["scale_0"][7] = np.nan, np.inf, 1e13, -np.inf
+    model = load_vanilla(write(tmp_path / "a.ply", columns))
+    told = "1 of 8 splats hold a NaN in means; 1 of 8 splats are above 1e+12 once activated"
+    assert model.notes == [f"2 of 8 splats were dropped: {told}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -142,6 +143,19 @@ def examine(model: SplatModel) -> Health:
     )
 
 
+def why_invalid(model: SplatModel, invalid: Tensor) -> list[str]:
+    """What is wrong with the rows where `invalid` [N] is True, in sentences; what other rows hold, or what these may hold, is not told."""
+    rows = {name: tensor.detach()[invalid] for name, tensor in model.parameters().items()}
+    nan = {name: _each_row(tensor.isnan()) for name, tensor in rows.items()}
+    # An opacity of 0 or 1 and a length of 0 are stored as infinities.
+    infinite = {name: _each_row(tensor == math.inf if name == "scales" else tensor.isinf()) for name, tensor in rows.items() if name != "opacities"}
+    told = torch.stack([*nan.values(), *infinite.values()]).any(0)
+    count, sentences = len(invalid), []
+    for kind, found in (("a NaN", nan), ("an infinity", infinite)):
+        sentences += [f"{n:,} of {count:,} splats hold {kind} in {name}" for name, each in found.items() if (n := _rows(each))]
+    return sentences + ([f"{n:,} of {count:,} splats are above {LARGEST:g} once activated"] if (n := _rows(~told)) else [])
+
+
 def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Model:
     """A new model without the rows where `mask` [N] is True, with a note and a warning of their number. `source`: where they come from."""
     kept = model.keep_rows(~mask)
@@ -163,8 +177,7 @@ def without_invalid(model: Read) -> Read:
     if health.invalid.all():
         what = f"none of its {health.splats:,} splats is finite once activated, and below {LARGEST:g}"
         raise CheckpointError(f"{model.source or 'this model'}: {what}; the training or the export failed")
-    reasons = health.non_finite() or [f"not finite once activated, or above {LARGEST:g}"]
-    return drop(model, health.invalid, "; ".join(reasons), model.source)
+    return drop(model, health.invalid, "; ".join(why_invalid(model, health.invalid)), model.source)
 
 
 def dropped(mask: Tensor, rows: str, why: str, source: Path | str | None) -> str:
