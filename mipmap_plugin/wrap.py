@@ -12,6 +12,7 @@ from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
+from mipmap_plugin.adaptation.views import refuse_blind
 from mipmap_plugin.backends import device_for
 from mipmap_plugin.camera import Camera, checked, digest_of
 from mipmap_plugin.errors import SettingsError
@@ -75,6 +76,12 @@ def asked_for(
     options = {name: value for name, value in read_options(folder)[0].items() if not isinstance(value, str)}  # but paths
     digest = sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest() if options else ""
     return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or "", "options": digest}
+
+
+def refuse_undrawn(base: Wrapped, views: Sequence[Camera] | None = None) -> None:
+    """Raise SettingsError if none of the views, by default the base's own, shows anything of it (`refuse_blind`)."""
+    looked_from = base.views() if views is None else views
+    refuse_blind(looked_from, base.model, base.effects().near_plane, lambda view: base.render(view).image)
 
 
 def _loaded(path: str | Path, backend: str) -> SplatModel:

@@ -574,6 +574,18 @@ def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
         wrap_model(small, cameras=views, backend="reference").adapt(0.5, steps=0, views="given")
 
 
+def test_a_model_of_which_nothing_is_drawn_is_refused_and_one_of_which_little_is_is_not():
+    faint = tiny.model()
+    faint.parameters()["opacities"][:] = -8.0
+    base = wrap_model(faint, cameras=tiny.cameras(2), backend="reference")
+    for scale in (0.5, 1):
+        with pytest.raises(SettingsError, match="below 1/255 and are never drawn; the training or the export failed"):
+            base.adapt(scale, steps=0, views="given")
+    faint.parameters()["opacities"][7] = 2.0
+    away = replace(tiny.cameras(1)[0], viewmat=HALF_TURN @ tiny.cameras(1)[0].viewmat)
+    wrap_model(faint, cameras=[away, *tiny.cameras(2)], backend="reference").adapt(0.5, steps=0, views="given")
+
+
 def test_views_that_show_nothing_do_not_count_in_the_mean():
     """They are at 120 dB, whatever the others show."""
     away = [replace(view, viewmat=HALF_TURN @ view.viewmat) for view in tiny.cameras(3)]

@@ -26,6 +26,7 @@ from mipmap_plugin.evaluation import viewer_differences
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
+from mipmap_plugin.scenes import write_cameras
 
 QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
 NO_STEP = ["--backend", "reference", "--steps", "0"]
@@ -340,6 +341,22 @@ def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     refused(run("evaluate", tiny.ply(tmp_path / "a.ply"), "--images", scene, "--scale", "1"), "has no cameras, so its base scale is not known")
     refused(run("evaluate", model_folder, "--images", scene, "--scale", "4", "--backend", "reference"), "the photographs have only 32 x 24")
     refused(run("evaluate", model_folder, "--images", tmp_path / "nowhere", "--scale", "1"), "there is no such file or folder")
+
+
+def test_a_checkpoint_of_which_nothing_is_drawn_is_refused_before_the_work(run, tmp_path):
+    faint = tiny.model()
+    faint.parameters()["opacities"][:] = -8.0
+    faint.save(tmp_path / "faint", provenance={})
+    write_cameras(tmp_path / "faint" / "cameras.json", tiny.cameras(3))
+    photographs = ["--images", tiny.scene(tmp_path / "scene"), "--scale", "1/2", "--backend", "reference"]
+    for words in (
+        ["adapt", "--scale", "1/2", "--backend", "reference"],
+        ["levels", "--viewer", "spark", "--output", tmp_path / "levels", "--backend", "reference"],
+        ["tradeoff", "--scale", "1/2", "--output", tmp_path / "tradeoff", "--backend", "reference"],
+        ["evaluate", *photographs],
+        ["adapt", "--scale", "1/2", "--tiles", "2", "--backend", "cpu"],
+    ):
+        refused(run(words[0], tmp_path / "faint", *words[1:]), "an opacity below 1/255")
 
 
 # backends

@@ -115,13 +115,13 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
+        near = self.base_effects.near_plane
+        refuse_blind(self.base_views, self.base, near, self.truth)
         few = _rows(self.base) <= (self.config.most_splats or sys.maxsize)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self.copy_of_base(), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        seen_by = self.base_views, self.base.parameters()["means"], self.base_effects.near_plane
-        refuse_blind(*seen_by, self.truth)
-        if lost := too_near(*seen_by):
+        if lost := too_near(self.base_views, self.base.parameters()["means"], near):
             warnings.warn(lost, stacklevel=2)
         began = time.perf_counter()
         with self.phase("compilation"):

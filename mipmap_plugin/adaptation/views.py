@@ -13,9 +13,11 @@ from torch import Tensor
 from mipmap_plugin.adaptation.spreading import places, spread
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.effects import MIN_ALPHA
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import derived_seed
+from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes.trajectories import ORBIT_FOV, jittered, orbit
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
@@ -138,17 +140,27 @@ def showing(views: Sequence[Camera], means: Tensor, near: float) -> list[Camera]
     return [view for view in views if view.in_picture(view.to_camera(means.detach()), near).any()]
 
 
-def refuse_blind(views: Sequence[Camera], means: Tensor, near: float, image_of: Callable[[Camera], Tensor]) -> None:
-    """Raise SettingsError for views that show nothing: of cameras of another scene, for example. `near`: the near plane, in world units;
-    `image_of`: a view's image [h, w, 3]."""
-    some = evenly(views, LOOKED_AT)
-    if showing(some, means, near):
+def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor]) -> None:
+    """Raise SettingsError for views that show nothing: of cameras of another scene, or of splats that no renderer draws, for example.
+
+    `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3].
+    """
+    some, means = evenly(views, LOOKED_AT), model.parameters()["means"]
+    if any(_draws(view, model, near) for view in some):
         return
     if all(torch.equal(image, image[:1, :1].expand_as(image)) for image in map(image_of, some)):  # nor a splat whose center lies outside
         wrong = "the cameras seem to be of another scene, or in other coordinates; give those of this scene"
-        if showing(some, means, 0.0):
+        if showing(some, means, near):
+            wrong = "all splats in view have an opacity below 1/255 and are never drawn; the training or the export failed"
+        elif showing(some, means, 0.0):
             wrong = f"all splats lie nearer than {near:g} units, where renderers of 3DGS draw none; scale the scene and its cameras up"
         raise SettingsError(f"none of the {len(views)} views shows a splat: {wrong}")
+
+
+def _draws(view: Camera, model: SplatModel, near: float) -> bool:
+    """Whether a row of the parameters that is opaque enough to be drawn lies in the view, farther than the near plane."""
+    inside = view.in_picture(view.to_camera(model.parameters()["means"].detach()), near)
+    return bool(inside.any()) and bool((model.row_opacities([view])[inside] >= MIN_ALPHA).any())
 
 
 def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:

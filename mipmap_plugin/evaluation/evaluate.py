@@ -35,7 +35,7 @@ from mipmap_plugin.models.base import SplatModel, effects_of
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.viewers import viewers_for
-from mipmap_plugin.wrap import Wrapped
+from mipmap_plugin.wrap import Wrapped, refuse_undrawn
 
 # In the name of a row that is the worst of several viewers'.
 WORST = ", worst of "
@@ -202,6 +202,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     model.targets(viewer)  # raise errors of the viewer, the recipes and the settings before any work
     for name, scale in product(recipes, scales):
         make_config(name, scale, **{key: value for key, value in settings.items() if key in AdaptConfig.model_fields})
+    refuse_undrawn(model, [view.camera for view in judge.views])
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
         rows += _adapted_rows(model, judge, scale, recipes, settings) if scale != 1 or viewer else []

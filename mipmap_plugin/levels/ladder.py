@@ -25,7 +25,7 @@ from mipmap_plugin.levels.switching import switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.models.base import why_no_viewer
 from mipmap_plugin.progress import announced
-from mipmap_plugin.wrap import Wrapped
+from mipmap_plugin.wrap import Wrapped, refuse_undrawn
 
 # Two neighboring zooms of the curve of dB are at most this factor apart.
 CURVE_STEP = 2**0.25
@@ -66,10 +66,11 @@ class Ladder:
 def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> Ladder | DistanceLadder:
     """Make the levels. `resume`: a folder for finished levels, to go on from after an interruption; saving the ladder removes it.
 
-    Raises SettingsError for a model that no viewer draws and for a group of viewers, BackendUnavailable, Interrupted.
+    Raises SettingsError for a model that no viewer draws, for views that show nothing and for a group of viewers, BackendUnavailable, Interrupted.
     """
     if reason := why_no_viewer(base.model):
         raise SettingsError(f"{base.model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
+    refuse_undrawn(base)
     if by_distance(base, request):
         return make_levels_by_distance(base, request, resume)
     with threads.limited(base.threads, shared=False):

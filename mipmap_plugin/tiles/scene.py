@@ -88,6 +88,8 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     if len(kept) < tiles:
         raise CheckpointError(f"{checkpoint.path} has {len(kept):,} splats, which cannot be cut into {tiles} tiles; give fewer")
     cores, tree = cut(splats.places, kept, tiles)
+    if not found.drawn:
+        raise CheckpointError(f"{checkpoint.path}: every splat has an opacity below 1/255, so none is drawn; the training or the export failed")
     degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
     sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()
     places = torch.where(valid[:, None], splats.places, torch.nan)  # an invalid splat is seen by no camera
@@ -103,15 +105,17 @@ def _read(kind: type[VanillaModel], rows: PlyRows) -> Iterator[dict[str, Tensor]
 
 
 class _Found:
-    """Which splats are finite, and one that has the highest SH band of all that are not zero."""
+    """Which splats are finite, whether one is drawn, and one that has the highest SH band of all that are not zero."""
 
     def __init__(self) -> None:
         self.valid: list[Tensor] = []
-        self.degree_at, self.highest = 0, -1
+        self.degree_at, self.highest, self.drawn = 0, -1, False
 
     def __call__(self, kind: type[VanillaModel], parameters: dict[str, Tensor]) -> dict[str, Tensor]:
         """Examine the next splats, and return them."""
-        valid = ~examine(kind(parameters)).invalid
+        health = examine(kind(parameters))
+        valid = ~health.invalid
+        self.drawn |= health.invisible < health.splats
         used = (parameters["shN"].abs().amax(dim=2) > 0) & valid[:, None]
         if used.any():
             row, band = used.nonzero()[used.nonzero()[:, 1].argmax()].tolist()
