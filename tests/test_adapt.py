@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import re
 import signal
 import threading
 from dataclasses import replace
@@ -18,6 +19,7 @@ from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.report import PeakMemory
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.views import remarks
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import BackendUnavailable, OutputExists, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
@@ -572,6 +574,24 @@ def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
     views = [view.moved(smaller) for view in tiny.cameras(2)]
     with pytest.raises(SettingsError, match=r"all splats lie nearer than 0.2 units, .* scale the scene and its cameras up"):
         wrap_model(small, cameras=views, backend="reference").adapt(0.5, steps=0, views="given")
+
+
+def shrunk(factor):
+    """The model in units so small."""
+    splats = tiny.gaussians()
+    return VanillaModel.from_gaussians(replace(splats, means=splats.means * factor, scales=splats.scales * factor))
+
+
+def test_a_scene_in_small_units_is_told_of_where_the_near_plane_keeps_an_orbit_away_from_it():
+    base = wrap_model(shrunk(0.02), backend="reference")
+    where = r"the scene is 0.0\d+ units wide, and no view shows it larger than \S+ px: renderers of 3DGS draw nothing nearer than 0.2 units; scale"
+    [remark] = remarks(base.views(), base.model, 0.2, orbit=True)
+    assert re.match(where, remark) and not remarks(base.views(), base.model, 0.2, orbit=False)
+    with pytest.raises(SettingsError, match=r"renderers of 3DGS draw nothing nearer than 0\.2 units"):
+        wrap_model(shrunk(1e-4), backend="reference").adapt(0.5, recipe="instant")
+    with pytest.raises(SettingsError, match="the cameras seem to be in other units"):
+        far = torch.diag(torch.tensor([100.0, 100.0, 100.0, 1.0], dtype=torch.float64))
+        wrap_model(tiny.model(), cameras=[view.moved(far) for view in tiny.cameras(2)], backend="reference").adapt(0.5, recipe="instant")
 
 
 def test_a_model_of_which_nothing_is_drawn_is_refused_and_one_of_which_little_is_is_not():

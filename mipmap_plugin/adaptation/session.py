@@ -35,7 +35,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, showing, too_near, with_times
+from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, with_times
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
@@ -80,7 +80,7 @@ class Session:
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self.views = over_band(self.base_views, config)
         self.views_note += f", {real.note(self.base_views)}" if real else ""
-        self._has_photographs = real is not None
+        self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
         request.images.keep_only([*self.views, *steering, *choosing])
         self.truth = PseudoTruth(request.images, scale, config, real)
@@ -121,8 +121,8 @@ class Session:
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self.copy_of_base(), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        if lost := too_near(self.base_views, self.base.parameters()["means"], near):
-            warnings.warn(lost, stacklevel=2)
+        for remark in remarks(self.base_views, self.base, near, orbit=self._orbits):
+            warnings.warn(remark, stacklevel=2)
         began = time.perf_counter()
         with self.phase("compilation"):
             effects = (self.base_effects, *self.targets.values())

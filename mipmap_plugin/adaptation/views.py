@@ -18,7 +18,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.scenes.trajectories import ORBIT_FOV, jittered, orbit
+from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, jittered, orbit
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
 ORBIT_PIXELS = 800
@@ -28,6 +28,13 @@ ORBIT_VIEWS = 50
 # Views that are looked at to see whether they show anything; and the fraction of splats before the near plane in all of them that is worth a word:
 # floaters lie before a camera.
 LOOKED_AT, TOO_MANY = 16, 0.1
+
+# px: of a scene that no view shows larger there is nothing to adapt. And the fraction of the shorter side of a picture: an orbit fills nearly all of
+# it, unless the near plane keeps it away from a scene in small units; then pictures are of another zoom than a user looks from.
+LEAST_PIXELS, LEAST_SHARE = 16, 0.25
+
+# Standard deviations of a splat that are seen of it; and near planes at which views keep clear of a scene (`orbit`).
+SEEN, CLEAR = 3, 2
 
 # Views take their places in a band at multiples of the golden ratio, so that any number of consecutive ones is spread evenly.
 GOLDEN = (math.sqrt(5) - 1) / 2
@@ -141,12 +148,14 @@ def showing(views: Sequence[Camera], means: Tensor, near: float) -> list[Camera]
 
 
 def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor]) -> None:
-    """Raise SettingsError for views that show nothing: of cameras of another scene, or of splats that no renderer draws, for example.
+    """Raise SettingsError for views that show nothing, or a speck: of cameras of another scene, or of splats that no renderer draws, for example.
 
     `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3].
     """
     some, means = evenly(views, LOOKED_AT), model.parameters()["means"]
     if any(_draws(view, model, near) for view in some):
+        if small := too_small(views, model, near, min(LEAST_PIXELS, LEAST_SHARE * min(views[0].size))):
+            raise SettingsError(small)
         return
     if all(torch.equal(image, image[:1, :1].expand_as(image)) for image in map(image_of, some)):  # nor a splat whose center lies outside
         wrong = "the cameras seem to be of another scene, or in other coordinates; give those of this scene"
@@ -178,6 +187,31 @@ def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
         return ""
     where = f"{lost:,} of {count:,} splats in view lie nearer than {near:g} units"
     return f"{where}, where renderers of 3DGS draw none; scale the scene and its cameras up"
+
+
+def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: float) -> str:
+    """That no view shows the scene `least` px large, in a sentence; "" if one does. `near`: the near plane, in world units."""
+    splats = model.gaussians(views[0]).detach()
+    if len(splats) == 0:
+        return ""
+    center = splats.means.median(dim=0).values
+    reach = (splats.means - center).norm(dim=1) + SEEN * splats.scales.abs().amax(1)
+    width = 2 * float(reach.kthvalue(max(1, round(FRAMED * len(reach)))).values)
+    most = max(width * view.fx / max(float((view.center - center.to(view.center)).norm()), near) for view in views)
+    if not most < least:
+        return ""
+    wrong = "the cameras seem to be in other units; give those of this scene"
+    if max(view.fx for view in views) * width / least < width / 2 + CLEAR * near:
+        wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; scale the scene and its cameras up"
+    return f"the scene is {width:.2g} units wide, and no view shows it larger than {most:.2g} px: {wrong}"
+
+
+def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:
+    """What is wrong with views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
+    least = LEAST_SHARE * min(views[0].size)
+    least = least if orbit else min(LEAST_PIXELS, least)
+    found = too_near(views, model.parameters()["means"], near), too_small(views, model, near, least)
+    return [sentence for sentence in found if sentence]
 
 
 def over_band(views: Sequence[Camera], config: AdaptConfig) -> list[Camera]:

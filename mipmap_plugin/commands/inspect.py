@@ -57,7 +57,7 @@ def inspect(
 
 def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]:
     """What is known of a loaded model without a picture, by name; `whole`: with the effects that are off."""
-    from mipmap_plugin.adaptation.views import too_near
+    from mipmap_plugin.adaptation.views import remarks
     from mipmap_plugin.effects import explain
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
@@ -68,7 +68,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         gaussians = model.gaussians(wrapped.views()[0])
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
-        lost = [sentence] if (sentence := too_near(wrapped.views(), gaussians.means, wrapped.effects().near_plane)) else []
+        lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
     return {
         "verdict": _verdict(checkpoint, [*health.sentences(), *lost], bool(lost) or health.spoilt(), model.notes),
         "splats": len(gaussians),
