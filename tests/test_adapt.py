@@ -258,6 +258,14 @@ def test_extra_columns_outlive_a_resumption_unless_splats_were_dropped(tmp_path,
         assert ("confidence" in read_ply(resumed.save(tmp_path / f"{name}.ply")).columns) == kept
 
 
+def test_columns_that_new_splats_do_not_have_are_told_of_once_and_in_the_report(tmp_path):
+    base = wrap_model(with_extras(tmp_path / "base.ply"), cameras=tiny.cameras(), backend="reference")
+    with pytest.warns(UserWarning, match="extra columns confidence are dropped") as caught:
+        pruned = base.adapt(1 / 4, **BRIEF, returns="last")
+    assert len(caught) == len(pruned.report.notes) == 1
+    assert base.adapt(1 / 4, steps=0, merge_to=1.0).report.notes == []  # whose splats are those of the base
+
+
 def test_a_reset_of_opacities_keeps_extra_columns(tmp_path):
     model = wrap_model(with_extras(tmp_path / "base.ply"), cameras=tiny.cameras(), backend="reference", background=WHITE)
     saved = model.adapt(1 / 4, recipe="paper", steps=3).save(tmp_path / "new.ply")

@@ -385,3 +385,14 @@ def test_a_column_that_nothing_reads_costs_no_anchor(tmp_path):
     count = len(whole.parameters()["means"])
     odd = np.full(count, np.nan)
     assert len(load_model(checkpoints.write(tmp_path / "odd", opacity=odd)).parameters()["means"]) == count
+
+
+def test_integers_that_nothing_reads_stay_integers(tmp_path):
+    columns = checkpoints.columns(Layout(), label=np.arange(40)) | {"label": np.arange(40, dtype=np.int32)}
+    ply = ply_files.write(checkpoints.write(tmp_path / "model"), columns)
+    saved = read_ply(load_model(ply).save(tmp_path / "saved", provenance={})).columns
+    assert saved["label"].dtype == np.int32 and saved["label"].tolist() == list(range(40)) and saved["x"].dtype == np.float32
+    columns["label"][3] = 2**31 - 1
+    with pytest.warns(UserWarning, match="integers above 16,777,216 in label are rounded to float32"):
+        large = load_model(ply_files.write(ply, columns))
+    assert read_ply(large.save(tmp_path / "large", provenance={})).columns["label"][3] == 2**31 - 1

@@ -38,6 +38,7 @@ from mipmap_plugin.tiles.folder import work_folder
 from mipmap_plugin.tiles.halo import draw_halos
 from mipmap_plugin.tiles.layers import draw_layers
 from mipmap_plugin.tiles.pictures import Album, write_pictures
+from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
 from mipmap_plugin.tiles.scene import make_cut, opened
 from mipmap_plugin.tiles.slabs import Painter
@@ -268,6 +269,15 @@ def halved(job):
         draw_layers(scene, number, scene.sweeps[0], folder)
     draw_halos(scene, 0, scene.sweeps[0], folder)
     return scene, folder
+
+
+def test_columns_that_tiles_do_not_hold_are_told_of(job):
+    [file] = job.base.checkpoint.rglob("*.ply")
+    columns = read_ply(file).columns
+    write_ply(file, columns | {"label": columns["x"]}, overwrite=True)
+    scene, _ = cut_in_three(job)
+    with pytest.warns(UserWarning, match="the extra columns label are dropped, since tiles hold none"):
+        assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes
 
 
 def whole_and_tiles(halved):

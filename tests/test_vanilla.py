@@ -302,6 +302,17 @@ def test_extra_columns_are_kept_until_rows_change(tmp_path):
     assert "segment" not in read_ply(adapted.save(tmp_path / "c.ply", provenance={})).columns
 
 
+def test_normals_are_kept_until_rows_change_where_there_are_any(tmp_path):
+    normals = {"nx": np.full(5, 0.6, np.float32), "nz": np.full(5, 0.8, np.float32)}
+    model = load_vanilla(write(tmp_path / "a.ply", splat_columns(5) | normals))
+    assert model.notes == ["extra columns are carried along: nx, ny, nz"]
+    adapted = model.copy()
+    file = read_ply(adapted.save(tmp_path / "b.ply", provenance={}))
+    assert list(file.columns) == splat_names(15) and all((file.columns[name] == column).all() for name, column in normals.items())
+    adapted.replace_parameters({name: tensor[:3] for name, tensor in adapted.parameters().items()})
+    assert not read_ply(adapted.save(tmp_path / "c.ply", provenance={})).columns["nx"].any()
+
+
 def test_model_folder_round_trip(tmp_path):
     options = "Namespace(sh_degree=3, source_path='C:\\\\a', resolution=8,  white_background=False)"
     folder = write_model_folder(tmp_path / "m", 7000, options)

@@ -40,6 +40,7 @@ class Report(BaseModel):
     peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without a GPU
     curve: list[CurvePoint]
     versions: dict[str, str]
+    notes: list[str] = []  # what became of the model on the way, such as columns of the base's file that the new splats do not have, in sentences
     inputs: dict[str, str] = {}  # what was given beside the checkpoint: hashes of cameras and photographs, background, screen filter
 
     def psnr_before(self) -> float | None:

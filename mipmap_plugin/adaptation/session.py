@@ -262,6 +262,9 @@ class Session:
         return [next((effect for effect in same if effect.on), same[0]) for same in zip(*per_viewer, strict=True)]
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
+        notes = [note for note in student.notes if note not in self.base.notes]
+        for note in notes:
+            warnings.warn(note, stacklevel=2)
         return Report(
             scale=self.scale,
             base=self.base.digest or digest_of_parameters(self.base),
@@ -282,6 +285,7 @@ class Session:
             curve=curve,
             versions=versions(),
             inputs=self.inputs,
+            notes=notes,
         )
 
 

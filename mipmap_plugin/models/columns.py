@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 CHUNK = 8192
 
 POSITION = ("x", "y", "z")
-NORMAL = ("nx", "ny", "nz")  # always 0 in 3DGS, and never read
+NORMAL = ("nx", "ny", "nz")  # always 0 in 3DGS, and never drawn
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -72,13 +72,21 @@ def to_columns(parameters: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
 
 
 def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Copies of the columns that 3DGS does not define, such as a confidence or a segment id, in this machine's byte order."""
+    """Copies of the columns that 3DGS does not define, such as a confidence or a segment id, in this machine's byte order; also of normals that are
+    not 0, as those of 3DGS are."""
+    normals = NORMAL if any(columns[name].any() for name in NORMAL if name in columns) else ()
+    kept = {*extra_names(columns), *normals}
+    return {name: column.astype(column.dtype.newbyteorder("=")) for name, column in columns.items() if name in kept}
+
+
+def extra_names(columns: Collection[str]) -> list[str]:
+    """Which of these columns 3DGS does not define."""
     known = {*POSITION, *NORMAL, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
     known |= set() if DC[0] in columns else set(RGB)
-    return {name: column.astype(column.dtype.newbyteorder("=")) for name, column in columns.items() if name not in known}
+    return [name for name in columns if name not in known]
 
 
-def rest_names(columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+def rest_names(columns: Iterable[str]) -> tuple[str, ...]:
     """The names of the f_rest columns in the order of their numbers."""
     return numbered(columns, "f_rest_")
 

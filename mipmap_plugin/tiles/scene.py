@@ -136,7 +136,8 @@ class TiledScene:
         self.base = Splats(self.kind, [Store(folder / BASE)], stored["places"])
         self.cores: list[Tensor] = stored["cores"]
         self.tree: Tree = stored["tree"]
-        self.comments = PlyRows(self.checkpoint.path).header.comments
+        header = PlyRows(self.checkpoint.path).header
+        self.comments, self.columns = header.comments, header.vertex.names
         self.digest: str = stored["digest"]
         self.options, _ = read_options(self.checkpoint.folder)
         self.wrapped = self._wrapped(base, stored["sample"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,7 +62,7 @@ def read_anchors(path: str | Path, family: str, iteration: int | None) -> Anchor
     first = {name: column[:2].copy() for name, column in ply.columns.items()}
     options, notes = read_options(checkpoint.folder)
     origin = _origin(checkpoint, ply.comments)
-    every_note = (*checkpoint.notes, *ply.notes, *notes, *dropped)
+    every_note = (*checkpoint.notes, *ply.notes, *notes, *dropped, *_rounded(ply.columns, carried, checkpoint.path))
     return AnchorFile(parameters, carried, weights, companions, options, trained_scale(options, None), origin, first, every_note)
 
 
@@ -92,8 +93,9 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> tuple[dict[s
     }, carried
 
 
-def to_columns(parameters: Mapping[str, Tensor], carried: tuple[str, ...], second: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns in the original's order, all f4; those of `second` follow the position."""
+def to_columns(parameters: Mapping[str, Tensor], read: AnchorFile, second: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns in the original's order, all f4 but integers of the file that was `read`; those of `second` follow the position."""
+    carried = read.carried
     raw = {name: tensor.detach().to("cpu", torch.float32) for name, tensor in parameters.items()}
     blocks = {OFFSET: raw["offsets"].transpose(1, 2).flatten(1), FEATURE: raw["features"]}
     named = {f"{prefix}{i}": block[:, i].numpy() for prefix, block in blocks.items() for i in range(block.shape[1])}
@@ -101,8 +103,26 @@ def to_columns(parameters: Mapping[str, Tensor], carried: tuple[str, ...], secon
     for names, block in ((POSITION, raw["means"]), (SCALES, raw["scales"]), (carried, raw[CARRIED])):
         named |= {name: block[:, i].numpy() for i, name in enumerate(names)}
     named |= second
+    named |= {name: _as_integers(named[name], first.dtype) for name, first in read.first.items() if name in carried and first.dtype.kind in "iu"}
     order = dict.fromkeys((*POSITION, *second, *middle, "opacity", *SCALES, *QUATERNION, *carried))
     return {name: named[name] for name in order}
+
+
+def _as_integers(column: np.ndarray, kind: np.dtype) -> np.ndarray:
+    """A column [N] of float32 in an integer type of a file, as near as this has it."""
+    limits = np.iinfo(kind)
+    return column.astype(np.float64).clip(limits.min, limits.max).astype(kind.newbyteorder("="))
+
+
+def _rounded(columns: Mapping[str, np.ndarray], carried: tuple[str, ...], path: Path) -> list[str]:
+    """A note, which is also a warning, on integers that float32, which holds the carried columns, does not."""
+    integers = [name for name in carried if columns[name].dtype.kind in "iu"]
+    names = [name for name in integers if (columns[name] != columns[name].astype(np.float32).astype(np.float64)).any()]
+    if not names:
+        return []
+    note = f"integers above {1 << np.finfo(np.float32).nmant + 1:,} in {', '.join(names)} are rounded to float32; number them from 0 if they matter"
+    warnings.warn(f"{path}: {note}", stacklevel=2)
+    return [note]
 
 
 def write_beside(ply: Path, companions: Mapping[str, bytes], source: Path | None, overwrite: bool) -> None:

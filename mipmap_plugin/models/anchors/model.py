@@ -146,7 +146,7 @@ class AnchorModel(ABC):
         for name, state in self._weights.items():
             refuse_infinite(name, state)
         decoded = finite({name: tensor for name, tensor in self._parameters.items() if name != CARRIED}, LARGEST)
-        columns = to_columns({**decoded, CARRIED: self._parameters[CARRIED]}, self._read.carried, self._second_columns())
+        columns = to_columns({**decoded, CARRIED: self._parameters[CARRIED]}, self._read, self._second_columns())
         comments = with_tags(self._read.origin.comments, self.trained.screen_filter, provenance)
         write = partial(write_ply, columns=columns, comments=comments)
         if path.suffix.lower() == ".ply":
