@@ -142,6 +142,10 @@ def write_ply(path: str | Path, columns: Mapping[str, np.ndarray], comments: Ite
     return path
 
 
+class _Fault(ValueError):
+    """What is wrong with a line of a header, as part of a sentence."""
+
+
 def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
     form, elements, comments = "", [], []
     for number, line in enumerate(lines, start=2):
@@ -158,7 +162,9 @@ def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
             elif keyword:
                 raise ValueError(keyword)
         except (ValueError, IndexError) as error:
-            raise CheckpointError(f"{path}: line {number} of the PLY header cannot be read: {line[:80].decode('ascii', 'replace')!r}") from error
+            why = f", {error}" if isinstance(error, _Fault) else ""
+            wrong = f"line {number} of the PLY header cannot be read: {line[:80].decode('ascii', 'replace')!r}{why}"
+            raise CheckpointError(f"{path}: {wrong}; export the file again") from error
     if not form:
         raise CheckpointError(f"{path}: the PLY header has no `format` line; export the file again")
     # An element without properties may declare any number of rows, and plyfile would iterate over them.
@@ -168,10 +174,12 @@ def _parsed(path: Path, lines: list[bytes], body: int) -> Header:
 def _with_property(element: Element, words: list[str]) -> Element:
     *kind, name = words
     types = kind[1:] if kind[0] == "list" and len(kind) == 3 else kind
-    for word in types:
-        _known(word, TYPES)
-    if not types or (len(types) > 1 and kind[0] != "list") or name in element.names:
+    if unknown := [word for word in types if word not in TYPES]:
+        raise _Fault(f"whose type {unknown[0]} PLY does not have")
+    if not types or (len(types) > 1 and kind[0] != "list"):
         raise ValueError(name)
+    if name in element.names:
+        raise _Fault("the second property of this name")
     return replace(element, properties=(*element.properties, (name, " ".join(kind))))
 
 
@@ -195,7 +203,7 @@ def _sized(path: Path, header: Header, size: int) -> Header:
         raise CheckpointError(f"{path} has no vertex element, so it holds no splats; its elements are {[e.name for e in header.elements]}")
     vertex = vertices[0]
     if vertex.has_lists:
-        raise CheckpointError(f"{path} has list properties in its vertex element: this is a mesh or another format, not splats")
+        raise CheckpointError(f"{path} has list properties in its vertex element, so it is a mesh or another format; give a trained model")
     available = size + (header.format == "ascii")  # the last value needs no blank behind it
     taken = sum(element.count * header.least_bytes(element) for element in header.before_vertex)
     held = max(0, available - taken) // header.least_bytes(vertex)

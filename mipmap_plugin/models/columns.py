@@ -36,7 +36,7 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     columns = _with_dc(columns)
     missing = [name for name in (*POSITION, *DC, "opacity", *SCALE, *QUATERNION) if name not in columns]
     if missing:
-        raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}")
+        raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}; export it again with them")
     rest = rest_names(columns)
     if len(rest) not in SH_DEGREES:
         raise CheckpointError(f"{path} has {len(rest)} f_rest columns, which fit no SH degree: 0, 9, 24, 45 or 72 do; export it again")

@@ -10,7 +10,7 @@ from pathlib import Path
 from mipmap_plugin.errors import CheckpointError, PluginError
 from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
-from mipmap_plugin.models.family import Family, Files, Match
+from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
 from mipmap_plugin.models.places import REPORT
 
 # The families of this package.
@@ -105,6 +105,8 @@ def _most_certain(files: Files, claims: dict[str, tuple[Family, Match]], notes: 
 def _why_not(files: Files) -> str:
     path, kind = files.path, files.kind
     if files.header:
+        if len(missing := OF_SPLATS - files.columns) < len(OF_SPLATS) / 2:
+            return f"{path} is no whole 3DGS checkpoint: it lacks the columns {', '.join(sorted(missing))}; export it again with them"
         columns = ", ".join(files.header.vertex.names[:8])
         return f"{path} is a plain point cloud or a mesh (columns {columns}), not Gaussian splats; give a trained model"
     if kind == "torch":
