@@ -280,6 +280,16 @@ def test_columns_that_tiles_do_not_hold_are_told_of(job):
         assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes
 
 
+def test_places_that_float32_does_not_hold_are_told_of(job):
+    [file] = job.base.checkpoint.rglob("*.ply")
+    columns = read_ply(file).columns
+    write_ply(file, columns | {"x": columns["x"].astype(float) + 5e6}, overwrite=True)
+    folder = work_folder(job.target)
+    folder.mkdir()
+    with pytest.warns(UserWarning, match=r"80 of 80 splats lie so far .* steps of 0.5 units"):
+        make_cut(job.base.checkpoint, 2, folder)
+
+
 def whole_and_tiles(halved):
     """All splats, and of each tile its rows, its surroundings and its crop of a view that shows all."""
     scene, folder = halved

@@ -103,16 +103,21 @@ class Health:
 
     def coarse(self) -> str:
         """That many splats lie too far from the origin for float32, in a sentence; "" if few do."""
-        if self.rounded <= COARSE_SHARE * self.splats:
-            return ""
-        count, remedy = f"{self.rounded:,} of {self.splats:,} splats", "export the scene again, moved near the origin together with its cameras"
-        why = f"lie so far from the origin that float32 rounds their positions to steps of {self.step:.2g} units, which is much for their size"
-        return f"{count} {why}; {remedy}"
+        return coarse(self.rounded, self.splats, self.step)
 
     def non_finite(self) -> list[str]:
         """The sentences on NaN and infinity."""
         counts = [("a NaN", name, n) for name, n in self.nan.items()] + [("an infinity", name, n) for name, n in self.infinite.items()]
         return [f"{count:,} of {self.splats:,} splats hold {kind} in {name}" for kind, name, count in counts if count]
+
+
+def coarse(rounded: int, splats: int, step: float) -> str:
+    """`Health.coarse`, of its three numbers."""
+    if rounded <= COARSE_SHARE * splats:
+        return ""
+    count, remedy = f"{rounded:,} of {splats:,} splats", "export the scene again, moved near the origin together with its cameras"
+    why = f"lie so far from the origin that float32 rounds their positions to steps of {step:.2g} units, which is much for their size"
+    return f"{count} {why}; {remedy}"
 
 
 def holds_splats(model: SplatModel) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -29,7 +30,7 @@ from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.jobs.base import COLORS, Base
 from mipmap_plugin.models import Checkpoint, detect
 from mipmap_plugin.models.exposure import read_exposures
-from mipmap_plugin.models.health import examine
+from mipmap_plugin.models.health import coarse, examine
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
@@ -90,6 +91,8 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     cores, tree = cut(splats.places, kept, tiles)
     if not found.drawn:
         raise CheckpointError(f"{checkpoint.path}: every splat has an opacity below 1/255, so none is drawn; the training or the export failed")
+    if lost := coarse(found.rounded, len(rows), found.step):
+        warnings.warn(f"{checkpoint.path}: {lost}", stacklevel=2)
     degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
     sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()
     places = torch.where(valid[:, None], splats.places, torch.nan)  # an invalid splat is seen by no camera
@@ -110,12 +113,14 @@ class _Found:
     def __init__(self) -> None:
         self.valid: list[Tensor] = []
         self.degree_at, self.highest, self.drawn = 0, -1, False
+        self.rounded, self.step = 0, 0.0  # as of `Health`; the largest step
 
     def __call__(self, kind: type[VanillaModel], parameters: dict[str, Tensor]) -> dict[str, Tensor]:
         """Examine the next splats, and return them."""
         health = examine(kind(parameters))
         valid = ~health.invalid
         self.drawn |= health.invisible < health.splats
+        self.rounded, self.step = self.rounded + health.rounded, max(self.step, health.step)
         used = (parameters["shN"].abs().amax(dim=2) > 0) & valid[:, None]
         if used.any():
             row, band = used.nonzero()[used.nonzero()[:, 1].argmax()].tolist()
