@@ -70,6 +70,7 @@ class AdaptConfig(BaseModel):
     decay: float = Field(1.0, gt=0, le=1, description="Fraction of itself that every learning rate decays to, along half a cosine.")
     betas: tuple[Momentum, Momentum] = Field((0.9, 0.999), description="Adam's decay rates of the moments.")
     nesterov: bool = Field(False, description="Adam with Nesterov's momentum: each step counts the newest gradient once more.")
+    conversion_steps: int = Field(0, ge=0, description="Zoom-in for what draws otherwise than the training did: at most so many steps at x1 before.")
     least_zoom_in: float = Field(1.0, ge=1, description="No steps are taken at a zoom-in below this for what draws as the training did.")
     views_per_step: int = Field(1, gt=0, description="Views whose gradients are summed for one step.")
     order: Literal["shuffled", "spread"] = Field("shuffled", description="Order of the views in each round; `spread`: neighbors look from all sides.")

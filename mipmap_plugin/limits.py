@@ -35,6 +35,13 @@ def check_scale(scale: Any) -> float:
     return number
 
 
+def check_kinds(**given: tuple[Any, Any]) -> None:
+    """Raise SettingsError for arguments, by name, that are neither None nor of the kind that each has to be."""
+    for name, (value, kind) in given.items():
+        if value is not None and not isinstance(value, kind):
+            raise SettingsError(f"{name} must be a {getattr(kind, '__name__', kind)}, got {type(value).__name__}")
+
+
 def derived_seed(seed: int, number: int) -> int:
     """The seed for random draw `number` of a run; multiplied by a prime, so that the seeds of different runs do not coincide."""
     return (seed * 1_000_003 + number) % (MAX_SEED + 1)

@@ -16,11 +16,13 @@ from mipmap_plugin import threads
 from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.adapted import render_model
+from mipmap_plugin.adaptation.conversion import Stages, conversion
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
-from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
+from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.target.photographs import placed as placed
 from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
@@ -31,9 +33,8 @@ from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.limits import check_image, check_scale
-from mipmap_plugin.models.base import Filtered, Placed, SplatModel, TrainedScale, checked_splats, why_no_viewer
-from mipmap_plugin.models.hosts import Capture
+from mipmap_plugin.limits import check_image, check_kinds, check_scale
+from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT
@@ -174,22 +175,22 @@ class Wrapped:
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override those of the recipe, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to continue from if it exists; Ctrl-C writes it
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe(step, seconds, render)` is
-        called before the first step and after each; `render(camera)` is the current image, and the run ends where it returns True.
+        called before the first step and after each (of the conversion before a zoom-in, too: `adaptation.conversion`); `render(camera)` is
+        the current image, and the run ends where it returns True.
         `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
         `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
         Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else checked(cameras, some=True)
-        _check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
+        check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         if not model.traits.same_for_all_views and (settings.setdefault("merge_to", 1.0) < 1 or settings.get("most_splats")):
             reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
             raise SettingsError(f"{model.family}: {reason}; leave merge_to and most_splats (--splats, --bytes) out")
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
-        config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
-        if len(targets) > 1:
-            config = make_config(recipe, scale, **(settings_for_several(config) | settings))
+        config, targets = self._planned(recipe, scale, viewer, settings)
+        first = conversion(config, self.effects(), targets.values(), scale) if start is None else None
         views = {} if cameras is None else {"views": digest_of(cameras)}
         inputs = self.asked | views | ({} if images is None else {"photographs": images.digest()})
         photographs = None if images is None else Photographs(self.place(images), self.cameras, self.background)
@@ -205,15 +206,26 @@ class Wrapped:
         if start is not None and start.scale <= scale:
             raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
         base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
-        if self.images is None or not self.images.are_of(model, backend, self.effects()):
-            self.images = BaseImages(model, backend, self.effects(), LIMIT if self.keeps_images else 0)
-        request = AdaptationRequest(self.images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs)
+        base_images = self._base_images(model, backend, self.keeps_images or first is not None)
+        request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs)
         family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
         alone = threads.limited(self.threads, shared=getattr(backend, "own_threads", False))
         with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
-            adapted = Session(request, scale, config, list(cameras), photographs).run(None if resume is None else Path(resume), observe)
+            stages = Stages(request, list(cameras), photographs, None if resume is None else Path(resume), observe)
+            adapted = stages.adapt(scale, config, first)
         adapted.report.seconds["loading"] = self.loading_s
         return replace(adapted, cameras=self.views())
+
+    def _planned(self, recipe: str, scale: float, viewer: str | None, settings: dict[str, Any]) -> tuple[AdaptConfig, dict[str, Effects]]:
+        """The settings of an adaptation, and `targets`."""
+        config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
+        return config if len(targets) == 1 else make_config(recipe, scale, **(settings_for_several(config) | settings)), targets
+
+    def _base_images(self, model: SplatModel, backend: Backend, keep: bool) -> BaseImages:
+        """Those that are drawn already, or none yet: of another base. `keep`: for further scales and stages."""
+        if self.images is None or not self.images.are_of(model, backend, self.effects()):
+            self.images = BaseImages(model, backend, self.effects(), LIMIT if keep else 0)
+        return self.images
 
     @usual_modes()
     def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Any:
@@ -280,19 +292,3 @@ class Wrapped:
     def any_camera(self) -> Camera:
         """One of the cameras, or a camera of one pixel if there are none."""
         return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
-
-
-def _check_kinds(**given: tuple[Any, Any]) -> None:
-    """Raise SettingsError for arguments, by name, that are neither None nor of the kind that each has to be."""
-    for name, (value, kind) in given.items():
-        if value is not None and not isinstance(value, kind):
-            raise SettingsError(f"{name} must be a {getattr(kind, '__name__', kind)}, got {type(value).__name__}")
-
-
-def placed(model: SplatModel, scene: Scene) -> Scene:
-    """The scene in the frame that the model was trained in: gsplat and splatfacto transform it. Raises SceneError."""
-    if not model.traits.placed:
-        return scene
-    scene = scene.original()
-    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
-    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))

@@ -78,3 +78,9 @@ def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig)
     if patience is not None and len(psnrs) > patience and max(psnrs[-patience:]) < max(psnrs[:-patience]) + config.min_gain_db:
         return f"knee: {patience} checks in a row gained less than {config.min_gain_db:g} dB"
     return None
+
+
+def is_true(answer: object) -> bool:
+    """Whether an observer's answer is True: Python's, NumPy's or torch's."""
+    kind = answer is True or str(getattr(answer, "dtype", "")) in ("bool", "torch.bool")
+    return kind and getattr(answer, "shape", ()) == () and bool(answer)

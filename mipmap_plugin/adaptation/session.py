@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.curve import CurvePoint
+from mipmap_plugin.adaptation.curve import CurvePoint, is_true
 from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
@@ -67,6 +67,8 @@ class AdaptationRequest:
 
 class Session:
     """One call of `adapt`: makes the parts, and runs them in order."""
+
+    keeps_state = False  # whether the state of a run that has ended is kept too: because another one starts from what it returns
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
         self.base, self.backend, self.base_effects = request.images.model, request.images.backend, request.images.effects
@@ -191,9 +193,11 @@ class Session:
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
             answer = observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
-            return _is_true(answer)
+            return is_true(answer)
 
         ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
+        if self.keeps_state:
+            keeper.save(run)
         run.optimizer.state.clear()
         pool.release_to_system()
         self.state = keeper.remaining_file()
@@ -287,12 +291,6 @@ class Session:
             inputs=self.inputs,
             notes=notes,
         )
-
-
-def _is_true(answer: object) -> bool:
-    """Whether an observer's answer is True: Python's, NumPy's or torch's."""
-    kind = answer is True or str(getattr(answer, "dtype", "")) in ("bool", "torch.bool")
-    return kind and getattr(answer, "shape", ()) == () and bool(answer)
 
 
 def _rows(model: SplatModel) -> int:

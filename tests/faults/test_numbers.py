@@ -36,7 +36,7 @@ def model():
 
 @pytest.fixture
 def no_work(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.wrapped.Session", lambda *_: pytest.fail("worked in vain"))
+    monkeypatch.setattr("mipmap_plugin.adaptation.conversion.Session", lambda *_: pytest.fail("worked in vain"))
 
 
 @pytest.mark.parametrize("scale", BAD_SCALES)

@@ -78,16 +78,21 @@ class StateKeeper:
         return None if self.file is None else self.file.path
 
     def save_if_due(self, run: Run) -> None:
-        """Save the state if the last save was long ago. A full disk does not end the run."""
+        """Save the state if the last save was long ago."""
         began = time.monotonic()
-        if self._path is None or began - self._saved_at < SAVE_EVERY_S * max(1.0, self._took / QUICK_SAVE_S):
+        if began - self._saved_at >= SAVE_EVERY_S * max(1.0, self._took / QUICK_SAVE_S):
+            self.save(run)
+            self._saved_at = time.monotonic()
+            self._took = self._saved_at - began
+
+    def save(self, run: Run) -> None:
+        """Save the state, if a file was requested. A full disk does not end the run."""
+        if self._path is None:
             return
         try:
             save_run(run, self._path, self._fingerprint)
         except OutputError as error:
             warnings.warn(f"the run continues, but could not be resumed if it were killed: {error}", stacklevel=2)
-        self._saved_at = time.monotonic()
-        self._took = self._saved_at - began
 
     def remaining_file(self) -> StateFile | None:
         """The state file of a run that has ended, which is needed until its model is saved; None if none was written."""

@@ -156,9 +156,14 @@ def split_validation(
     return adapted, [view.window(size, size) for view in validation]
 
 
+def count_of_views(config: AdaptConfig) -> int:
+    """How many views there are for validation."""
+    return min(config.validation_views, max(MIN_VIEWS, config.steps * config.views_per_step // RENDERS_PER_VIEW))
+
+
 def _validation_views(cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, config: AdaptConfig) -> tuple[list[Camera], list[Camera]]:
     """`split_validation` with whole images. Random views come first in each pair, so that they steer and kept cameras choose."""
-    count = min(config.validation_views, max(MIN_VIEWS, config.steps * config.views_per_step // RENDERS_PER_VIEW))
+    count = count_of_views(config)
     generator = torch.Generator().manual_seed(config.seed + SEED_OFFSET)
     if config.views == "orbit" or not cameras:
         changes = {"views": "orbit", "extra_views": count, "seed": config.seed + SEED_OFFSET}

@@ -36,10 +36,11 @@ COARSE_COSTS = 3.0
 
 @dataclass(frozen=True, eq=False)
 class FinerLevel:
-    """A model for the same viewer at a finer scale than the wanted one, to start from instead of from the base."""
+    """A model for the same viewer to start from instead of from the base: at a finer scale than the wanted one, or before a zoom-in at x1."""
 
     model: SplatModel
     scale: float
+    name: str = "the finer level"  # what it is called in the report
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,7 @@ class StartProblem:
     coarse_base: Callable[[], SplatModel] | None = None  # with it, splats may be merged even where too few share a pixel: copies of the base itself
 
     def from_level(self, finer: FinerLevel, model: Callable[[], SplatModel]) -> StartProblem:
-        """The same request, starting from a finer level instead of from the base; `model` makes copies of it.
+        """The same request, starting from such a model instead of from the base; `model` makes copies of it.
 
         The settings' `merge_to` stays a fraction of the base's splats. A finer level may be as good as it is: it is merged all the same.
         """
@@ -69,7 +70,7 @@ class StartProblem:
         config = self.config.model_copy(update={"merge_to": min(1.0, self.config.merge_to * counts[0] / counts[1])})
         views = [view.zoomed(finer.scale) for view in self.views]
         return replace(
-            self, base=model, views=views, scale=self.scale / finer.scale, base_effects=self.target, config=config, name="the finer level",
+            self, base=model, views=views, scale=self.scale / finer.scale, base_effects=self.target, config=config, name=finer.name,
             may_lose=config.merging_costs, coarse_base=self.base,
         )  # fmt: skip
 

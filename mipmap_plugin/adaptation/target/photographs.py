@@ -6,12 +6,15 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 from torch import Tensor
 
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.models.base import Placed, SplatModel
+from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import Scene
 
 
@@ -65,3 +68,12 @@ def _difference(one: Camera, other: Camera) -> float:
     """How much the fields of view of two cameras differ along both axes: the sum of the logarithms of their ratios."""
     ratios = one.width / one.fx * other.fx / other.width, one.height / one.fy * other.fy / other.height
     return sum(abs(math.log(ratio)) for ratio in ratios)
+
+
+def placed(model: SplatModel, scene: Scene) -> Scene:
+    """The scene in the frame that the model was trained in: gsplat and splatfacto transform it. Raises SceneError."""
+    if not model.traits.placed:
+        return scene
+    scene = scene.original()
+    capture = Capture(scene.points, scene.smaller if scene.images else None, scene.applied_scale)
+    return scene.with_cameras(cast(Placed, model).as_trained(scene.cameras, capture))

@@ -1,0 +1,140 @@
+"""Zoom-ins for viewers that draw otherwise than the training did: with the conversion at x1 before, and without.
+
+    python benchmarks/conversion.py
+    python benchmarks/conversion.py DATA --only lego_200 --viewer spark --scale 2
+
+Made-up captures (made_captures.py) are judged as in captures.py, by views that nothing was adapted to, averaged to the size of the base's own image.
+With DATA, that of real_bases.py, lego and chair are judged by photographs (protocol P3), and flowers as the captures are. Writes conversion.md and
+conversion.json; rows that are not measured again are kept. Half an hour; the captures alone take ten minutes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import fmean
+
+import torch
+import tyro
+from captures import Views
+from made_captures import CAPTURES
+from torch import Tensor
+
+from mipmap_plugin import Camera, load_scene, wrap_model
+from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.camera import evenly
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
+from mipmap_plugin.evaluation.report import markdown
+from mipmap_plugin.formats.atomic import new_file, write_json
+from mipmap_plugin.wrap import Wrapped
+
+VIEWERS, SCALES = ("spark", "playcanvas"), (2.0, 4.0)
+BASES = {"lego_200": "bases/lego_200", "chair_100": "bases/chair_100", "flowers": "flowers_r8"}
+JUDGED = 8  # views, of those that nothing was adapted to
+HEAD = ["scene", "viewer", "zoom", "base", "without", "with", "seconds without", "with"]
+INTRO = """# Zoom-ins for other viewers
+
+Made by `python benchmarks/conversion.py DATA`: mean PSNR (dB) of views that nothing was adapted to, drawn as the viewer draws. *base*: as it is.
+*without*: `default` with `conversion_steps=0`. *with*: `default`, which first learns at x1 how the viewer draws. Lego and chair against photographs
+(protocol P3), all others against the base's own image, to whose size the zoom-in is averaged. One thread of a shared machine.
+"""
+
+Show = Callable[[Camera], Tensor]  # a camera of the base scale -> [h, w, 3]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scene in one viewer at one zoom; dB and seconds."""
+
+    scene: str
+    viewer: str
+    scale: float
+    base: float
+    without: float
+    with_it: float
+    seconds_without: float
+    seconds_with: float
+
+    def cells(self) -> list[str]:
+        quality = [f"{value:.1f}" for value in (self.base, self.without, self.with_it)]
+        return [self.scene, self.viewer, f"x{self.scale:g}", *quality, f"{self.seconds_without:.0f}", f"{self.seconds_with:.0f}"]
+
+
+def scene(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], Callable[[Show], float]]]:
+    """A base, and what judges it: a zoom -> (what is shown -> dB)."""
+    if name in CAPTURES:
+        capture = CAPTURES[name]()
+        return (base := capture.wrapped()), lambda scale: by_itself(base, capture.held_out[:JUDGED], scale)
+    if data is None:
+        raise SystemExit(f"{name} needs DATA, or there is no such capture; known are {', '.join((*CAPTURES, *BASES))}")
+    base = wrap_model(data / "checkpoints" / BASES[name], threads=1)
+    if not (images := data / "images" / name.split("_")[0]).is_dir():
+        return base, lambda scale: by_itself(base, evenly([view for view in base.cameras if view.split == "test"], JUDGED), scale)
+    shots = evenly(test_views(base.place(load_scene(images)), base.cameras, base.background), JUDGED)
+
+    def by_photographs(scale: float) -> Callable[[Show], float]:
+        p3 = PROTOCOLS["P3"]
+        truths = [(shot.camera, shot.truth(scale, p3)) for shot in shots]
+        return lambda show: fmean(psnr(p3.as_saved(show(camera)), truth) for camera, truth in truths)
+
+    return base, by_photographs
+
+
+def by_itself(base: Wrapped, cameras: Sequence[Camera], scale: float) -> Callable[[Show], float]:
+    """What judges a zoom-in by the base's own images."""
+    views = Views(base, cameras, scale)
+    return lambda show: fmean(map(decibel, views.errors(show)))
+
+
+def measure(name: str, data: Path | None, viewers: Sequence[str], scales: Sequence[float]) -> list[Row]:
+    base, judge_at = scene(name, data)
+    rows = []
+    for viewer in viewers:
+        for scale in scales:
+            judge = judge_at(scale)
+            plain, converted = (base.adapt(scale, viewer=viewer, **settings) for settings in ({"conversion_steps": 0}, {}))
+            quality = [judge(lambda camera: base.render(camera.zoomed(scale), scale, viewer=viewer).image)]  # noqa: B023
+            quality += [judge(lambda camera, of=adapted: of.render(camera.zoomed(scale)).image) for adapted in (plain, converted)]  # noqa: B023
+            rows.append(Row(name, viewer, scale, *quality, plain.report.seconds["total"], converted.report.seconds["total"]))
+            print(*rows[-1].cells(), sep="  ", flush=True)
+    return rows
+
+
+def joined(file: Path, rows: Sequence[Row]) -> list[Row]:
+    """These rows, and those of an earlier run that were not measured again."""
+    earlier = [Row(**row) for row in json.loads(file.read_text())] if file.exists() else []
+    known, names = {(row.scene, row.viewer, row.scale): row for row in (*earlier, *rows)}, [*BASES, *CAPTURES]
+    return sorted(known.values(), key=lambda row: (names.index(row.scene), row.viewer, row.scale))
+
+
+def main(
+    data: tyro.conf.Positional[Path | None] = None,
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    scale: tyro.conf.UseAppendAction[tuple[float, ...]] = (),
+    output: Path = Path("benchmarks/results"),
+) -> None:
+    """Measure, print the table and write it.
+
+    Args:
+        data: The folder with checkpoints/ and images/; without it captures alone are measured.
+        only: Which scenes; by default all.
+        viewer: Which viewers; spark and playcanvas by default.
+        scale: Which zooms; 2 and 4 by default.
+        output: Where conversion.md and conversion.json go.
+    """
+    torch.set_num_threads(1)
+    rows = [row for name in only or (*(BASES if data else ()), *CAPTURES) for row in measure(name, data, viewer or VIEWERS, scale or SCALES)]
+    rows = joined(output / "conversion.json", rows)
+    text = INTRO + "\n" + markdown(HEAD, [row.cells() for row in rows]) + "\n"
+    with new_file(output / "conversion.md", overwrite=True) as file:
+        file.write_text(text)
+    write_json(output / "conversion.json", [asdict(row) for row in rows], overwrite=True)
+    print(f"\n{text}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,113 @@
+"""A zoom-in for a renderer that draws otherwise than the training did: the conversion before it."""
+
+import signal
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.conversion import conversion
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.recipes import recipe
+from mipmap_plugin.wrap import Interrupted, wrap_model
+
+BASE, OTHER = Effects(1), Effects(1, "antialiased")
+BRIEF = dict(steps=3, extra_views=4, validation_views=4)
+
+
+def wrapped(screen_filter="classic"):
+    return wrap_model(tiny.model(60, TrainedScale(screen_filter)), cameras=tiny.cameras(8), backend="cpu", threads=1)
+
+
+def settings_of(scale=2.0, targets=(OTHER,), **settings):
+    return conversion(recipe("default", scale, **settings), BASE, targets, scale)
+
+
+@pytest.mark.parametrize(
+    ("scale", "targets", "settings"),
+    [
+        (2.0, (BASE,), {}),
+        (2.0, (OTHER, Effects(1, "mip")), {}),
+        (0.5, (OTHER,), {}),
+        (1.0, (OTHER,), {}),
+        (2.0, (OTHER,), dict(steps=0)),
+        (2.0, (OTHER,), dict(conversion_steps=0)),
+    ],
+    ids=["nothing to learn", "several viewers", "a zoom-out", "a conversion itself", "no steps", "none wanted"],
+)
+def test_where_there_is_none(scale, targets, settings):
+    assert settings_of(scale, targets, **settings) is None
+
+
+def test_its_settings_are_those_of_the_recipe_at_the_bases_scale():
+    first = settings_of(seed=7, views="train", most_splats=99, time_budget_s=8.0)
+    at_base = recipe("default", 1.0)
+    assert (first.rates, first.views_per_step, first.compare_at) == (at_base.rates, at_base.views_per_step, at_base.compare_at)
+    assert (first.seed, first.views, first.most_splats, first.time_budget_s) == (7, "train", 99, 4.0)
+
+
+def test_it_takes_no_more_steps_than_the_zoom_in_may():
+    assert settings_of(steps=20).steps == 20 and settings_of(steps=10_000).steps == recipe("default", 2.0).conversion_steps
+
+
+def test_a_zoom_in_starts_from_it_and_tells_so():
+    report = wrapped().adapt(2, viewer="antialiased", **BRIEF).report
+    assert report.notes[-1].startswith("converted at x1 before, ") and report.notes[-1].endswith("ended by 3 steps")
+    assert 0 < report.seconds["conversion"] < report.seconds["total"]
+    assert report.curve[0].seconds > report.seconds["conversion"]
+
+
+def test_it_brings_a_zoom_in_closer_to_the_base():
+    base = wrapped()
+
+    def quality(**settings):
+        adapted = base.adapt(2, viewer="antialiased", **(BRIEF | settings))
+        halves = [adapted.render(view.zoomed(2)).image.view(24, 2, 32, 2, 3).mean((1, 3)) for view in tiny.cameras(3, seed=5)]
+        truths = [base.render(view).image for view in tiny.cameras(3, seed=5)]
+        return sum(map(psnr, halves, truths)) / 3
+
+    assert quality(steps=40) > quality(steps=40, conversion_steps=0) + 1
+
+
+@pytest.mark.parametrize("nth", [2, 6], ids=["in the conversion", "in the zoom-in"])
+def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, nth):
+    whole = wrapped().adapt(2, viewer="antialiased", **BRIEF)
+    state, steps = tmp_path / "run.resume", []
+
+    def press(step, seconds, render):
+        steps.append(step)
+        if len(steps) == nth:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted, match=f"continue from .*run.resume{'.x1' if nth == 2 else ''}$"):
+        wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **BRIEF)
+    assert steps == [0, 1, 2, 3, 0, 1][:nth]
+    resumed = wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **BRIEF)
+    assert steps[nth:] == ([1, 2, 3, 0, 1, 2, 3] if nth == 2 else [3, 1, 2, 3])  # what the conversion did is not done again
+    files = [adapted.save(tmp_path / f"{i}.ply").read_bytes() for i, adapted in enumerate((whole, resumed))]
+    assert files[0] == files[1] and not list(tmp_path.glob("*resume*"))
+
+
+def test_a_time_budget_is_for_both_and_told_as_it_was_given():
+    report = wrapped().adapt(2, viewer="antialiased", time_budget_s=60.0, **BRIEF).report
+    assert report.settings.time_budget_s == 60.0 and report.ended_by == "3 steps"
+
+
+def test_an_observer_that_ends_the_conversion_ends_the_run():
+    steps = []
+    report = wrapped().adapt(2, viewer="antialiased", observe=lambda step, *_: steps.append(step) or step == 1, **BRIEF).report
+    assert steps == [0, 1] and report.ended_by == "0 steps" and "ended by its observer" in report.notes[-1]
+
+
+def test_a_file_in_the_filter_of_its_training_is_not_converted():
+    report = wrapped().adapt(2, **BRIEF).report
+    assert "conversion" not in report.seconds and not report.notes
+
+
+def test_the_base_is_not_changed():
+    base = wrapped()
+    before = {name: tensor.clone() for name, tensor in base.model.parameters().items()}
+    base.adapt(2, viewer="antialiased", **BRIEF)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in base.model.parameters().items())
