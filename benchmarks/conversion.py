@@ -4,8 +4,8 @@
     python benchmarks/conversion.py DATA --only lego_200 --viewer spark --scale 2
 
 Made-up captures (made_captures.py) are judged as in captures.py, by views that nothing was adapted to, averaged to the size of the base's own image.
-With DATA, that of real_bases.py, lego and chair are judged by photographs (protocol P3), and flowers as the captures are. Writes conversion.md and
-conversion.json; rows that are not measured again are kept. Half an hour; the captures alone take ten minutes.
+With DATA, that of real_bases.py, lego and chair are judged by photographs (protocol P3). Writes conversion.md and conversion.json; rows that are not
+measured again are kept. Half an hour; the captures alone take twenty minutes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mipmap_plugin.formats.atomic import new_file, write_json
 from mipmap_plugin.wrap import Wrapped
 
 VIEWERS, SCALES = ("spark", "playcanvas"), (2.0, 4.0)
-BASES = {"lego_200": "bases/lego_200", "chair_100": "bases/chair_100", "flowers": "flowers_r8"}
+BASES = {"lego_200": "bases/lego_200", "chair_100": "bases/chair_100"}
 JUDGED = 8  # views, of those that nothing was adapted to
 HEAD = ["scene", "viewer", "zoom", "base", "without", "with", "seconds without", "with"]
 INTRO = """# Zoom-ins for other viewers
@@ -63,7 +63,7 @@ class Row:
         return [self.scene, self.viewer, f"x{self.scale:g}", *quality, f"{self.seconds_without:.0f}", f"{self.seconds_with:.0f}"]
 
 
-def scene(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], Callable[[Show], float]]]:
+def prepared(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], Callable[[Show], float]]]:
     """A base, and what judges it: a zoom -> (what is shown -> dB)."""
     if name in CAPTURES:
         capture = CAPTURES[name]()
@@ -71,9 +71,8 @@ def scene(name: str, data: Path | None) -> tuple[Wrapped, Callable[[float], Call
     if data is None:
         raise SystemExit(f"{name} needs DATA, or there is no such capture; known are {', '.join((*CAPTURES, *BASES))}")
     base = wrap_model(data / "checkpoints" / BASES[name], threads=1)
-    if not (images := data / "images" / name.split("_")[0]).is_dir():
-        return base, lambda scale: by_itself(base, evenly([view for view in base.cameras if view.split == "test"], JUDGED), scale)
-    shots = evenly(test_views(base.place(load_scene(images)), base.cameras, base.background), JUDGED)
+    scene = load_scene(data / "images" / name.split("_")[0])
+    shots = evenly(test_views(base.place(scene), base.cameras, base.background), JUDGED)
 
     def by_photographs(scale: float) -> Callable[[Show], float]:
         p3 = PROTOCOLS["P3"]
@@ -90,7 +89,7 @@ def by_itself(base: Wrapped, cameras: Sequence[Camera], scale: float) -> Callabl
 
 
 def measure(name: str, data: Path | None, viewers: Sequence[str], scales: Sequence[float]) -> list[Row]:
-    base, judge_at = scene(name, data)
+    base, judge_at = prepared(name, data)
     rows = []
     for viewer in viewers:
         for scale in scales:

@@ -28,6 +28,7 @@ from mipmap_plugin.adaptation.optimization.validation import (
     Validation,
     split_validation,
 )
+from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import choose_views
@@ -407,3 +408,13 @@ def test_a_start_that_is_worse_than_the_base_is_not_returned(monkeypatch):
     adapted = model.adapt(SCALE, recipe="instant")
     assert adapted.report.returned.startswith("the base as it is: ")
     assert same(adapted.model, model.model)
+
+
+@pytest.mark.parametrize("viewer", ["spark", "playcanvas", "gaussian-splats-3d"])
+def test_splats_that_are_rounded_once_for_all_views_give_the_same_images(viewer):
+    """Spark rounds them for all cameras alike, but for their places, which it keeps relative to the eye."""
+    base = wrap_model(tiny.model(40), cameras=tiny.cameras(3), backend="cpu")
+    draw, splats = Renderer(base.backend()[0], base.effects(viewer=viewer)), base.model.gaussians().detach()
+    alone = draw.of(splats)
+    for camera in base.cameras:
+        assert torch.equal(alone(camera), draw(splats, camera))

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
+import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import Backend, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.packing import in_two_steps, packed
+
+# For a rounding that does not depend on it.
+NO_CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 # An image [h, w, 3] -> the gradient of its loss, [h, w, 3], and its mean square error, [].
 Comparison = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -19,9 +25,27 @@ Comparison = Callable[[Tensor], tuple[Tensor, Tensor]]
 ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
 
 
-def renderer(backend: Backend, effects: Effects) -> Callable[[Gaussians, Camera], Tensor]:
-    """A function that renders the image of a camera. It holds no session, which would keep the state's file locked after the run."""
-    return lambda gaussians, camera: backend.render(gaussians, camera, effects).image
+@dataclass(frozen=True)
+class Renderer:
+    """Renders the image of a camera. It holds no session, which would keep the state's file locked after the run."""
+
+    backend: Backend
+    effects: Effects
+
+    def __call__(self, gaussians: Gaussians, camera: Camera) -> Tensor:
+        return self.backend.render(gaussians, camera, self.effects).image
+
+    def of(self, gaussians: Gaussians) -> Callable[[Camera], Tensor]:
+        """What renders these splats alone, several times: a viewer's rounding of them takes longer than an image, and most is the same for all.
+
+        Buckets of depth are those of the splats before they are rounded, so that these are not rounded once for all.
+        """
+        settings = self.effects.settings
+        if settings.packing is None or settings.bucketed:
+            return partial(self, gaussians)
+        once, rest = in_two_steps(settings.packing)
+        rounded = packed(gaussians, NO_CAMERA, once)
+        return partial(Renderer(self.backend, replace(self.effects, settings=replace(settings, packing=rest))), rounded)
 
 
 def views_renderer(backend: Backend, targets: Sequence[Effects]) -> ViewsRenderer | None:

@@ -25,7 +25,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
-from mipmap_plugin.adaptation.renderers import SteppingRenderer, renderer, unrounded, views_renderer
+from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
 from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch
 from mipmap_plugin.adaptation.start.compilation import warm_up
@@ -92,7 +92,7 @@ class Session:
             self.views_note += f", {len(self.views)} of them upsampled"
         self.state: StateFile | None = None
         truth = PseudoTruth(request.images, scale, config.model_copy(update=COMPARED_WITH_BASE if scale > 1 else {}))
-        first, *further = [renderer(self.backend, target) for target in self.extremes.values()]
+        first, *further = [Renderer(self.backend, target) for target in self.extremes.values()]
         self.validation = Validation(steering, choosing, scale, truth, first, config.resize, further)
 
     def _affordable(self, config: AdaptConfig, cameras: list[Camera]) -> AdaptConfig:
@@ -177,7 +177,7 @@ class Session:
         max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
         max_splats = min(max_splats, self.config.most_splats or sys.maxsize)
         targets = [unrounded(target) for target in self.extremes.values()]
-        first, *further = [renderer(self.backend, target) for target in targets]
+        first, *further = [Renderer(self.backend, target) for target in targets]
         together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
         task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together, stepping)
         keeper = StateKeeper(resume, self._fingerprint())
@@ -255,7 +255,7 @@ class Session:
         """PSNR (dB) in each viewer, where the file is made for several."""
         if len(self.targets) == 1:
             return {}
-        first, *further = [renderer(self.backend, target) for target in self.targets.values()]
+        first, *further = [Renderer(self.backend, target) for target in self.targets.values()]
         psnrs = replace(self.validation, render=first, further_renders=further).viewer_psnrs(model, self.validation.choosing)
         return dict(zip(self.targets, psnrs, strict=True))
 

@@ -35,19 +35,27 @@ def packed(gaussians: Gaussians, camera: Camera, packing: Packing) -> Gaussians:
 
 def _rounded(gaussians: Gaussians, camera: Camera, packing: Packing) -> dict[str, Tensor]:
     """What packing changes, by the names of the tensors of `gaussians` and in their dtype."""
-    exact = gaussians.to(dtype=torch.float64)
-    opacities = exact.opacities
-    for step in packing.opacity:
-        opacities = _stepped(opacities, step, packing.downwards)
-    rounded = {"opacities": opacities, "sh": _harmonics(exact.sh, packing)}
+    rounded = {}
+    if packing.opacity:
+        rounded["opacities"] = gaussians.opacities.double()
+        for step in packing.opacity:
+            rounded["opacities"] = _stepped(rounded["opacities"], step, packing.downwards)
+    if packing.color is not None or packing.bands:
+        rounded["sh"] = _harmonics(gaussians.sh.double(), packing)
     if packing.log_scales is not None:
-        rounded["scales"] = _scales(exact.scales, *packing.log_scales)
+        rounded["scales"] = _scales(gaussians.scales.double(), *packing.log_scales)
     if packing.quats is not None:
-        rounded["quats"] = _quaternions(exact.quats, _octahedral if packing.quats == "octahedral" else _stereographic)
+        rounded["quats"] = _quaternions(gaussians.quats.double(), _octahedral if packing.quats == "octahedral" else _stereographic)
     if packing.half_means:
-        eye = camera.center.to(exact.means)
-        rounded["means"] = (exact.means.half().double() - eye).half().double() + eye
+        means = gaussians.means.double()
+        eye = camera.center.to(means)
+        rounded["means"] = (means.half().double() - eye).half().double() + eye
     return {name: value.to(gaussians.means) for name, value in rounded.items()}
+
+
+def in_two_steps(packing: Packing) -> tuple[Packing, Packing | None]:
+    """What of a packing is the same for every camera, and the rest, which is not; None if there is none."""
+    return replace(packing, half_means=False), Packing(half_means=True) if packing.half_means else None
 
 
 def round_to(values: Tensor, steps: Tensor) -> Tensor:

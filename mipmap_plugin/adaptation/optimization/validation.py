@@ -19,6 +19,7 @@ from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.parallel import max_threads
+from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.camera import Camera, evenly
@@ -93,12 +94,12 @@ class Validation:
         shared = model.gaussians(views[0]) if views and model.traits.same_for_all_views else None
         threads = max_threads(model.parameters()["means"], views[0].zoomed(self.scale)) if views else 1
 
-        def error(render: Callable[[Gaussians, Camera], Tensor], view: Camera) -> float:
-            camera = view.zoomed(self.scale)
-            image = render(shared or model.gaussians(camera), camera).clamp(0, 1)
+        def error(draw: Callable[[Camera], Tensor], view: Camera) -> float:
+            image = draw(view.zoomed(self.scale)).clamp(0, 1)
             return float(difference_from(self.truth(view), image, self.resize).square().mean())
 
-        return [list(side_by_side(partial(error, render), views, threads)) for render in (self.render, *self.further_renders)]
+        draws = [_drawing(render, model, shared) for render in (self.render, *self.further_renders)]
+        return [list(side_by_side(partial(error, draw), views, threads)) for draw in draws]
 
     def steer(self, model: SplatModel) -> float:
         """The visible quality (dB) on the steering views."""
@@ -123,6 +124,13 @@ class Validation:
         best, first = max(quality[name] for name in among), next(iter(states))
         least = max(best - TIE_DB, quality[first]) if first in among else best - TIE_DB
         return [name for name in among if quality[name] >= least][-1], {name: min(map(mean_db, each)) for name, each in errors.items()}
+
+
+def _drawing(render: Callable[[Gaussians, Camera], Tensor], model: SplatModel, shared: Gaussians | None) -> Callable[[Camera], Tensor]:
+    """What draws a model, whose splats are `shared` by all cameras, if they are."""
+    if shared is None:
+        return lambda camera: render(model.gaussians(camera), camera)
+    return render.of(shared) if isinstance(render, Renderer) else partial(render, shared)
 
 
 def mean_db(errors: Sequence[float]) -> float:
