@@ -226,4 +226,5 @@ def _details(report: Report) -> Iterator[str]:
     if report.peak_memory_mib is not None:
         yield f"at most {report.peak_memory_mib:,.0f} MiB on the GPU"
     yield f"{report.views}; {report.filters}; backend {report.backend}"
+    yield from report.notes
     yield f"seconds: {', '.join(f'{phase} {seconds:.2f}' for phase, seconds in report.seconds.items())}"

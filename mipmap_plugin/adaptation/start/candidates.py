@@ -100,6 +100,7 @@ class StartSearch:
     def __init__(self, problem: StartProblem) -> None:
         self._problem, self._rounds = problem, Rounds()
         self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
+        self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
         unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
         self._matches_weights = problem.has_blend_weights and problem.scale <= 1 and not unchanged
 
@@ -171,7 +172,7 @@ class StartSearch:
         problem, merged_weights = self._problem, []
 
         def pixel_of(means: Tensor) -> Tensor:
-            return pixel_size(means, problem.views, self._count) / problem.scale
+            return self._pixel_size(means) / problem.scale
 
         def merged(gaussians: Gaussians) -> Gaussians:
             most = problem.config.most_splats or (math.ceil(fraction * len(gaussians)) if coarsely else None)
@@ -188,7 +189,8 @@ class StartSearch:
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
         problem = self._problem
-        settings = FormSettings(1.0 if self._matches_weights else AREA_POWER, problem.config.crispness, self._count)
+        area_power = 1.0 if self._matches_weights else AREA_POWER
+        settings = FormSettings(area_power, problem.config.crispness, self._count, self._pixel_size(gaussians.means))
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if not self._matches_weights or weights is None:
             return scales, opacities
@@ -198,6 +200,14 @@ class StartSearch:
             return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, problem.target)
 
         return scales, matched_opacities(opacities, weights, weights_of)
+
+    def _pixel_size(self, means: Tensor) -> Tensor:
+        """`pixel_size`; that of the base, which is asked for first, serves all candidates."""
+        if self._of_base is not None and torch.equal(self._of_base[0], means):
+            return self._of_base[1]
+        pixels = pixel_size(means, self._problem.views, self._count)
+        self._of_base = self._of_base or (means, pixels)
+        return pixels
 
     def _base_weights(self, base: SplatModel) -> Tensor:
         """[N]: the blend weights of the base's splats, in target pixels of a view, from as many views as show enough of them."""

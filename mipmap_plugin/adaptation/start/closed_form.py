@@ -26,6 +26,7 @@ Mip-Splatting); the mean distance costs 0.3 to 0.7 dB at zoom-in on lego and the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -70,6 +71,7 @@ class FormSettings:
     area_power: float = AREA_POWER  # zoom-out: opacity falls with this power of the area
     crispness: float = 0.0  # 0..1, zoom-in: the base's images are averages over a pixel (0), or over the whole filter (1)
     views: int | None = None  # how many are looked at, evenly spread, where it is known how much they show; None: `enough_views`
+    pixel: Tensor | None = None  # `pixel_size` [N], where it is known
 
 
 def closed_form(
@@ -82,7 +84,7 @@ def closed_form(
     if filter_suffices(scale, base, target):
         return gaussians.scales, gaussians.opacities
     count = form.views or enough_views(gaussians.means, views)
-    pixels, some = pixel_size(gaussians.means, views, count), every_nth(views, count)
+    pixels, some = pixel_size(gaussians.means, views, count) if form.pixel is None else form.pixel, every_nth(views, count)
     formed = in_chunks(lambda chunk: _form(gaussians[chunk], pixels[chunk], some, scale, (base, target), form), gaussians.means)
     scales, opacities = zip(*formed, strict=True)
     return torch.cat(scales), torch.cat(opacities)
@@ -190,7 +192,7 @@ def _closest_of(means: Tensor, views: Sequence[Camera], count: int | None = None
 
 
 def _pixel_sizes(means: Tensor, views: Sequence[Camera], near: float = 0.0) -> tuple[Tensor, Tensor]:
-    """The size of a pixel at each mean in the closest view that sees it, infinity if none does, and in the closest of all views, [N] both."""
+    """The size of a pixel at each mean in the closest view that sees it, [N], infinity if none does; and there, in the closest of all views, [N]."""
     chunks = in_chunks(lambda chunk: _sizes_of_chunk(means[chunk], views, near), means)
     seen, anywhere = zip(*chunks, strict=True)
     return torch.cat(seen), torch.cat(anywhere)
@@ -201,11 +203,16 @@ def _sizes_of_chunk(means: Tensor, views: Sequence[Camera], near: float) -> tupl
     finest, anywhere = (torch.full_like(means[:, 0], torch.inf) for _ in range(2))
     for view in views:
         points = view.to_camera(means)
-        focal = (view.fx * view.fy) ** 0.5
-        finest = torch.where(view.in_picture(points, near), torch.minimum(finest, points[:, 2] / focal), finest)
-        # Of what is in no picture by its distance: in the camera's own plane a depth is 0.
-        anywhere = torch.minimum(anywhere, points.norm(dim=1).clamp_min(torch.finfo(points.dtype).eps) / focal)
+        finest = torch.where(view.in_picture(points, near), torch.minimum(finest, points[:, 2] / _focal(view)), finest)
+    unseen = finest.isinf()
+    for view in views if unseen.any() else ():  # by their distance: in the camera's own plane a depth is 0
+        distance = view.to_camera(means[unseen]).norm(dim=1).clamp_min(torch.finfo(means.dtype).eps)
+        anywhere[unseen] = torch.minimum(anywhere[unseen], distance / _focal(view))
     return finest, anywhere
+
+
+def _focal(view: Camera) -> float:
+    return math.sqrt(view.fx * view.fy)
 
 
 def min_variance(effects: Effects) -> float:
