@@ -7,9 +7,12 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.conversion import conversion
+from mipmap_plugin.adaptation.session import Session
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.outputs import is_adapted
+from mipmap_plugin.models.places import conversion_state, state_path
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
@@ -54,7 +57,7 @@ def test_it_takes_no_more_steps_than_the_zoom_in_may():
 
 def test_a_zoom_in_starts_from_it_and_tells_so():
     report = wrapped().adapt(2, viewer="antialiased", **BRIEF).report
-    assert report.notes[-1].startswith("converted at x1 before, ") and report.notes[-1].endswith("ended by 3 steps")
+    assert report.notes[-1].startswith("converted at x1 before, ") and report.notes[-1].endswith(", in 3 steps")
     assert 0 < report.seconds["conversion"] < report.seconds["total"]
     assert report.curve[0].seconds > report.seconds["conversion"]
 
@@ -83,16 +86,58 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, nth):
 
     with pytest.raises(Interrupted, match=f"continue from .*run.resume{'.x1' if nth == 2 else ''}$"):
         wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **BRIEF)
-    assert steps == [0, 1, 2, 3, 0, 1][:nth]
+    assert steps == [0, 1, 2, 3, 4, 5][:nth]
     resumed = wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **BRIEF)
-    assert steps[nth:] == ([1, 2, 3, 0, 1, 2, 3] if nth == 2 else [3, 1, 2, 3])  # what the conversion did is not done again
+    assert steps[nth:] == ([1, 2, 3, 4, 5, 6] if nth == 2 else [5, 6])  # what the conversion did is not done again
+    assert list(tmp_path.glob("*.resume.x1"))  # should the disk be full, nothing is lost
     files = [adapted.save(tmp_path / f"{i}.ply").read_bytes() for i, adapted in enumerate((whole, resumed))]
     assert files[0] == files[1] and not list(tmp_path.glob("*resume*"))
 
 
-def test_a_time_budget_is_for_both_and_told_as_it_was_given():
+def test_a_time_budget_is_for_both_and_told_as_it_was_given(monkeypatch):
+    budgets, run = [], Session.run
+    monkeypatch.setattr(Session, "run", lambda self, *given: budgets.append(self.config.time_budget_s) or run(self, *given))
     report = wrapped().adapt(2, viewer="antialiased", time_budget_s=60.0, **BRIEF).report
-    assert report.settings.time_budget_s == 60.0 and report.ended_by == "3 steps"
+    assert budgets == [30.0, 30.0] and report.settings.time_budget_s == 60.0 and report.ended_by == "3 steps"
+
+
+def test_with_a_budget_too_what_has_ended_is_not_taken_further(tmp_path, monkeypatch):
+    """What time is left would be enough for further steps of the conversion, of which another zoom-in would come."""
+    budget = {**BRIEF, "steps": 20, "time_budget_s": 60.0}
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.budget.Pace.steps", lambda *_: 3)
+    state, steps = tmp_path / "run.resume", []
+
+    def press(step, seconds, render):
+        steps.append(step)
+        if len(steps) == 6:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **budget)
+    wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **budget)
+    assert steps[:4] == [0, 1, 2, 3] and steps[6] == steps[5] and steps[-1] <= 23
+
+
+def test_a_zoom_in_that_fails_leaves_no_state(tmp_path):
+    def fail(step, seconds, render):
+        if step == 4:
+            raise RuntimeError("no memory")
+
+    with pytest.raises(RuntimeError):
+        wrapped().adapt(2, viewer="antialiased", resume=tmp_path / "run.resume", observe=fail, **BRIEF)
+    assert not list(tmp_path.glob("*resume*"))
+
+
+def test_an_observer_sees_steps_and_seconds_of_both_counted_on():
+    seen = []
+    report = wrapped().adapt(2, viewer="antialiased", observe=lambda step, seconds, _: seen.append((step, seconds)) and None, **BRIEF).report
+    assert [step for step, _ in seen] == [0, 1, 2, 3, 4, 5, 6] and seen == sorted(seen)
+    assert seen[4][1] > report.seconds["conversion"]
+
+
+def test_states_of_conversions_are_known_as_such(tmp_path):
+    state = conversion_state(state_path(tmp_path / "out.ply"))
+    assert state.name == "out.ply.resume.x1" and is_adapted(state)
 
 
 def test_an_observer_that_ends_the_conversion_ends_the_run():

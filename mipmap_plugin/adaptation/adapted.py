@@ -37,7 +37,7 @@ class Adapted:
     backend: Backend
     effects: Effects
     viewers: Mapping[str, Effects] = field(default_factory=dict)  # how each viewer that the file is made for renders it
-    state: StateFile | None = None  # the state of the run, which is needed until the model is saved
+    states: Sequence[StateFile] = ()  # of the run, and of a conversion before it, which are needed until the model is saved
     adapted_to: Sequence[Camera] = ()  # the cameras of the base scale that the model was adapted to or selected on
     cameras: Sequence[Camera] = ()  # the base's, at its scale
 
@@ -74,8 +74,8 @@ class Adapted:
         with together(Path(path)), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
             saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
             write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=overwrite)
-        if self.state is not None:
-            self.state.remove()
+        for state in self.states:
+            state.remove()
         return saved
 
 

@@ -1,17 +1,20 @@
 """A zoom-in for a renderer that draws otherwise than the training did, in two stages.
 
-Its way to draw is learned at the base's own scale, where an image costs 1/s² of one at x s; the zoom-in then starts from this conversion, in
-closed form. Both compare images of the base's size, so that nothing is lost. At x2, a board of stripes for spark has 24 dB without and 32 with it.
+Its way to draw is learned at the base's own scale, where an image has 1/s² of the pixels of one at x s; the zoom-in then starts from this
+conversion, in closed form. Both compare images of the base's size, so that nothing is lost. At x2, a board of stripes for spark has 24 dB
+without and 32 with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.optimization.loop import STOPPED
+from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import count_of_views
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
@@ -20,19 +23,20 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.models.places import conversion_state
 from mipmap_plugin.recipes import recipe as make_config
 
-# What the conversion is called in the report, and what is appended to the name of the state's file for its own.
-NAME, STATE = "the conversion at x1", ".x1"
+# What the conversion is called in the report.
+NAME = "the conversion at x1"
 
-# The fraction of a time budget that each stage may take. It does not depend on the clock, so that an interrupted zoom-in can be resumed.
+# The fraction of a time budget that each stage may take, whatever the other one takes, so that an interrupted zoom-in can be resumed.
 SHARE = 0.5
 
 
 def conversion(config: AdaptConfig, base: Effects, targets: Collection[Effects], scale: float) -> AdaptConfig | None:
     """The settings of the conversion before a zoom-in with `config`; None where there is none. `base`: how the base is rendered.
 
-    Its views are those of the zoom-in, whose images are drawn once, and so are its views for validation, to which nothing is adapted in either.
+    It looks from where the zoom-in does, whose views for validation are not adapted to in either.
     A file for several viewers has none: at x1, where their filters differ most, it would learn a compromise that a zoom-in does not need.
     """
     steps = min(config.conversion_steps, config.steps)
@@ -59,15 +63,44 @@ class Stages:
             return Session(self.request, scale, config, self.cameras, self.photographs).run(self.resume, self.observe)
         session = Session(self.request, 1.0, first, self.cameras, None)
         session.keeps_state = True
-        converted = session.run(self.resume and self.resume.with_name(self.resume.name + STATE), self.observe)
+        converted = session.run(self.resume and conversion_state(self.resume), self.observe)
+        half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if _stopped(converted.report) else {}))
         request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME))
-        stopped = converted.report.ended_by.startswith(STOPPED)
-        half = config.model_copy(update={"time_budget_s": _half(config), "steps": 0 if stopped else config.steps})
-        adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self.observe)
-        if converted.state is not None:
-            converted.state.remove()
-        settings = adapted.report.settings.model_copy(update={"time_budget_s": config.time_budget_s, "steps": config.steps})
-        return replace(adapted, report=_joined(converted.report, adapted.report.model_copy(update={"settings": settings})))
+        with _kept_if_interrupted(converted.states):
+            adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self._further(converted.report))
+        settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if _stopped(converted.report) else {})
+        report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings)})
+        return replace(adapted, report=_joined(converted.report, report), states=[*converted.states, *adapted.states])
+
+    def _further(self, first: Report) -> Observer | None:
+        """The observer of the second stage, whose steps and seconds are counted on from those of the first."""
+        observe, steps, spent = self.observe, _steps(first), first.seconds["total"]
+        if observe is None:
+            return None
+        return lambda step, seconds, render: step > 0 and observe(step + steps, seconds + spent, render)
+
+
+@contextmanager
+def _kept_if_interrupted(states: Sequence[StateFile]) -> Iterator[None]:
+    """Leave the states to the next run, should this one be interrupted; remove them should it fail, as no other run leaves one then."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        for state in states:
+            state.release()
+        raise
+    except Exception:
+        for state in states:
+            state.remove()
+        raise
+
+
+def _steps(report: Report) -> int:
+    return report.curve[-1].step
+
+
+def _stopped(report: Report) -> bool:
+    return report.ended_by.startswith(STOPPED)
 
 
 def _half(config: AdaptConfig) -> float | None:
@@ -80,5 +113,7 @@ def _joined(first: Report, second: Report) -> Report:
     spent = first.seconds["total"]
     seconds = {"conversion": spent, **second.seconds, "total": second.seconds["total"] + spent}
     curve = [point.model_copy(update={"seconds": point.seconds + spent}) for point in second.curve]
-    notes = [*second.notes, f"converted at x1 before, {first.gain()}, ended by {first.ended_by}"]
-    return second.model_copy(update={"seconds": seconds, "curve": curve, "notes": notes})
+    told = f"converted at x1 before, {first.gain()}, in {_steps(first)} steps{f', ended by {STOPPED}' if _stopped(first) else ''}"
+    peaks = [peak for peak in (first.peak_memory_mib, second.peak_memory_mib) if peak is not None]
+    changes = {"seconds": seconds, "curve": curve, "notes": [*first.notes, *second.notes, told], "peak_memory_mib": max(peaks, default=None)}
+    return second.model_copy(update=changes)

@@ -170,7 +170,7 @@ class Session:
         report = self._report(states[best], curve, ended_by, f"{best}{note}", psnrs)
         used_views = [*self.views, *self.validation.steering, *self.validation.choosing]
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
-        return Adapted(model, report, self.backend, self.effects, self.targets, self.state, used_views)
+        return Adapted(model, report, self.backend, self.effects, self.targets, [self.state] if self.state else [], used_views)
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
@@ -188,14 +188,15 @@ class Session:
                 self.detail.prepare(self.views)
             self.seconds["total"] += self.seconds["upsampling"]
         run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
-        task, config = within_budget(run, task, self.config)
 
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
             answer = observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
             return is_true(answer)
 
-        ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
+        if not run.ended_by:
+            task, config = within_budget(run, task, self.config)
+            run.ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
         if self.keeps_state:
             keeper.save(run)
         run.optimizer.state.clear()
@@ -205,7 +206,7 @@ class Session:
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + checks
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
-        return run, ended_by + fewer_note(self.asked_steps, self.config) + growth_note(run)
+        return run, run.ended_by + fewer_note(self.asked_steps, self.config) + growth_note(run)
 
     def copy_of_base(self) -> SplatModel:
         """A copy of the base that is rendered with the target's screen filter."""
@@ -266,7 +267,8 @@ class Session:
         return [next((effect for effect in same if effect.on), same[0]) for same in zip(*per_viewer, strict=True)]
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
-        notes = [note for note in student.notes if note not in self.base.notes]
+        known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]
+        notes = [note for note in student.notes if note not in known]
         for note in notes:
             warnings.warn(note, stacklevel=2)
         return Report(

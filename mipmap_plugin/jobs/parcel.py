@@ -15,7 +15,7 @@ from mipmap_plugin.formats.atomic import named, new_file, new_folder, refuse_out
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models import detect
 from mipmap_plugin.models.outputs import parts_of, refuse_parts
-from mipmap_plugin.models.places import state_path
+from mipmap_plugin.models.places import conversion_state, state_path
 from mipmap_plugin.scenes import load_scene
 
 # Folders of an unpacked parcel.
@@ -55,8 +55,7 @@ def pack(job: Job) -> Parcel:
     members = {BASE / part.relative_to(folder): part for part in parts}
     members |= {} if base.cameras is None else _scene(base.cameras, CAMERAS)
     members |= {} if job.images is None else _photographs(job.images, IMAGES)
-    state = state_path(job.target)
-    members |= {OUTPUT / state.name: state} if state.is_file() else {}
+    members |= {OUTPUT / state.name: state for state in _states(job.target) if state.is_file()}
     sent = replace(base, checkpoint=BASE / base.checkpoint.relative_to(folder), cameras=base.cameras and _packed(base.cameras, CAMERAS))
     target = OUTPUT / named(job.target).name
     return Parcel(replace(job, base=sent, target=target, images=job.images and _packed(job.images, IMAGES)), _archive(members))
@@ -71,8 +70,7 @@ def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
         (place / OUTPUT).mkdir(exist_ok=True)
         base = replace(job.base, checkpoint=place / job.base.checkpoint, cameras=job.base.cameras and place / job.base.cameras)
         outcome = do(replace(job, base=base, target=place / job.target, images=job.images and place / job.images))
-        state = state_path(place / job.target)
-        kept = {"done": (place / OUTPUT).rglob("*"), "interrupted": [state]}.get(outcome.status, [])
+        kept = {"done": (place / OUTPUT).rglob("*"), "interrupted": _states(place / job.target)}.get(outcome.status, [])
         written = [file for file in kept if file.is_file()]
         file = outcome.file and outcome.file.relative_to(place / OUTPUT)
         reason = outcome.reason.replace(f"{place}/", "")
@@ -81,7 +79,7 @@ def do_parcel(parcel: Parcel, do: Callable[[Job], Outcome]) -> Delivery:
 
 def unpack(delivery: Delivery, job: Job) -> Outcome:
     """Write what came back to where the job was to write it, atomically: its files, or the state of its run. Raises OutputExists, OutputError."""
-    outcome, place, state = replace(delivery.outcome, job=job), named(job.target).parent, state_path(job.target)
+    outcome, place = replace(delivery.outcome, job=job), named(job.target).parent
     if outcome.status == "interrupted":
         with tarfile.open(fileobj=io.BytesIO(delivery.files)) as archive:
             for member in archive.getmembers():
@@ -99,8 +97,15 @@ def unpack(delivery: Delivery, job: Job) -> Outcome:
         else:
             for member in archive.getmembers():
                 _write(archive, member, place, job, parts_of(source, model_folder))
-    state.unlink(missing_ok=True)
+    for state in _states(job.target):
+        state.unlink(missing_ok=True)
     return replace(outcome, file=place / outcome.file)
+
+
+def _states(target: Path) -> list[Path]:
+    """Where the states of a run, and of a conversion before it, are."""
+    state = state_path(target)
+    return [state, conversion_state(state)]
 
 
 def _write(archive: tarfile.TarFile, member: tarfile.TarInfo, place: Path, job: Job, base: list[Path]) -> None:

@@ -16,7 +16,7 @@ from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import refuse_as_folder
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.places import CONVERTED, REPORT, STATE
 
 # Subfolders in which the supported projects keep parts of a checkpoint.
 PARTS = ("point_cloud", "deform", "ckpts", "nerfstudio_models")
@@ -105,4 +105,4 @@ def _belongs(name: str, source: str) -> bool:
 def is_adapted(file: Path) -> bool:
     """Whether a file is the output of an adaptation, its report or the state of its run. Raises OutputError for a root."""
     file = named(file)
-    return file.name.endswith((REPORT, ".resume")) or file.with_name(file.name + REPORT).exists()
+    return file.name.endswith((REPORT, STATE, STATE + CONVERTED)) or file.with_name(file.name + REPORT).exists()

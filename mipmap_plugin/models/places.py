@@ -14,6 +14,9 @@ SPLATFACTO = ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")
 # What is appended to the name of an adapted file, for the report that lies beside it.
 REPORT = ".adaptation.json"
 
+# What is appended to it for the state of an unfinished run, and to that for the state of the conversion before the run.
+STATE, CONVERTED = ".resume", ".x1"
+
 # What lies in the folder of a ladder of levels.
 LADDER = "levels.json"
 
@@ -47,4 +50,9 @@ def is_coarse(ply: Path) -> bool:
 def state_path(output: Path) -> Path:
     """The path of the state of a run whose model is to be saved to `output`."""
     output = named(output)
-    return output.with_name(output.name + ".resume")
+    return output.with_name(output.name + STATE)
+
+
+def conversion_state(state: Path) -> Path:
+    """The path of the state of the conversion before a run with that `state` (`adaptation.conversion`)."""
+    return state.with_name(state.name + CONVERTED)

@@ -120,6 +120,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "costs": run.costs.sums(),
         "square_error": float(run.square_error),
         "rows_changed": run.rows_changed,
+        "ended_by": run.ended_by,
         "curve": [point.model_dump() for point in run.curve],
         "parameters": {name: tensor.detach() for name, tensor in run.student.parameters().items()},
         "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
@@ -133,7 +134,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
 
 def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) -> Run:
     """Return the run of a state that `save_run` wrote; its parameters replace those of `student`."""
-    for name, kind in (("step", int), ("seconds", float), ("square_error", float), ("rows_changed", bool)):
+    for name, kind in (("step", int), ("seconds", float), ("square_error", float), ("rows_changed", bool), ("ended_by", str)):
         if not isinstance(state[name], kind):
             raise TypeError(f"{name} must be of type {kind.__name__}")
     device = student.parameters()["means"].device
@@ -157,6 +158,7 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     return Run(
         student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, steering, _trial(state["trial"], device), state["step"],
         [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"], Costs(earlier=tuple(state["costs"])),
+        state["ended_by"],
     )  # fmt: skip
 
 

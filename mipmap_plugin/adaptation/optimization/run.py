@@ -102,6 +102,7 @@ class Run:
     square_error: Tensor | float = 0.0  # summed since the last point of the curve, on the device of the images, so that no step waits for it
     rows_changed: bool = False  # splats were added or removed
     costs: Costs = field(default_factory=Costs)
+    ended_by: str = ""  # why it takes no further step; "" while it does
     by_rows: ByRows | None = None  # the student, while the backend moves it
     threads: QuickestThreads = field(default_factory=QuickestThreads)
 

@@ -186,7 +186,7 @@ class LevelRun:
         warm_up(self.scene.backend, self.finest, drawn_with, gradients=self.config.steps > 0, merging=True)
         with announced(f"level {self.number}: merging"):
             student, name = self._start()
-        initial, states, curve, ended_by, state = student.copy(), {}, [], "0 steps", None
+        initial, states, curve, ended_by, kept = student.copy(), {}, [], "0 steps", None
         states[f"the start, {name}"] = initial
         self.seconds["total"] = time.perf_counter() - began
         if self.config.steps:
@@ -195,12 +195,13 @@ class LevelRun:
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
             ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due)
             states |= run.states(initial)
-            curve, state, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
+            curve, kept, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
             self.seconds["optimization"] = run.watch.seconds - run.costs.seconds()
         best, psnrs = self.validation.choose(states)
         report = self._report(states[best], curve, ended_by, best, psnrs)
         effects = {str(self.scene.request.viewer): self.scene.target}
-        return Adapted(states[best], report, self.scene.backend, self.scene.target, effects, state, self.views, self.scene.views)
+        files = [kept] if kept else []
+        return Adapted(states[best], report, self.scene.backend, self.scene.target, effects, files, self.views, self.scene.views)
 
     def _start(self) -> tuple[SplatModel, str]:
         """The student, and what it is called: as few splats as a ladder by zoom would keep, or more where merging would cost too much."""
