@@ -294,11 +294,16 @@ def test_photographs_outside_the_folder_of_their_list_do_not_travel(tmp_path):
         pack(job_of(tmp_path, images=file))
 
 
-def test_an_interrupted_run_travels_with_its_state(tmp_path):
-    job = job_of(tmp_path, target=tmp_path / "new" / "out.ply", settings={"steps": 4, "seed": 0, "views": "given", "warm_up": 0})
+@pytest.mark.parametrize(("changes", "kept"), [({}, [".resume"]), (dict(scale=2.0, viewer="antialiased"), [".resume", ".resume.x1"])])
+def test_an_interrupted_run_travels_with_its_states(tmp_path, changes, kept):
+    """A zoom-in for another viewer has that of its conversion too."""
+    settings = {"steps": 4, "seed": 0, "views": "given", "warm_up": 0}
+    job = replace(job_of(tmp_path, target=tmp_path / "new" / "out.ply", settings=settings), **changes)
 
     def interrupted(job):
-        stopped = lambda run, task, config, stop, observe: adapt(run, task, config, stop, lambda run: stop(run) if run.step == 2 else None)  # noqa: E731
+        def stopped(run, task, config, stop, observe):
+            return adapt(run, task, config, stop, lambda run: stop(run) if run.step == 2 and task.scale == job.scale else None)
+
         with pytest.MonkeyPatch.context() as patched:
             patched.setattr("mipmap_plugin.adaptation.session.adapt", stopped)
             try:
@@ -307,13 +312,13 @@ def test_an_interrupted_run_travels_with_its_state(tmp_path):
                 return Outcome(job, "interrupted", reason=str(interrupt))
 
     outcome = unpack(do_parcel(pack(job), interrupted), job)
-    state = job.target.with_name("out.ply.resume")
-    assert outcome.status == "interrupted" and state.is_file() and not job.target.exists()
+    states = [job.target.with_name(f"out.ply{ending}") for ending in kept]
+    assert outcome.status == "interrupted" and sorted(job.target.parent.glob("*.resume*")) == states and not job.target.exists()
     began = []
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, *rest: began.append(run.step) or adapt(run, *rest))
         assert unpack(do_parcel(pack(job), run_job), job).status == "done"
-    assert began == [2] and not state.exists()
+    assert began == [2] and not any(state.exists() for state in states)
     whole = replace(job, target=tmp_path / "whole.ply")
     assert run_job(whole).status == "done" and whole.target.read_bytes() == job.target.read_bytes()
 
