@@ -149,8 +149,6 @@ class Effects:
     def __post_init__(self) -> None:
         if unknown := [name for name in self.outputs if name not in list(OUTPUTS)]:
             raise SettingsError(f"there is no output {unknown[0]!r}; choose from {', '.join(OUTPUTS)}")
-        if not isinstance(self.screen_filter, str):
-            raise SettingsError(f"a screen filter is a name, such as 'classic', got {self.screen_filter!r}")
         if len(self.background) != 3 or not all(map(math.isfinite, self.background)):
             raise SettingsError(f"background must be three finite numbers, got {self.background!r}")
         if not 0 <= self.eps2d < math.inf or self.sh_degree < 0 or self.supersampling < 1:

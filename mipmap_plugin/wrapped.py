@@ -86,6 +86,7 @@ class Wrapped:
         keeps its size in the world. Filters that integrate over the pixel dilate splats in this way too, because a classic model was
         trained to look right with dilation. Raises SettingsError for an unknown viewer, and for a viewer together with a filter.
         """
+        check_kinds(screen_filter=(screen_filter, str))
         trained = self.trained
         degree = self._needs.sh_degree
         if viewer is not None:
@@ -96,8 +97,8 @@ class Wrapped:
         if screen_filter in (None, "scaled"):
             eps2d = trained.eps2d * (scale**2 if screen_filter == "scaled" else 1)
             return Effects(degree, trained.screen_filter, eps2d, self.background, supersampling, trained.near_plane)
-        eps2d = USUAL_EPS2D.get(str(screen_filter), DILATION)
-        if screen_filter in list(INTEGRALS) and trained.screen_filter == "classic":
+        eps2d = USUAL_EPS2D.get(screen_filter, DILATION)
+        if screen_filter in INTEGRALS and trained.screen_filter == "classic":
             eps2d = trained.eps2d * scale**2
         return Effects(degree, screen_filter, eps2d, self.background, supersampling, trained.near_plane)
 

@@ -90,7 +90,7 @@ def test_without_dilation_nothing_is_compensated():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"), [(dict(screen_filter=["mip"]), "a screen filter is a name"), (dict(outputs=[["depth"]]), "there is no output")]
+    ("wrong", "sentence"), [(dict(screen_filter=["mip"]), "screen_filter must be a str, got list"), (dict(outputs=[["depth"]]), "there is no output")]
 )
 def test_names_of_another_type_are_refused(wrong, sentence):
     with pytest.raises(SettingsError, match=sentence):
