@@ -16,7 +16,6 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import INTEGRATED, Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting import buckets
 from mipmap_plugin.splatting.packing import packed
 
 NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
@@ -87,7 +86,7 @@ class CpuBackend:
             raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
         packing = effects.settings.packing
         g = gaussians if packing is None else packed(gaussians, camera, packing)
-        ranks = buckets.ranks(gaussians, camera).numpy() if effects.settings.bucketed else None
+        ranks = _ranks(gaussians, camera) if effects.settings.bucketed else None
         return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), ranks
 
 
@@ -101,6 +100,15 @@ def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[flo
     arrays = tuple(tensor.contiguous().numpy() for tensor in (means, *further))
     nearest, least = pairing.nearest_along(arrays, reach, *limits)
     return torch.from_numpy(nearest), torch.from_numpy(least)
+
+
+def _ranks(gaussians: Gaussians, camera: Camera) -> Any:
+    """`splatting.buckets.ranks`, compiled."""
+    _drawing()  # reports what numba lacks
+    from mipmap_plugin.backends.cpu_kernels import bucketing
+
+    means, scales = (tensor.detach().contiguous().numpy() for tensor in (gaussians.means, gaussians.scales))
+    return bucketing.ranks(means, scales, camera)
 
 
 def _drawing() -> ModuleType:

@@ -7,6 +7,8 @@ in memory, which is Morton order.
 from __future__ import annotations
 
 import math
+from itertools import accumulate
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,8 +25,9 @@ WEIGHTS = ((0, 40), (2, 20), (5, 8), (10, 3), (BINS, 1))
 # There are 2^b + 1 buckets, b = round(log2(N / 4)) clamped to these bounds.
 LEAST_BITS, MOST_BITS = 10, 20
 
-# Bits of the Morton code per axis.
+# Bits of the Morton code per axis, and how they are spread to every third place: (shift, bits kept), twice as far apart each time.
 MORTON_BITS = 10
+SPREADING = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
 
 
 @torch.no_grad()
@@ -37,32 +40,45 @@ def ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
     sizes = gaussians.scales.double().nan_to_num(0.0, 0.0, 0.0).abs().amax(1, keepdim=True)
     if not len(means):
         return torch.zeros(0, dtype=torch.int32, device=means.device)
-    eye, forward = camera.center.to(means), camera.viewmat[2, :3].to(means)
-    box = torch.stack([(means - BOX * sizes).amin(0), (means + BOX * sizes).amax(0)])
-    corners = torch.cartesian_prod(*box.T) - eye
-    nearest, farthest = (corners @ forward).aminmax()
-    bins = (farthest - (means - eye) @ forward) * BINS / (farthest - nearest).clamp_min(torch.finfo(means.dtype).tiny)
-    own = int((farthest / (farthest - nearest) * BINS).nan_to_num().floor().clamp(0, BINS - 1))
-    buckets = _buckets(bins, own, len(means))
+    depths = ((means - camera.center.to(means)) * camera.viewmat[2, :3].to(means)).sum(1)
+    scale = depth_scale(torch.stack([(means - BOX * sizes).amin(0), (means + BOX * sizes).amax(0)]), len(means), camera)
+    bins = (scale.farthest - depths) * BINS / scale.range
+    # A splat at the very end of the last bin has a bucket of its own.
+    first, count_of = means.new_tensor(scale.firsts), means.new_tensor([*scale.counts, 0])
+    whole = bins.long().clamp(0, BINS)
+    buckets = (first[whole] + count_of[whole] * (bins - whole)).long()
     order = ((buckets.max() - buckets) << 3 * MORTON_BITS | _morton(means)).argsort(stable=True)
     return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device)).int()
 
 
-def _buckets(bins: Tensor, own: int, count: int) -> Tensor:
-    """Bucket of each splat, [N] int64; higher is nearer. `bins` [N] is 0..BINS from farthest to nearest; `own` is the camera's bin."""
+class DepthScale(NamedTuple):
+    """The bins of a view, from the farthest to the nearest, and the buckets of each."""
+
+    farthest: float  # depth, in world units
+    range: float  # from the nearest depth to the farthest
+    firsts: list[int]  # [BINS + 1]: the first bucket of each bin; higher is nearer
+    counts: list[int]  # [BINS]: how many buckets it has
+
+
+def depth_scale(box: Tensor, count: int, camera: Camera) -> DepthScale:
+    """The bins and buckets for `count` splats in `box` [2, 3], the least and the greatest coordinates, in float64."""
+    corners = torch.cartesian_prod(*box.T) - camera.center.to(box)
+    nearest, farthest = map(float, (corners @ camera.viewmat[2, :3].to(box)).aminmax())
+    extent = max(farthest - nearest, torch.finfo(box.dtype).tiny)
+    own = int(min(max(farthest / extent * BINS, 0), BINS - 1))  # the camera's bin
     most = 2 ** min(max(round(math.log2(count / 4)), LEAST_BITS), MOST_BITS) + 1
     weights = [next(weight for reach, weight in WEIGHTS if abs(i - own) <= reach) for i in range(BINS)]
-    sizes = [max(1, weight * most // sum(weights)) for weight in weights]
-    sizes[-1] = max(1, sizes[-1] - max(0, sum(sizes) - most))
-    # A splat at the very end of the last bin has a bucket of its own.
-    first, count_of = bins.new_tensor([0, *sizes]).cumsum(0), bins.new_tensor([*sizes, 0])
-    whole = bins.long().clamp(0, BINS)
-    return (first[whole] + count_of[whole] * (bins - whole)).long()
+    counts = [max(1, weight * most // sum(weights)) for weight in weights]
+    counts[-1] = max(1, counts[-1] - max(0, sum(counts) - most))
+    return DepthScale(farthest, extent, [0, *accumulate(counts)], counts)
 
 
 def _morton(means: Tensor) -> Tensor:
     """Morton code of each center, [N] int64: interleaved bits of x, y and z in a grid of 2^MORTON_BITS cells per axis of their bounding box."""
     low, high = means.amin(0), means.amax(0)
     cells = ((means - low) * 2**MORTON_BITS / (high - low).clamp_min(torch.finfo(means.dtype).tiny)).clamp_max(2**MORTON_BITS - 1).long()
-    bits = [((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(MORTON_BITS) for axis in range(3)]
-    return sum(bits, torch.zeros_like(cells[:, 0]))
+    for shift, kept in SPREADING:
+        cells = (cells | cells << shift) & kept
+    x, y, z = cells.unbind(1)
+    code: Tensor = x | y << 1 | z << 2
+    return code

@@ -79,7 +79,7 @@ def _budget_left(run: Run, config: AdaptConfig) -> float:
 def is_checked(step: int, config: AdaptConfig) -> bool:
     """Whether the run is checked after this step: more often during the warm-up, and if the run is short."""
     warm_up = config.warm_up_steps
-    every = max(1, warm_up // CHECKS_IN_WARM_UP) if step < warm_up else max(STEPS_BETWEEN, config.steps // CHECKS)
+    every = math.ceil(warm_up / CHECKS_IN_WARM_UP) if step < warm_up else max(STEPS_BETWEEN, config.steps // CHECKS)
     every = min(every, config.check_every)
     return step % every == 0 or step in (warm_up, config.steps)
 
