@@ -24,20 +24,37 @@ DIGITS = 16
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One view. Compared and hashed by identity, so that a cache keyed by a camera is exact."""
+    """One view of a pinhole camera, with the axes of OpenCV: x right, y down, z forward. The centers of pixels lie at +0.5.
 
-    width: int  # px
-    height: int  # px
-    fx: float  # px
-    fy: float  # px
-    cx: float  # px, continuous: the left edge of the image is 0
-    cy: float  # px
-    viewmat: Tensor  # [4, 4] float64 on the CPU, world to camera
+    Compared and hashed by identity, so that a cache keyed by a camera is exact. Raises SettingsError or ShapeError for numbers that are no camera.
+
+    Attributes:
+        width: Of the image, px.
+        height: Of the image, px.
+        fx: Focal length in x, px.
+        fy: Focal length in y, px.
+        cx: Principal point, px from the left edge of the image, which is 0.
+        cy: Principal point, px from the upper edge.
+        viewmat: [4, 4] float64 on the CPU, from the world to the camera; given as a tensor or an array of any type, which is copied.
+        name: Of the view, as in messages and files: that of its photograph, for example.
+        split: Whether the base was trained on it; views of "test" are for judging.
+        time: 0..1, for moving scenes; None: the scene does not move.
+        zoom: Sampling rate ÷ that of training; models with levels of detail choose their level by it.
+        index: Number of the view in training, for models with one appearance embedding per view.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    viewmat: Tensor
     name: str = ""
     split: Literal["train", "test"] = "train"
-    time: float | None = None  # 0..1, for moving scenes
-    zoom: float = 1.0  # sampling rate ÷ that of training; models with levels of detail choose their level by it
-    index: int | None = None  # number of the training view, for models with one appearance embedding per view
+    time: float | None = None
+    zoom: float = 1.0
+    index: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):

@@ -134,17 +134,28 @@ class Effects:
     """How one image is rendered.
 
     `eps2d` is the variance of the screen filter in px² of the *output* image; supersampling keeps it there.
+
+    Attributes:
+        sh_degree: Of the colors; bands above it are not evaluated.
+        screen_filter: "classic" dilates; "antialiased" and "mip" also compensate; the others integrate over the pixel.
+        eps2d: The variance that the filter adds, px² of the image.
+        background: RGB, 0..1.
+        supersampling: N, for N x N samples per pixel, averaged.
+        near_plane: Depth up to which splats are not drawn, world units.
+        outputs: What is rendered besides the image: "depth", "normals".
+        settings: Cut-offs, order and rounding.
+        exposure: Whether the exposure of the view's photograph is applied (`models.exposure`).
     """
 
-    sh_degree: int = 3  # bands above it are not evaluated
-    screen_filter: str = "classic"  # "classic" dilates; "antialiased" and "mip" also compensate; the others integrate over the pixel
-    eps2d: float = DILATION  # px²
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear RGB
-    supersampling: int = 1  # N: N x N samples per pixel, averaged
-    near_plane: float = NEAR_PLANE  # world units
+    sh_degree: int = 3
+    screen_filter: str = "classic"
+    eps2d: float = DILATION
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    supersampling: int = 1
+    near_plane: float = NEAR_PLANE
     settings: RenderSettings = USUAL
-    outputs: tuple[str, ...] = ()  # of OUTPUTS
-    exposure: bool = False  # the exposure of the view's photograph is applied (`models.exposure`)
+    outputs: tuple[str, ...] = ()
+    exposure: bool = False
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.outputs if name not in list(OUTPUTS)]:
@@ -158,12 +169,16 @@ class Effects:
 
 @dataclass(frozen=True)
 class Effect:
-    """One thing that can be simulated, whether it is on here, and why."""
+    """One thing that can be simulated, whether it is on here, and why.
+
+    Attributes:
+        cost: In operations: what it costs if it is on, and what is saved if it is off.
+    """
 
     name: str
     on: bool
     reason: str
-    cost: str  # in operations: what it costs if it is on, and what is saved if it is off
+    cost: str
 
     def __str__(self) -> str:
         return f"{self.name}: {'on' if self.on else 'off'}, {self.reason} ({'costs' if self.on else 'saves'} {self.cost})"

@@ -14,14 +14,23 @@ from mipmap_plugin.errors import ShapeError
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N splats in world space, activated: scales are lengths, opacities lie in 0..1. Raises ShapeError if the tensors do not fit together."""
+    """N splats in world space, activated: scales are lengths, opacities lie in 0..1. Raises ShapeError if the tensors do not fit together.
 
-    means: Tensor  # [N, 3] world units
-    quats: Tensor  # [N, 4] wxyz, any norm > 0
-    scales: Tensor  # [N, 3] world units, standard deviations along the local axes
-    opacities: Tensor  # [N]
-    sh: Tensor  # [N, (degree + 1)**2, 3] basis-major
-    covariances: Tensor | None = None  # [N, 3, 3] world units², overrides quats and scales where a family needs it
+    Attributes:
+        means: [N, 3] world units.
+        quats: [N, 4] wxyz, any norm > 0.
+        scales: [N, 3] world units, standard deviations along the local axes.
+        opacities: [N], 0..1.
+        sh: [N, (degree + 1)**2, 3], coefficients of the colors' spherical harmonics, basis-major, as 3DGS has them; degree 0 to 4.
+        covariances: [N, 3, 3] world units², override quats and scales where a family needs it; None: they do not.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    sh: Tensor
+    covariances: Tensor | None = None
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]

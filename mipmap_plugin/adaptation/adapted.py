@@ -30,16 +30,27 @@ from mipmap_plugin.torch_modes import usual_modes
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Adapted:
-    """A model that looks right at its scale, and the report of how it was made."""
+    """A model that looks right at its scale, and the report of how it was made.
+
+    Attributes:
+        model: The adapted model.
+        report: How it was made, and what it gained.
+        backend: What renders it.
+        effects: How it is rendered: by the filter that its file is for.
+        viewers: How each viewer that the file is made for renders it.
+        states: Of the run, and of a conversion before it, which are needed until the model is saved.
+        adapted_to: The cameras of the base scale that the model was adapted to or selected on.
+        cameras: The base's, at its scale.
+    """
 
     model: SplatModel
     report: Report
     backend: Backend
     effects: Effects
-    viewers: Mapping[str, Effects] = field(default_factory=dict)  # how each viewer that the file is made for renders it
-    states: Sequence[StateFile] = ()  # of the run, and of a conversion before it, which are needed until the model is saved
-    adapted_to: Sequence[Camera] = ()  # the cameras of the base scale that the model was adapted to or selected on
-    cameras: Sequence[Camera] = ()  # the base's, at its scale
+    viewers: Mapping[str, Effects] = field(default_factory=dict)
+    states: Sequence[StateFile] = ()
+    adapted_to: Sequence[Camera] = ()
+    cameras: Sequence[Camera] = ()
 
     @usual_modes()
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:

@@ -12,16 +12,25 @@ from mipmap_plugin.config import AdaptConfig
 
 
 class CurvePoint(BaseModel):
-    """One point of accuracy against time."""
+    """One point of accuracy against time.
+
+    Attributes:
+        step: Steps before it.
+        seconds: Of adapting, including the time before the first step, excluding the time that an observer takes.
+        psnr_db: PSNR against the pseudo truth, over the views since the last point; None where no step was taken since.
+        validation_db: PSNR of the state that the run continues from, on views that nothing is adapted to.
+        gaussians: How many splats there are.
+        taken_back: The steps since the best state did harm, and were undone.
+    """
 
     model_config = ConfigDict(frozen=True)
 
     step: int
-    seconds: float  # of adapting, including the time before the first step, excluding the time that an observer takes
-    psnr_db: float | None  # against the pseudo truth, over the views since the last point; None where no step was taken since
-    validation_db: float  # of the state that the run continues from, on views that nothing is adapted to
+    seconds: float
+    psnr_db: float | None
+    validation_db: float
     gaussians: int
-    taken_back: bool = False  # the steps since the best state did harm, and were undone
+    taken_back: bool = False
 
 
 class Stopwatch:

@@ -18,30 +18,53 @@ AS_IT_IS = "the base as it is"
 
 
 class Report(BaseModel):
-    """Everything needed to assess an adapted model, or to make it again."""
+    """Everything needed to assess an adapted model, or to make it again.
+
+    Attributes:
+        scale: What it was adapted to, over the scale of the training.
+        base: sha256 of the base checkpoint; of its parameters, where it was made in memory.
+        settings: Those of the run, as the recipe and its overrides give them.
+        backend: Which one, and why.
+        views: Which views were adapted to, in a sentence.
+        viewer: What the file is made for; None: any viewer that renders as 3DGS does, or the base's project if it keeps its filter.
+        filters: Of the pseudo truth, the base and the adapted file.
+        effects: What adapting and rendering simulate, what they do not, and why.
+        gaussians_before: Splats of the base.
+        gaussians_after: Splats of the file.
+        seconds: By phase; "total": all of them but "loading".
+        ended_by: What ended the run, such as a number of steps or a time budget.
+        returned: Which of the run's states the file holds, and why if it is not the last.
+        validation: dB of each state on views that nothing was adapted to and that did not steer the run, at most 54 of a view.
+        viewers: Of a file for several viewers: dB in each on the same views; `validation` is the worst of the extreme viewers.
+        peak_memory_mib: Of tensors on the GPU while adapting; None without a GPU.
+        curve: Quality against time; a point per check.
+        versions: Of this package and of torch.
+        notes: What became of the model on the way, such as columns of the base's file that the new splats do not have, in sentences.
+        inputs: What was given beside the checkpoint: hashes of cameras and photographs, background, screen filter.
+    """
 
     model_config = ConfigDict(frozen=True)
 
     scale: float
-    base: str  # sha256 of the base checkpoint; of its parameters, where it was made in memory
+    base: str
     settings: AdaptConfig
-    backend: str  # which one, and why
-    views: str  # which views were adapted to, in a sentence
-    viewer: str | None = None  # what the file is made for; None: any viewer that renders as 3DGS does, or the base's project if it keeps its filter
-    filters: str  # of the pseudo truth, the base and the adapted file
-    effects: list[Effect]  # what adapting and rendering simulate, what they do not, and why
+    backend: str
+    views: str
+    viewer: str | None = None
+    filters: str
+    effects: list[Effect]
     gaussians_before: int
     gaussians_after: int
-    seconds: dict[str, float]  # by phase; "total": all of them but "loading"
+    seconds: dict[str, float]
     ended_by: str
-    returned: str  # which of the run's states the file holds, and why if it is not the last
-    validation: dict[str, float]  # dB of each state on views that nothing was adapted to and that did not steer the run, at most 54 of a view
-    viewers: dict[str, float] = {}  # of a file for several viewers: dB in each on the same views; `validation` is the worst of the extreme viewers
-    peak_memory_mib: float | None = None  # of tensors on the GPU while adapting; None without a GPU
+    returned: str
+    validation: dict[str, float]
+    viewers: dict[str, float] = {}
+    peak_memory_mib: float | None = None
     curve: list[CurvePoint]
     versions: dict[str, str]
-    notes: list[str] = []  # what became of the model on the way, such as columns of the base's file that the new splats do not have, in sentences
-    inputs: dict[str, str] = {}  # what was given beside the checkpoint: hashes of cameras and photographs, background, screen filter
+    notes: list[str] = []
+    inputs: dict[str, str] = {}
 
     def psnr_before(self) -> float | None:
         """PSNR (dB) of the base on views that nothing was adapted to; None if it was not measured."""

@@ -47,15 +47,22 @@ API_VERSION = 1
 
 
 class Rendered:
-    """One image, differentiable in the Gaussians that it was rendered from."""
+    """One image, differentiable in the Gaussians that it was rendered from.
+
+    Attributes:
+        image: [H, W, 3] RGB, background included, not clamped.
+        depth: [H, W] world units, on request (`geometry.depth`); this and the following are added by a wrapped model.
+        normals: [H, W, 3] unit vectors in the axes of the world, on request (`geometry.normals`).
+        effects: The effects that were simulated, and those that were not.
+    """
 
     def __init__(
         self,
-        image: Tensor,  # [H, W, 3], background included, not clamped
-        alpha: Tensor | Callable[[], Tensor],  # [H, W], 1 - transmittance; or a function that renders it, if that takes another pass
-        depth: Tensor | None = None,  # [H, W] world units, on request (`geometry.depth`); this and the following are added by a wrapped model
-        normals: Tensor | None = None,  # [H, W, 3] unit, world axes, on request (`geometry.normals`)
-        effects: tuple[Effect, ...] = (),  # the effects that were simulated, and those that were not
+        image: Tensor,
+        alpha: Tensor | Callable[[], Tensor],  # or a function that renders it, if that takes another pass
+        depth: Tensor | None = None,
+        normals: Tensor | None = None,
+        effects: tuple[Effect, ...] = (),
     ) -> None:
         self.image, self.depth, self.normals, self.effects, self._alpha = image, depth, normals, effects, alpha
 
@@ -74,9 +81,19 @@ class Rendered:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a request requires of a backend."""
+    """What a request requires of a backend.
 
-    device: str  # torch device type: "cpu", "cuda", ...
+    Attributes:
+        device: Torch device type: "cpu", "cuda", ...
+        dtype: Of the splats.
+        gradients: Whether the image is to be differentiable.
+        sh_degree: Of the colors.
+        screen_filter: As in `Effects`.
+        covariances: Whether splats have them in place of quaternions and scales.
+        settings: As in `Effects`.
+    """
+
+    device: str
     dtype: torch.dtype
     gradients: bool
     sh_degree: int
@@ -93,15 +110,25 @@ class Needs:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a backend can do, as data."""
+    """What a backend can do, as data.
 
-    devices: frozenset[str] | None  # torch device types; None: any
+    Attributes:
+        devices: Torch device types; None: any.
+        dtypes: Of the splats.
+        screen_filters: Names of `Effects.screen_filter`.
+        gradients: Whether images are differentiable in the splats.
+        max_sh_degree: The highest degree of spherical harmonics that is evaluated.
+        covariances: Whether splats may have covariances in place of quaternions and scales.
+        settings: Fields of `RenderSettings` that may differ from the usual, names of SETTINGS.
+    """
+
+    devices: frozenset[str] | None
     dtypes: frozenset[torch.dtype]
     screen_filters: frozenset[str]
     gradients: bool = True
     max_sh_degree: int = 4
     covariances: bool = True
-    settings: frozenset[str] = frozenset()  # names from SETTINGS
+    settings: frozenset[str] = frozenset()
 
     def lacking(self, needs: Needs) -> list[str]:
         """One reason for each need that is not met; empty if all are."""
@@ -134,16 +161,26 @@ class AdamStep:
     """A step of Adam (Kingma and Ba 2015) over the raw parameters of 3DGS: log scales, logits, quaternions of any norm.
 
     By name means [N, 3], quats [N, 4], scales [N, 3], opacities [N], and sh [N, K, 3], which is sh0 and shN in one; all are changed in place.
+
+    Attributes:
+        raw: The parameters.
+        first: The first moments, by the same names.
+        second: The second moments.
+        rates: By name, with sh0 and shN apart; over 1 - beta1^t, where this is step t.
+        betas: Decay rates of the moments.
+        correction: 1 / sqrt(1 - beta2^t).
+        eps: Added to the root of the second moment.
+        nesterov: With beta1 · first + (1 - beta1) · gradient in place of the first moment (Dozat 2016, without its schedule of beta1).
     """
 
     raw: Mapping[str, Tensor]
-    first: Mapping[str, Tensor]  # moments
+    first: Mapping[str, Tensor]
     second: Mapping[str, Tensor]
-    rates: Mapping[str, float]  # by name, with sh0 and shN apart; over 1 - beta1^t, where this is step t
+    rates: Mapping[str, float]
     betas: tuple[float, float]
-    correction: float  # 1 / sqrt(1 - beta2^t)
+    correction: float
     eps: float
-    nesterov: bool = False  # with beta1 · first + (1 - beta1) · gradient in place of the first moment (Dozat 2016, without its schedule of beta1)
+    nesterov: bool = False
 
 
 class Stepper(Protocol):

@@ -25,28 +25,48 @@ CARRIED = "carried"
 
 @dataclass(frozen=True)
 class TrainedScale:
-    """The screen filter and the sampling rate that a checkpoint was trained with."""
+    """The screen filter and the sampling rate that a checkpoint was trained with.
 
-    screen_filter: str = "classic"  # a name of splatting/filters.py
-    eps2d: float = DILATION  # px² of a training pixel
-    resolution: float = -1  # INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px
-    background: tuple[float, float, float] | None = None  # linear RGB; None: the checkpoint does not say
-    near_plane: float = NEAR_PLANE  # world units
-    keeps_filter: bool = False  # an adapted file needs this filter, so it is for the original project only; else it is classic, or for a viewer
+    Attributes:
+        screen_filter: "classic", "antialiased", "mip", or another name of `splatting.filters`.
+        eps2d: The variance that the filter adds, px² of a training pixel.
+        resolution: INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px.
+        background: RGB, 0..1; None: the checkpoint does not say.
+        near_plane: Depth up to which splats were not drawn, world units.
+        keeps_filter: An adapted file needs this filter, so it is for the original project only; else it is classic, or for a viewer.
+    """
+
+    screen_filter: str = "classic"
+    eps2d: float = DILATION
+    resolution: float = -1
+    background: tuple[float, float, float] | None = None
+    near_plane: float = NEAR_PLANE
+    keeps_filter: bool = False
 
 
 @dataclass(frozen=True)
 class Traits:
-    """Properties of a model. No other code depends on its family."""
+    """Properties of a model. No other code depends on its family.
 
-    same_for_all_views: bool = False  # rows are splats, the same for every camera: the model has `rebuild`, and splats may be merged
-    plain: bool = False  # the parameters are those of 3DGS, activated as there, so that a backend may move them itself (`Backend.render_to_step`)
-    moves: bool = False  # Gaussians depend on the camera's time
-    filtered: bool = False  # each splat has a 3D filter, which only the original project's viewer applies: the model has `fused` and `bare`
-    placed: bool = False  # trained in a coordinate frame or at an image size of its own: the model has `as_trained`
-    no_viewer: str = ""  # why no viewer (`viewers`) can draw the splats, a sentence without a full stop; empty if one can
-    exposures: Exposures = NO_EXPOSURES  # the trained color transformation of each photograph
-    effects: tuple[Effect, ...] = ()  # those of `effects.MODEL_EFFECTS` that the model simulates
+    Attributes:
+        same_for_all_views: Rows are splats, the same for every camera: the model has `rebuild`, and splats may be merged.
+        plain: The parameters are those of 3DGS, activated as there, so that a backend may move them itself (`Backend.render_to_step`).
+        moves: Gaussians depend on the camera's time.
+        filtered: Each splat has a 3D filter, which only the original project's viewer applies: the model has `fused` and `bare`.
+        placed: Trained in a coordinate frame or at an image size of its own: the model has `as_trained`.
+        no_viewer: Why no viewer (`viewers`) can draw the splats, a sentence without a full stop; empty if one can.
+        exposures: The trained color transformation of each photograph.
+        effects: Those of `effects.MODEL_EFFECTS` that the model simulates.
+    """
+
+    same_for_all_views: bool = False
+    plain: bool = False
+    moves: bool = False
+    filtered: bool = False
+    placed: bool = False
+    no_viewer: str = ""
+    exposures: Exposures = NO_EXPOSURES
+    effects: tuple[Effect, ...] = ()
 
 
 # Allowed names of parameters, each with a learning rate of its own (`config.LearningRates`). The first is required.
@@ -57,14 +77,22 @@ class SplatModel(Protocol):
     """What every model provides to be rendered, adapted and saved. A Protocol: plug-ins need no base class.
 
     Raw parameters are as the family stores them (log scales, logits); `gaussians` activates them.
+
+    Attributes:
+        family: The name of its family: "3dgs", "scaffold", ...
+        trained: The screen filter and the sampling rate of the training.
+        notes: Remarks for the user on how it was read, in sentences.
+        source: The file that was read; None: created in memory.
+        folder: The model folder around it; None: there is none.
+        digest: sha256 of the file, hexadecimal; "" for a model created in memory, such as a copy.
     """
 
-    family: str  # "3dgs", "scaffold", ...
+    family: str
     trained: TrainedScale
-    notes: list[str]  # remarks for the user on how it was read, in sentences
-    source: Path | None  # the file that was read; None: created in memory
-    folder: Path | None  # the model folder around it
-    digest: str  # sha256 of the file, hexadecimal; "" for a model created in memory, such as a copy
+    notes: list[str]
+    source: Path | None
+    folder: Path | None
+    digest: str
 
     @property
     def traits(self) -> Traits:
@@ -74,8 +102,11 @@ class SplatModel(Protocol):
         """The splats that this camera sees, differentiable in `parameters()`."""
 
     def parameters(self) -> dict[str, Tensor]:
-        """The tensors that adaptation optimizes, by names of PARAMETERS, with "means" [N, 3] among them. Row i of each belongs to the same
-        splat (or anchor). Deformation networks are not included."""
+        """The tensors that adaptation optimizes, by name, with "means" [N, 3] among them. Row i of each belongs to the same splat (or anchor).
+
+        Names are those of PARAMETERS: means, scales, quats, opacities, sh0, shN, offsets, features, and carried, which is never optimized.
+        Deformation networks are not included.
+        """
 
     def copy(self) -> SplatModel:
         """An independent model whose parameters are leaves that require gradients; this one does not change."""

@@ -27,12 +27,19 @@ OF_SPLATS = frozenset({"opacity", "scale_0", "rot_0"})
 
 @dataclass(frozen=True)
 class Match:
-    """A family's claim that a file is its own."""
+    """A family's claim that a file is its own.
 
-    sure: float  # certainty, 0..1
-    why: str  # the feature by which it was recognized
-    trouble: str = ""  # a sentence: why it cannot be loaded nevertheless
-    lacks: tuple[str, ...] = ()  # files missing beside it; of a model folder, an older iteration that has them is loaded instead
+    Attributes:
+        sure: Certainty, 0..1.
+        why: The feature by which it was recognized.
+        trouble: A sentence: why it cannot be loaded nevertheless.
+        lacks: Files missing beside it; of a model folder, an older iteration that has them is loaded instead.
+    """
+
+    sure: float
+    why: str
+    trouble: str = ""
+    lacks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.sure, (int, float)) or not 0 <= self.sure <= 1:
@@ -110,15 +117,25 @@ def _beginnings(text: str) -> tuple[bytes, bytes, bytes]:
 
 @dataclass(frozen=True)
 class Family:
-    """One kind of checkpoint. Built-in (`families`) and third-party families are such records."""
+    """One kind of checkpoint. Built-in (`families`) and third-party families are such records.
 
-    name: str  # short name, used in reports
-    title: str  # the name its authors use
-    recognize: Callable[[Files], Match | None]  # None: the file is not of this family
+    Attributes:
+        name: Short name, used in reports.
+        title: The name its authors use.
+        recognize: A file -> the claim that it is of this family; None: it is not.
+        load: `(path, *, iteration) -> SplatModel`, or "package.module:function". The path is the user's, a file or a folder, in which `detect`
+            finds the file. None: recognized, but not loaded.
+        before: Families over which this one takes precedence when both claim a file.
+        place: In a result folder: the subfolder and the pattern of file names, which may have a group `step`.
+        api_version: `API_VERSION` of the contract that it was written for.
+        not_loaded: Addition to the message for a family that is not loaded.
+    """
+
+    name: str
+    title: str
+    recognize: Callable[[Files], Match | None]
     api_version: int
-    # (path, *, iteration) -> SplatModel, or "package.module:function". The path is the user's, a file or a folder, in which `detect`
-    # finds the file. None: recognized, but not loaded.
     load: str | Callable[..., Any] | None = None
-    before: tuple[str, ...] = ()  # families over which this one takes precedence when both claim a file
-    place: tuple[str, str] | None = None  # in a result folder: the subfolder and the pattern of file names, which may have a group `step`
-    not_loaded: str = ""  # addition to the message for a family that is not loaded
+    before: tuple[str, ...] = ()
+    place: tuple[str, str] | None = None
+    not_loaded: str = ""

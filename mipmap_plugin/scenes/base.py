@@ -19,16 +19,27 @@ from mipmap_plugin.scenes.lenses import Lens
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The scene at one path. Cameras without an image are usable views: adaptation needs no photographs."""
+    """The scene at one path. Cameras without an image are usable views: adaptation needs no photographs.
+
+    Attributes:
+        cameras: In the order of the files.
+        images: The photographs that were found; there may be none.
+        source: The path.
+        notes: What was assumed or left out, one sentence each.
+        points: [P, 3] float64, the points of structure from motion, where the files hold them.
+        applied: [4, 4] float64, transform that nerfstudio applied to COLMAP's world before it wrote the file.
+        applied_scale: The scale that it applied then.
+        lenses: Of photographs that have to be undistorted.
+    """
 
     cameras: tuple[Camera, ...]
-    images: dict[Camera, Path]  # may be empty
+    images: dict[Camera, Path]
     source: Path
-    notes: list[str] = field(default_factory=list)  # what was assumed or left out, one sentence each
-    points: Tensor | None = None  # [P, 3] float64, the points of structure from motion, where the files hold them
-    applied: Tensor | None = None  # [4, 4] float64, transform that nerfstudio applied to COLMAP's world before it wrote the file
-    applied_scale: float = 1.0  # and its scale
-    lenses: dict[Path, Lens] = field(default_factory=dict)  # of photographs that have to be undistorted
+    notes: list[str] = field(default_factory=list)
+    points: Tensor | None = None
+    applied: Tensor | None = None
+    applied_scale: float = 1.0
+    lenses: dict[Path, Lens] = field(default_factory=dict)
 
     def digest(self) -> str:
         """A hash of the cameras and of the photographs: of their names and sizes in bytes, not of what they show."""

@@ -21,18 +21,31 @@ from mipmap_plugin.screen_filters import SCREEN_FILTERS
 
 @dataclass(frozen=True)
 class Viewer:
-    """One drawing convention: a screen filter and further render settings."""
+    """One drawing convention: a screen filter and further render settings.
+
+    Attributes:
+        name: Short name, as in `--viewer`.
+        title: The name that people know it by.
+        source: The source code this record was taken from, with its version.
+        screen_filter: As in `Effects`: "classic" dilates, "antialiased" and "mip" compensate.
+        eps2d: The variance that the filter adds, px² of the image.
+        settings: What else differs from 3DGS: cut-offs, order, rounding.
+        near_plane: World units; None: decided by the page that embeds the viewer.
+        sh_degree: Bands above it are not drawn.
+        filter_3d: Whether the viewer reads the column filter_3D of a PLY and smooths splats by it.
+        unlike: Known differences between the viewer and this record.
+    """
 
     name: str
     title: str
-    source: str  # the source code this record was taken from, with its version
-    screen_filter: str  # of `Effects`: "classic" dilates, "antialiased" and "mip" compensate
-    eps2d: float  # px² of the image
+    source: str
+    screen_filter: str
+    eps2d: float
     settings: RenderSettings = USUAL
-    near_plane: float | None = None  # world units; None: decided by the page that embeds the viewer
-    sh_degree: int = 3  # bands above it are not drawn
-    filter_3d: bool = False  # whether the viewer reads the column filter_3D of a PLY and smooths splats by it
-    unlike: str = ""  # known differences between the viewer and this record
+    near_plane: float | None = None
+    sh_degree: int = 3
+    filter_3d: bool = False
+    unlike: str = ""
 
     def __post_init__(self) -> None:
         if not isinstance(self.screen_filter, str) or self.screen_filter not in SCREEN_FILTERS:
