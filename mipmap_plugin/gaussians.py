@@ -52,6 +52,11 @@ class Gaussians:
         """The splats at `rows`, a boolean mask [N], indices or a slice."""
         return self._map(lambda tensor: tensor[rows])
 
+    def joined(self, other: Gaussians) -> Gaussians:
+        """These splats, then those of `other`, which has covariances if these have."""
+        names = [f.name for f in fields(self) if getattr(self, f.name) is not None]
+        return replace(self, **{name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names})
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Gaussians:
         """The same splats on `device` in `dtype`."""
         return self._map(lambda tensor: tensor.to(device=device, dtype=dtype))

@@ -1,15 +1,17 @@
 """Blend weights: how many pixels each splat fills, from any backend."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from tiny import cameras, model
 
-from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights
+from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, whole_weights
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.effects import USUAL, Effects
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import USUAL, Effects, RenderSettings
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.harmonics import C0
 
@@ -38,6 +40,23 @@ def test_a_splat_alone_fills_what_it_covers():
     splats, views = model(60).gaussians().detach(), cameras(1)
     one = splats[torch.tensor([0])]
     torch.testing.assert_close(blend_weights(one, views, ReferenceBackend(), Effects(1))[0], opacity(one, views[0]).sum(), rtol=1e-4, atol=0.0)
+
+
+def test_the_whole_weight_is_that_of_a_splat_alone_in_the_middle_of_the_picture():
+    """A faint ball of 3 px in the base, at half its size: alphas add up to opacity x 2 pi (variance + dilation)."""
+    camera, depth = Camera(200, 200, 100.0, 100.0, 100.0, 100.0, torch.eye(4)), 5.0
+    pixel, faint = torch.tensor([depth / 100]), torch.tensor([0.1])
+    ball = Gaussians(torch.tensor([[0.0, 0.0, depth]]), torch.tensor([[1.0, 0, 0, 0]]), 3 * pixel.expand(1, 3), faint, torch.zeros(1, 1, 3))
+    whole = whole_weights(ball, pixel, [camera], Effects(0), 0.5)
+    assert whole.item() == pytest.approx(0.25 * 0.1 * 2 * math.pi * (9 + 0.3), rel=1e-5)
+    shown = 0.25 * blend_weights(ball, [camera], ReferenceBackend(), Effects(0, settings=RenderSettings(min_alpha=1e-6)))
+    assert shown.item() == pytest.approx(whole.item(), rel=0.01)
+
+
+def test_the_whole_weight_of_a_sky_is_the_picture():
+    camera = cameras(1)[0]
+    sky = Gaussians(torch.zeros(1, 3), torch.ones(1, 4), torch.full((1, 3), 1e6), torch.ones(1), torch.zeros(1, 1, 3))
+    assert whole_weights(sky, torch.ones(1), [camera], Effects(0), 1.0).item() == camera.width * camera.height
 
 
 def test_what_lies_behind_the_camera_has_none():

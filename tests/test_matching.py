@@ -30,6 +30,8 @@ def weigh(opacities: torch.Tensor) -> torch.Tensor:
 
 HALF = torch.tensor([PIXELS / 2, PIXELS / 4], dtype=torch.float64)  # px: of two walls that cover half of what they are before
 
+NOTHING = torch.zeros(2)  # of splats that are seen as a whole, whatever that is
+
 
 def test_the_weights_of_two_walls_are_known():
     torch.testing.assert_close(weigh(torch.tensor([0.5, 0.5], dtype=torch.float64)), HALF, rtol=1e-4, atol=0)
@@ -37,32 +39,40 @@ def test_the_weights_of_two_walls_are_known():
 
 @pytest.mark.parametrize("opacities", [(0.9, 0.9), (0.8, 0.2), (0.3, 0.3), (0.3, 0.9)])
 def test_opacities_become_those_that_were_wanted(opacities):
-    new = matched_opacities(torch.tensor(opacities, dtype=torch.float64), HALF, weigh)
+    new = matched_opacities(torch.tensor(opacities, dtype=torch.float64), HALF, NOTHING, weigh)
     torch.testing.assert_close(new, torch.full_like(new, 0.5), rtol=1e-3, atol=0)
 
 
 def test_every_round_comes_closer():
     tried = []
-    matched_opacities(torch.tensor([0.95, 0.05], dtype=torch.float64), HALF, lambda opacities: tried.append(opacities) or weigh(opacities))
+    matched_opacities(torch.tensor([0.95, 0.05], dtype=torch.float64), HALF, NOTHING, lambda opacities: tried.append(opacities) or weigh(opacities))
     far = [float((weigh(each) - HALF).abs().sum()) for each in tried]
     assert len(far) == ROUNDS and far == sorted(far, reverse=True)
 
 
 def test_no_opacity_rises_above_one():
-    new = matched_opacities(torch.tensor([0.5, 0.5], dtype=torch.float64), 10 * HALF, weigh)
+    new = matched_opacities(torch.tensor([0.5, 0.5], dtype=torch.float64), 10 * HALF, NOTHING, weigh)
     assert (new == 1).all()
 
 
 def test_unseen_splats_stay_as_they_are():
     opacities = torch.tensor([0.3, 0.0])
-    assert torch.equal(matched_opacities(opacities, torch.zeros(2), torch.zeros_like), opacities)
+    assert torch.equal(matched_opacities(opacities, torch.zeros(2), NOTHING, torch.zeros_like), opacities)
 
 
 def test_what_is_wanted_of_the_unseen_and_what_nobody_wants_stay_finite():
-    unseen, unwanted = matched_opacities(torch.tensor([1e-6, 0.5]), torch.tensor([9.0, 0.0]), lambda tried: torch.tensor([0.0, 9.0])).tolist()
+    wanted, found = torch.tensor([9.0, 0.0]), torch.tensor([0.0, 9.0])
+    unseen, unwanted = matched_opacities(torch.tensor([1e-6, 0.5]), wanted, NOTHING, lambda tried: found).tolist()
     assert unseen == pytest.approx(1e-6 * MAX_FACTOR**ROUNDS) and unwanted == pytest.approx(0.5 / MAX_FACTOR**ROUNDS)
 
 
 def test_nothing_changes_where_weights_match():
     opacities = torch.tensor([0.7, 0.2], dtype=torch.float64)
-    torch.testing.assert_close(matched_opacities(opacities, weigh(opacities), weigh), opacities, rtol=1e-9, atol=0)
+    torch.testing.assert_close(matched_opacities(opacities, weigh(opacities), NOTHING, weigh), opacities, rtol=1e-9, atol=0)
+
+
+def test_what_hardly_shows_of_a_splat_says_little_of_its_opacity():
+    """Of 1,000 px one tenth shows, and a fifth is wanted: the sight of both changes the opacity by a tenth a round."""
+    opacities, whole = torch.tensor([0.3]), torch.tensor([1000.0])
+    new = matched_opacities(opacities, torch.tensor([0.2]), whole, lambda tried: torch.tensor([0.1]))
+    assert new.item() == pytest.approx(0.3 * (1.2 / 1.1) ** ROUNDS, rel=1e-3)

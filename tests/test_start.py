@@ -1,11 +1,15 @@
 """The start: the best of base, closed form and merged splats, as validation views have it."""
 
+from dataclasses import replace
+
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.start import candidates as start
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
 SCALE, COUNT = 1 / 4, 80
@@ -110,6 +114,27 @@ def test_what_is_merged_furthest_without_being_worse_than_the_base_is_begun_with
     monkeypatch.setattr(Validation, "quality", quality)
     report = adapted(merge_to=0.5, merging_costs=COUNT).report
     assert (start_of(report), report.gaussians_after) == ("the closed form of merged splats", tried[4])
+
+
+def beside(seen: int, hidden: int) -> VanillaModel:
+    """A ball of splats that the cameras look at, and others in pairs far behind all of them."""
+    shown, others = tiny.gaussians(seen), tiny.gaussians(hidden, seed=1)
+    far = replace(others, means=others.means.repeat_interleave(2, 0)[:hidden] + 1000.0)
+    return VanillaModel.from_gaussians(shown.joined(far), TrainedScale())
+
+
+def test_splats_that_no_view_shows_are_not_merged_and_the_report_tells_of_them():
+    base = beside(COUNT, COUNT)
+    with pytest.warns(UserWarning, match="no view shows 5[0-9]% of the splats"):
+        result = wrap_model(base, cameras=tiny.cameras()).adapt(SCALE, steps=0, merge_to=0.1, merging_costs=99, returns="last", views="given")
+    assert COUNT < len(result.model) < 2 * COUNT
+    assert torch.equal(result.model.parameters()["means"][-COUNT:], base.parameters()["means"][-COUNT:])
+    assert len(result.report.notes) == 1
+
+
+def test_few_hidden_splats_are_not_worth_a_word(recwarn):
+    report = wrap_model(beside(COUNT, COUNT // 4), cameras=tiny.cameras()).adapt(SCALE, steps=0, merge_to=0.5, views="given").report
+    assert not report.notes and not recwarn
 
 
 def test_merging_without_a_closed_form_is_called_so(monkeypatch):

@@ -11,10 +11,11 @@ from torch import Tensor
 from mipmap_plugin import pool
 from mipmap_plugin.adaptation.optimization.validation import mean_db
 from mipmap_plugin.adaptation.report import AS_IT_IS
+from mipmap_plugin.adaptation.start.blend_weights import whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, enough_views, filter_suffices, pixel_size
 from mipmap_plugin.adaptation.start.matching import matched_opacities
-from mipmap_plugin.adaptation.start.merging import merge
+from mipmap_plugin.adaptation.start.merging import merge_seen
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
@@ -71,24 +72,31 @@ class StartSearch:
     def _candidate(self, name: str, weights: Tensor, fraction: float) -> None:
         """Write the closed form of the base after merging each core down to a fraction."""
         cores = range(len(self.scene.cores))
-        wanted = torch.cat([self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores])
+        merged = [self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores]
         pool.release_to_system()
         if self.matches and self.scene.config.closed_form:
-            self._match(name, wanted)
+            self._match(name, *map(torch.cat, zip(*merged, strict=True)))
             pool.release_to_system()
 
-    def _merged(self, file: Path, core: Tensor, weights: Tensor, fraction: float) -> Tensor:
+    def _merged(self, file: Path, core: Tensor, weights: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+        """Write a core's candidate; returns its blend weights, and those that it had if nothing hid it."""
         scene = self.scene
         model = scene.for_target(scene.base.parameters(core))
-        merged_weights = [weights[core]]
+        found = [weights[core], torch.empty(0)]
+
+        def sizes(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+            """Of a base pixel at each splat, and of the splat's weight if nothing hid it."""
+            pixel = pixel_size(gaussians.means, scene.views.adapted)
+            return pixel, whole_weights(gaussians, pixel, scene.views.adapted, scene.base_effects, scene.scale)
 
         def merged(gaussians: Gaussians) -> Gaussians:
-            pixel = pixel_size(gaussians.means, scene.views.adapted) / scene.scale
-            splats, merged_weights[0] = merge(gaussians, pixel, weights[core], fraction)
+            pixel, whole = sizes(gaussians)
+            splats, found[0] = merge_seen(gaussians, pixel / scene.scale, weights[core], fraction, whole)
             return splats
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-            form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness)
+            pixel, found[1] = sizes(gaussians)
+            form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, pixel=pixel)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
 
         if fraction < 1:
@@ -96,10 +104,13 @@ class StartSearch:
         if scene.config.closed_form:
             model.reshape(formed)
         write_store(file, model.parameters())
-        return merged_weights[0]
+        return found[0], found[1]
 
-    def _match(self, name: str, wanted: Tensor) -> None:
-        """Give the splats opacities with which they have the `wanted` blend weights [N] (`start.matching`), and write them again."""
+    def _match(self, name: str, wanted: Tensor, whole: Tensor) -> None:
+        """Give the splats opacities with which they have the `wanted` blend weights [N] (`start.matching`), and write them again.
+
+        `whole` [N]: the weights that they would have if nothing hid them.
+        """
         splats = self._open(name)
         views = [view.zoomed(self.scene.scale) for view in self.views]
         painter = self.scene.painter(self.scene.target)
@@ -110,7 +121,7 @@ class StartSearch:
 
         opacities = torch.cat([part.shapes[:, -1] for part in splats.parts]).sigmoid()
         splats.release()
-        opacities = matched_opacities(opacities, wanted, weights_of)
+        opacities = matched_opacities(opacities, wanted, whole, weights_of)
         for number, (part, matched) in enumerate(zip(splats.parts, opacities.split([*map(len, splats.parts)]), strict=True)):
             model = self.scene.for_target(part.parameters())
             _set_opacities(model, matched)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import max_threads
+from mipmap_plugin.adaptation.start.closed_form import filter_variance
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -18,6 +20,10 @@ from mipmap_plugin.threads import side_by_side
 
 # Pixels: the blend weight from which on a view shows a splat.
 SHOWN = 0.1
+
+# Fraction of its `whole_weights` below which nothing is known of a splat: no view shows it, or only through gaps. These are 2 % of lego, 3 % of
+# chair, 12 % of a capture seen from all around, 24 % of a made-up panorama, and 61 % of a capture of which one side is shown.
+UNSEEN = 1e-3
 
 
 def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Tensor:
@@ -44,6 +50,17 @@ def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, eff
         total += each
         shown += float((each > SHOWN).float().mean())
     return total / len(views), shown / len(views)
+
+
+def whole_weights(gaussians: Gaussians, pixel: Tensor, views: Sequence[Camera], base: Effects, scale: float) -> Tensor:
+    """[N]: the blend weight of each splat, in target pixels of a view of the base, if it lay in all pictures and nothing hid it.
+
+    `pixel` [N]: the size of a base pixel there, in world units; `base`: how the base is rendered. The area is the root mean square over all
+    directions, and at most that of a picture.
+    """
+    a, b, c = ((gaussians.scales / pixel[:, None]).square() + filter_variance(base)).unbind(1)
+    picture = sum(view.width * view.height for view in views) / len(views)
+    return gaussians.opacities * (2 * math.pi * ((a * b + b * c + c * a) / 3).sqrt()).clamp_max(picture) * scale**2
 
 
 @torch.enable_grad()

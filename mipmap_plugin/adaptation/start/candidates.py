@@ -12,10 +12,18 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.start.blend_weights import blend_weights, weighed
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, LEAST_VIEWS, FormSettings, closed_form, filter_suffices, pixel_size, views_for
+from mipmap_plugin.adaptation.start.blend_weights import UNSEEN, blend_weights, weighed, whole_weights
+from mipmap_plugin.adaptation.start.closed_form import (
+    AREA_POWER,
+    LEAST_VIEWS,
+    FormSettings,
+    closed_form,
+    filter_suffices,
+    pixel_size,
+    views_for,
+)
 from mipmap_plugin.adaptation.start.matching import matched_opacities
-from mipmap_plugin.adaptation.start.merging import Rounds, merge, merge_down
+from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -32,6 +40,10 @@ COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 
 # dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB, of lego, of chair and of a capture. What fails is merged less.
 COARSE_COSTS = 3.0
+
+
+# The user is told where no view shows more than this fraction of the splats, for dB say nothing of them. Captures have up to a quarter.
+HIDDEN = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +113,7 @@ class StartSearch:
         self._problem, self._rounds = problem, Rounds()
         self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
+        self._notes: list[str] = []  # on what the views show of the base
         unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
         self._matches_weights = problem.has_blend_weights and problem.scale <= 1 and not unchanged
 
@@ -159,6 +172,7 @@ class StartSearch:
     def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
         """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""
         problem, student = self._problem, self._problem.base()
+        student.notes.extend(self._notes)
         if fraction < 1 and weights is not None:
             with problem.phase("merging"):
                 weights = self._merge(student, weights, fraction, coarsely)
@@ -177,7 +191,8 @@ class StartSearch:
         def merged(gaussians: Gaussians) -> Gaussians:
             most = problem.config.most_splats or (math.ceil(fraction * len(gaussians)) if coarsely else None)
             if most is None:
-                splats, new_weights = merge(gaussians, pixel_of(gaussians.means), weights, fraction, self._rounds)
+                whole = self._whole_weights(gaussians, self._pixel_size(gaussians.means))
+                splats, new_weights = merge_seen(gaussians, pixel_of(gaussians.means), weights, fraction, whole, self._rounds)
             else:
                 splats, new_weights = merge_down(gaussians, pixel_of, weights, most)
             merged_weights.append(new_weights)
@@ -190,7 +205,8 @@ class StartSearch:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
         problem = self._problem
         area_power = 1.0 if self._matches_weights else AREA_POWER
-        settings = FormSettings(area_power, problem.config.crispness, self._count, self._pixel_size(gaussians.means))
+        pixel = self._pixel_size(gaussians.means)
+        settings = FormSettings(area_power, problem.config.crispness, self._count, pixel)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if not self._matches_weights or weights is None:
             return scales, opacities
@@ -199,7 +215,11 @@ class StartSearch:
         def weights_of(opacities: Tensor) -> Tensor:
             return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, problem.target)
 
-        return scales, matched_opacities(opacities, weights, weights_of)
+        return scales, matched_opacities(opacities, weights, self._whole_weights(gaussians, pixel), weights_of)
+
+    def _whole_weights(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
+        problem = self._problem
+        return whole_weights(gaussians, pixel, problem.views, problem.base_effects, problem.scale)
 
     def _pixel_size(self, means: Tensor) -> Tensor:
         """`pixel_size`; that of the base, which is asked for first, serves all candidates."""
@@ -220,4 +240,9 @@ class StartSearch:
         self._count = views_for(shown)
         if self._count > LEAST_VIEWS:
             weights, _ = over(self._count)
-        return weights * problem.scale**2
+        weights = weights * problem.scale**2
+        whole = self._whole_weights(gaussians, self._pixel_size(gaussians.means))
+        if (hidden := float((weights <= UNSEEN * whole).float().mean())) > HIDDEN:
+            advice = "give cameras that show all of the scene, or look at it from where these do"
+            self._notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
+        return weights

@@ -99,8 +99,8 @@ def _form(
         return _of_surfels(gaussians, views, scale, (base, target), base_pixel, form)
     target_pixel = base_pixel / scale
     averaging = _averaging_variance(base, form.crispness) if scale > 1 else 0.0
-    wide = gaussians.scales.square() + ((_filter_variance(base) - averaging) * base_pixel**2)[:, None]
-    narrow = (wide - ((_filter_variance(target) - averaging) * target_pixel**2)[:, None]).clamp_min(0)
+    wide = gaussians.scales.square() + ((filter_variance(base) - averaging) * base_pixel**2)[:, None]
+    narrow = (wide - ((filter_variance(target) - averaging) * target_pixel**2)[:, None]).clamp_min(0)
     if compensates(target.screen_filter):  # the area shrinks only by the factor by which the opacity can rise
         narrow = narrow.maximum(gaussians.opacities[:, None] * wide)
     thinnest = torch.full_like(narrow, MIN_AXIS**2).scatter(1, wide.topk(2, dim=1).indices, max(MIN_AXIS**2, min_variance(target)))
@@ -124,7 +124,7 @@ def filter_suffices(scale: float, base: Effects, target: Effects) -> bool:
 def _max_area_ratio(base: Effects, target: Effects, scale: float, averaging: float) -> float:
     """The largest factor of an opacity. It is exact for a splat of no size of its own; in a distant view all splats look like that."""
     if averaging:
-        return _filter_variance(base) / (_filter_variance(base) - averaging + averaging / scale**2)
+        return filter_variance(base) / (filter_variance(base) - averaging + averaging / scale**2)
     return torch.inf if compensates(target.screen_filter) else 1.0
 
 
@@ -217,18 +217,18 @@ def _focal(view: Camera) -> float:
 
 def min_variance(effects: Effects) -> float:
     """The minimum variance (target px²) of a splat's two longer axes for which the viewer does not leave it out."""
-    return CULL_MARGIN * max(0.0, effects.settings.min_variance - _filter_variance(effects), effects.settings.least_spread)
+    return CULL_MARGIN * max(0.0, effects.settings.min_variance - filter_variance(effects), effects.settings.least_spread)
 
 
-def _filter_variance(effects: Effects) -> float:
+def filter_variance(effects: Effects) -> float:
     """The variance that the screen filter adds, in px²."""
     return widening(effects.screen_filter, effects.eps2d)
 
 
 def _averaging_variance(base: Effects, crispness: float) -> float:
     """The variance (px²) over which the base's images are averages: from that of a pixel (crispness 0) to that of the filter (1)."""
-    pixel = min(SQUARE_VARIANCE, _filter_variance(base))
-    return pixel + crispness * (_filter_variance(base) - pixel)
+    pixel = min(SQUARE_VARIANCE, filter_variance(base))
+    return pixel + crispness * (filter_variance(base) - pixel)
 
 
 def _compensation(gaussians: Gaussians, views: Sequence[Camera], effects: Effects) -> Tensor | float:
@@ -238,7 +238,7 @@ def _compensation(gaussians: Gaussians, views: Sequence[Camera], effects: Effect
     # An integral over the pixel compensates as a Gaussian of the pixel's variance does.
     name = "mip" if effects.screen_filter in INTEGRALS else effects.screen_filter
     ones = torch.ones_like(gaussians.opacities)
-    variance = _filter_variance(effects)
+    variance = filter_variance(effects)
     return _mean_in_front(gaussians, views, effects.near_plane, lambda _, projected: footprint(projected, ones, name, variance).opacities)
 
 
@@ -253,7 +253,7 @@ def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: 
 
     def areas(_: Camera, projected: Projected) -> Tensor:
         new_projected = projected.with_axes(new_axes) if new.covariances is None else projected
-        dets = _det(projected, _filter_variance(base) * scale**2), _det(new_projected, _filter_variance(target))
+        dets = _det(projected, filter_variance(base) * scale**2), _det(new_projected, filter_variance(target))
         return torch.stack(dets).sqrt()
 
     before, after = _mean_in_front(old, [view.zoomed(scale) for view in views], base.near_plane, areas)

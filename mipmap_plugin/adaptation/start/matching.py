@@ -22,11 +22,19 @@ MAX_FACTOR = 4.0
 # Pixels: an invisible blend weight, added to keep ratios finite.
 INVISIBLE_WEIGHT = 1e-4
 
+# Fraction of the weight that a splat would have if nothing hid it, added too: what shows of hidden splats, or at the edge of a view, says little
+# of their opacities. A phone's capture of which one side is shown keeps 1 dB more of the others by it, and none of that side is lost.
+HARDLY_SEEN = 1e-3
+
 
 @torch.no_grad()
-def matched_opacities(opacities: Tensor, target: Tensor, weights_of: Callable[[Tensor], Tensor]) -> Tensor:
-    """Opacities [N] for which `weights_of(opacities)`, the mean blend weight [N] of each splat in pixels, is close to `target` [N]."""
+def matched_opacities(opacities: Tensor, target: Tensor, whole: Tensor, weights_of: Callable[[Tensor], Tensor]) -> Tensor:
+    """Opacities [N] for which `weights_of(opacities)`, the mean blend weight [N] of each splat in pixels, is close to `target` [N].
+
+    `whole` [N]: the weights of splats that nothing hides (`blend_weights.whole_weights`).
+    """
+    known = INVISIBLE_WEIGHT + HARDLY_SEEN * whole
     for _ in range(ROUNDS):
-        ratio = (target + INVISIBLE_WEIGHT) / (weights_of(opacities) + INVISIBLE_WEIGHT)
+        ratio = (target + known) / (weights_of(opacities) + known)
         opacities = (opacities * ratio.to(opacities).clamp(1 / MAX_FACTOR, MAX_FACTOR)).clamp_max(1)
     return opacities

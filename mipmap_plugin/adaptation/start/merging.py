@@ -18,6 +18,7 @@ from torch import Tensor
 
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation.parallel import CHUNK, in_chunks
+from mipmap_plugin.adaptation.start.blend_weights import UNSEEN
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.eigen import eigh3
@@ -98,6 +99,20 @@ def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float,
         splats, new_rows = splats.merged(pairs[0][:merged], pairs[1][:merged])
         rows = new_rows[rows]
     return splats.gaussians(gaussians, rows, old_weights), splats.weights
+
+
+def merge_seen(
+    gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, whole: Tensor, rounds: Rounds | None = None
+) -> tuple[Gaussians, Tensor]:
+    """`merge` of the splats that views show; those that none shows, where no view would tell the harm, stay as they are, behind the others.
+
+    `whole` [N]: the weights of splats that nothing hides (`blend_weights.whole_weights`).
+    """
+    seen = weights > UNSEEN * whole
+    if seen.all():
+        return merge(gaussians, pixel, weights, fraction, rounds)
+    merged, new_weights = merge(gaussians[seen], pixel[seen], weights[seen], fraction, rounds)
+    return merged.joined(gaussians[~seen]), torch.cat([new_weights, weights[~seen]])
 
 
 def merge_down(gaussians: Gaussians, pixel_of: Callable[[Tensor], Tensor], weights: Tensor, most: int) -> tuple[Gaussians, Tensor]:
