@@ -325,7 +325,7 @@ def test_adapting_in_a_thread():
 
 
 def test_the_time_budget_ends_the_run():
-    assert wrapped().adapt(1 / 4, time_budget_s=1e-6, **BRIEF).report.ended_by == "time budget of 1e-06 s"
+    assert wrapped().adapt(1 / 4, time_budget_s=1e-6, **BRIEF).report.ended_by == "time budget of 1e-06 s, all of which the start took"
 
 
 def test_the_knee_ends_the_run():
@@ -570,8 +570,8 @@ def test_a_scene_of_which_most_is_before_the_near_plane_is_told_of():
     """What is left is adapted all the same."""
     base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
     depths = torch.stack([camera.to_camera(base.model.parameters()["means"].detach())[:, 2] for camera in base.cameras])
-    base.trained = replace(base.trained, near_plane=float(depths.amax(0).median()))
-    with pytest.warns(UserWarning, match=r"splats in view lie nearer than .* units, where renderers of 3DGS draw none"):
+    base.trained = replace(base.trained, near_plane=float(depths.median()))  # each splat is far enough in some views
+    with pytest.warns(UserWarning, match=r"(4|5)\d% of the splats in a view's picture lie nearer than .* units, where renderers of 3DGS draw none"):
         base.adapt(1 / 2, recipe="instant")
 
 

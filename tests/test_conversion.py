@@ -99,6 +99,8 @@ def test_a_time_budget_is_for_both_and_told_as_it_was_given(monkeypatch):
     monkeypatch.setattr(Session, "run", lambda self, *given: budgets.append(self.config.time_budget_s) or run(self, *given))
     report = wrapped().adapt(2, viewer="antialiased", time_budget_s=60.0, **BRIEF).report
     assert budgets == [30.0, 30.0] and report.settings.time_budget_s == 60.0 and report.ended_by == "3 steps"
+    spent = wrapped().adapt(2, viewer="antialiased", time_budget_s=1e-3, **BRIEF).report
+    assert spent.ended_by.startswith("time budget of 0.001 s")
 
 
 def test_with_a_budget_too_what_has_ended_is_not_taken_further(tmp_path, monkeypatch):

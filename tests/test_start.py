@@ -142,6 +142,16 @@ def test_merging_without_a_closed_form_is_called_so(monkeypatch):
     assert start_of(adapted(merge_to=0.5, closed_form=False).report) == "merged splats"
 
 
+def test_a_start_that_takes_the_whole_time_budget_merges_nothing_and_the_report_says_so():
+    settings = {"steps": 5, "merge_to": 0.5, "merging_costs": 99, "views": "given"}
+    report = adapted(time_budget_s=1e-6, **settings).report
+    assert report.ended_by == "time budget of 1e-06 s, all of which the start took"
+    assert report.gaussians_after == COUNT and "merging" not in report.seconds
+    assert not report.returned.startswith("the last state")  # there is none
+    whole = adapted(time_budget_s=1000.0, **settings).report
+    assert whole.seconds["merging"] > 0 and whole.ended_by == "5 steps"
+
+
 def test_phases_are_named():
     seconds = adapted(merge_to=0.5).report.seconds
     phases = ["compilation", "blend weights", "closed form", "merging", "validation"]

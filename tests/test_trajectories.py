@@ -174,11 +174,32 @@ def test_cameras_that_look_apart_are_not_mixed():
 
 def test_the_widest_gap_between_cameras_is_filled_first():
     cameras = []
-    for x in (0.0, 0.1, 0.2, 0.3, 0.4, 5.0):
+    for x in (0.0, 0.1, 0.2, 0.3, 0.4, 1.5):
         cameras.append(Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4, dtype=torch.float64)))
         cameras[-1].viewmat[0, 3] = -x
     views = jittered(cameras, 4, seeded(), amount=0.0)
-    assert sum(1.0 < view.center[0] < 4.5 for view in views) >= 2
+    assert sum(0.6 < view.center[0] < 1.4 for view in views) >= 2
+
+
+def on_a_line(*places: float) -> list[Camera]:
+    cameras = [Camera(8, 8, 8.0, 8.0, 4.0, 4.0, torch.eye(4)) for _ in places]
+    for camera, x in zip(cameras, places, strict=True):
+        camera.viewmat[0, 3] = -x
+    return cameras
+
+
+@pytest.mark.parametrize("far", [[100.0 + step for step in range(6)], [100.0]], ids=["another room", "a stray camera"])
+def test_no_view_lies_between_two_parts_of_a_capture(far):
+    views = jittered(on_a_line(*range(6), *far), 60, seeded(), amount=0.0)
+    places = [float(view.center[0]) for view in views]
+    assert any(place > 90 for place in places) or len(far) == 1  # a camera alone is the view from there
+    assert not [place for place in places if 10 < place < 90]
+
+
+def test_rigs_have_views_between_them():
+    """The cameras of a rig lie a hundredth apart."""
+    views = jittered(on_a_line(0.0, 0.01, 0.02, 5.0, 5.01, 5.02), 60, seeded(), amount=0.0)
+    assert [view for view in views if 1 < view.center[0] < 4]
 
 
 def test_views_are_spread_over_the_times_of_the_cameras_too():

@@ -69,7 +69,9 @@ class Stages:
         with _kept_if_interrupted(converted.states):
             adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self._further(converted.report))
         settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if _stopped(converted.report) else {})
-        report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings)})
+        its_own, given = (f"budget of {each.time_budget_s or 0:g} s" for each in (half, config))
+        ended_by = adapted.report.ended_by.replace(its_own, given)
+        report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings), "ended_by": ended_by})
         return replace(adapted, report=_joined(converted.report, report), states=[*converted.states, *adapted.states])
 
     def _further(self, first: Report) -> Observer | None:

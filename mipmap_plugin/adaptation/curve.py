@@ -79,7 +79,7 @@ def psnr_as_shown(image: torch.Tensor, truth: torch.Tensor) -> float:
 def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig) -> str | None:
     """Why a run ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue."""
     if config.time_budget_s is not None and seconds >= config.time_budget_s:
-        return f"time budget of {config.time_budget_s:g} s"
+        return f"time budget of {config.time_budget_s:g} s" + (", all of which the start took" if not curve[-1].step else "")
     psnrs = [point.psnr_db for point in curve if point.psnr_db is not None]
     if config.target_db is not None and psnrs and psnrs[-1] >= config.target_db:
         return f"target of {config.target_db:g} dB against the pseudo truth"

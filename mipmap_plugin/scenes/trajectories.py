@@ -28,6 +28,10 @@ FLATTER = 0.8
 NEIGHBORS = 16
 BEYOND = 0.25
 
+# Cameras beyond a gap of so many times the distance before it are of another part of the capture, where nobody was on the way; but for the first
+# few, which may be those of a rig.
+GAP, RIG = 4.0, 4
+
 # Candidates per generated view: keeping those that fill gaps gains 0.5 dB on lego's test views at x1/8.
 CANDIDATES = 16
 
@@ -147,10 +151,22 @@ def _neighbors(centers: Tensor, rotations: Tensor, index: Tensor, generator: tor
     distances = torch.cdist(centers, centers)
     distances[(traces - 1) / 2 < math.cos(SAME_DIRECTION)] = math.inf
     distances.fill_diagonal_(math.inf)
+    reach = _reach(distances)
+    distances[distances > torch.minimum(reach[:, None], reach)] = math.inf
     distances, nearest = distances.topk(min(NEIGHBORS, len(centers)), largest=False)
     known = distances.isfinite().sum(1)[index]
     drawn = (torch.rand(len(index), generator=generator) * known).long()
     return torch.where(known > 0, nearest[index, drawn], index)
+
+
+def _reach(distances: Tensor) -> Tensor:
+    """How far each camera's own part of the capture reaches: its distance [C] before the first `GAP`, of `distances` [C, C]; infinity without one."""
+    near = distances.topk(min(NEIGHBORS, len(distances)), largest=False).values
+    gaps = (near[:, 1:] > GAP * near[:, :-1]) & near[:, 1:].isfinite() & (near[:, :-1] > 0)
+    gaps[:, : RIG - 1] = False
+    before = torch.where(gaps, near[:, :-1], math.inf)
+    reach: Tensor = torch.cat([before, torch.full_like(near[:, :1], math.inf)], 1).amin(1)
+    return reach
 
 
 def _places(centers: Tensor, rotations: Tensor, times: Tensor, around: Tensor) -> Tensor:

@@ -127,6 +127,6 @@ class Run:
         best, states = self.steering.best_step, {}
         if 0 < best < self.step:
             states[f"the state after step {best}"] = self.steering.best.over(initial)
-        if not self.curve[-1].taken_back:  # otherwise the last state is the best one
+        if self.step and not self.curve[-1].taken_back:  # otherwise it is the start, or the best one
             states["the last state"] = self.student
         return states

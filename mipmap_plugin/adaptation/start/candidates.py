@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
@@ -22,7 +23,7 @@ from mipmap_plugin.adaptation.start.closed_form import (
     pixel_size,
     views_for,
 )
-from mipmap_plugin.adaptation.start.matching import matched_opacities
+from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
@@ -41,6 +42,9 @@ COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 # dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB, of lego, of chair and of a capture. What fails is merged less.
 COARSE_COSTS = 3.0
 
+
+# The fraction of a time budget that the start may take: what it would not finish in it is left out, from the strongest merging on.
+START_SHARE = 0.5
 
 # The user is told where no view shows more than this fraction of the splats, for dB say nothing of them. Captures have up to a quarter.
 HIDDEN = 1 / 3
@@ -114,6 +118,7 @@ class StartSearch:
         self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
         self._notes: list[str] = []  # on what the views show of the base
+        self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
         unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
         self._matches_weights = problem.has_blend_weights and problem.scale <= 1 and not unchanged
 
@@ -128,7 +133,8 @@ class StartSearch:
             weights = self._base_weights(base) if self._matches_weights or config.merge_to < 1 or too_many else None
         if too_many:
             return self._candidate(weights, 0.0), start_name(config, merged=True)
-        formed = self._candidate(weights, 1.0)
+        with self._clock.timing("candidate"):
+            formed = self._candidate(weights, 1.0)
         if config.merge_to == 1 and config.returns == "last":
             return formed, start_name(config)
         before, after = problem.quality(base), problem.quality(formed)
@@ -144,13 +150,19 @@ class StartSearch:
         Splats that can hardly be merged lose too much by the mildest merging already, as those of captures do: then no other is tried.
         """
         for power in COARSE_POWERS if coarse_bounds else ():
+            if not self._clock.allows("candidate"):
+                break
             coarse, quality = self._tried(weights, power, coarsely=True)
             if coarse_bounds and coarse_bounds.hold_for(quality):
                 return coarse
+        if not self._clock.allows("candidate"):
+            return None
         mildest, quality = self._tried(weights, POWERS[-1])
         if not bounds.hold_for(quality):
             return None
         for power in POWERS[:-1]:
+            if not self._clock.allows("candidate"):
+                break
             merged, quality = self._tried(weights, power)
             if bounds.hold_for(quality):
                 return merged
@@ -204,18 +216,21 @@ class StartSearch:
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
         problem = self._problem
-        area_power = 1.0 if self._matches_weights else AREA_POWER
+        rounds = ROUNDS if self._matches_weights and weights is not None else 0
+        while rounds and not self._clock.allows("weights", rounds):
+            rounds -= 1
+        area_power = 1.0 if rounds else AREA_POWER
         pixel = self._pixel_size(gaussians.means)
         settings = FormSettings(area_power, problem.config.crispness, self._count, pixel)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
-        if not self._matches_weights or weights is None:
+        if weights is None or not rounds:
             return scales, opacities
         views = [view.zoomed(problem.scale) for view in evenly(problem.views, self._count)]
 
         def weights_of(opacities: Tensor) -> Tensor:
             return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, problem.target)
 
-        return scales, matched_opacities(opacities, weights, self._whole_weights(gaussians, pixel), weights_of)
+        return scales, matched_opacities(opacities, weights, self._whole_weights(gaussians, pixel), weights_of, rounds)
 
     def _whole_weights(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
         problem = self._problem
@@ -236,13 +251,32 @@ class StartSearch:
         def over(count: int) -> tuple[Tensor, float]:
             return weighed(gaussians, evenly(problem.views, count), problem.backend, problem.base_effects)
 
-        weights, shown = over(LEAST_VIEWS)
+        with self._clock.timing("weights"):
+            weights, shown = over(LEAST_VIEWS)
         self._count = views_for(shown)
         if self._count > LEAST_VIEWS:
-            weights, _ = over(self._count)
+            with self._clock.timing("weights"):
+                weights, _ = over(self._count)
         weights = weights * problem.scale**2
         whole = self._whole_weights(gaussians, self._pixel_size(gaussians.means))
         if (hidden := float((weights <= UNSEEN * whole).float().mean())) > HIDDEN:
             advice = "give cameras that show all of the scene, or look at it from where these do"
             self._notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
         return weights
+
+
+class _Clock:
+    """What the rest of a start's time allows."""
+
+    def __init__(self, seconds: float) -> None:
+        self._end, self._took = time.perf_counter() + seconds, dict[str, float]()
+
+    @contextmanager
+    def timing(self, work: str) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self._took[work] = time.perf_counter() - began
+
+    def allows(self, work: str, times: int = 1) -> bool:
+        """Whether there is time to do a work again, as long as the last time."""
+        return time.perf_counter() + times * self._took.get(work, 0.0) <= self._end

@@ -28,13 +28,15 @@ HARDLY_SEEN = 1e-3
 
 
 @torch.no_grad()
-def matched_opacities(opacities: Tensor, target: Tensor, whole: Tensor, weights_of: Callable[[Tensor], Tensor]) -> Tensor:
+def matched_opacities(
+    opacities: Tensor, target: Tensor, whole: Tensor, weights_of: Callable[[Tensor], Tensor], rounds: int = ROUNDS
+) -> Tensor:
     """Opacities [N] for which `weights_of(opacities)`, the mean blend weight [N] of each splat in pixels, is close to `target` [N].
 
     `whole` [N]: the weights of splats that nothing hides (`blend_weights.whole_weights`).
     """
     known = INVISIBLE_WEIGHT + HARDLY_SEEN * whole
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         ratio = (target + known) / (weights_of(opacities) + known)
         opacities = (opacities * ratio.to(opacities).clamp(1 / MAX_FACTOR, MAX_FACTOR)).clamp_max(1)
     return opacities
