@@ -575,6 +575,13 @@ def test_a_scene_of_which_most_is_before_the_near_plane_is_told_of():
         base.adapt(1 / 2, recipe="instant")
 
 
+@pytest.mark.parametrize("times", [2, 4])
+def test_lenses_that_differ_too_much_are_told_of(times, recwarn):
+    wide, *others = tiny.cameras()
+    wrap_model(tiny.model(), cameras=[wide, *others, replace(wide, fx=times * wide.fx, fy=times * wide.fy)]).adapt(1 / 2, recipe="instant")
+    assert [str(each.message) for each in recwarn if "focal lengths of the cameras are" in str(each.message)] if times > 3 else not recwarn
+
+
 def test_a_scene_nearer_than_the_near_plane_is_refused_with_what_to_do():
     splats = tiny.gaussians()
     small = VanillaModel.from_gaussians(replace(splats, means=splats.means * 0.01, scales=splats.scales * 0.01))

@@ -35,6 +35,9 @@ LOOKED_AT, TOO_MANY = 16, 0.05
 # it, unless the near plane keeps it away from a scene in small units; then pictures are of another zoom than a user looks from.
 LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
+# Ratio of focal lengths, px, of which views want files as different as scales at such a ratio: two lenses at 5 times cost a capture 10 of 12 dB.
+UNLIKE = 3.0
+
 # Standard deviations of a splat that are seen of it; and near planes at which views keep clear of a scene (`orbit`).
 SEEN, CLEAR = 3, 2
 
@@ -174,6 +177,15 @@ def _draws(view: Camera, model: SplatModel, near: float) -> bool:
     return bool(inside.any()) and bool((model.row_opacities([view])[inside] >= MIN_ALPHA).any())
 
 
+def too_unlike(views: Sequence[Camera]) -> str:
+    """That lenses differ so much that no file fits all of them, in a sentence; "" if they do not."""
+    shortest, longest = (pick(math.sqrt(view.fx * view.fy) for view in views) for pick in (min, max))
+    if longest <= UNLIKE * shortest:
+        return ""
+    where = f"focal lengths of the cameras are {shortest:.0f} to {longest:.0f} px, and what looks right through one does not through another"
+    return f"{where}; adapt with the cameras of each lens on their own"
+
+
 def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
     """How many of the splats with these `means` [N, 3] in a view's picture are not drawn because they are too near, in a sentence; "" if few.
 
@@ -211,7 +223,7 @@ def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: b
     """What is wrong with views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
     least = LEAST_SHARE * min(views[0].size)
     least = least if orbit else min(LEAST_PIXELS, least)
-    found = too_near(views, model.parameters()["means"], near), too_small(views, model, near, least)
+    found = too_near(views, model.parameters()["means"], near), too_small(views, model, near, least), too_unlike(views)
     return [sentence for sentence in found if sentence]
 
 
