@@ -30,11 +30,15 @@ SPZ = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20)
 
 MADE = [("spz", SPZ), ("spz", gzip.compress(SPZ)), ("ksplat", b"\0\1\0\0" + bytes(6000)), ("splat", RECORD * 3)]
 
-# A stand-in for splat-transform: it returns the PLY beside it, and records its arguments.
+# A stand-in for splat-transform: it returns the PLY beside it, and records its arguments. Its own choice is SPZ 4, which Spark does not read.
 STAND_IN = """#!{python}
 import json, pathlib, shutil, sys
 here = pathlib.Path(__file__).parent
+if sys.argv[1:] == ["--version"]:
+    sys.exit(print("splat-transform v3.7.0 (0a1b2c3)", file=sys.stderr))
 *options, source, target = sys.argv[1:]
+if ("--spz-version" in options) != target.endswith(".spz") or target.endswith(".spz") and options[options.index("--spz-version") + 1] != "3":
+    sys.exit("Error: expected --spz-version 3 for SPZ, and for nothing else")
 (here / "asked.json").write_text(json.dumps([options, source, target, pathlib.Path(source).read_bytes().hex()[:64]]))
 if pathlib.Path(source).stat().st_size == 13:
     print("  ✗ Error: Invalid header\\n    at parseSpz (cli.mjs:37217:15)\\n✗ failed in 0.051s  [peak cpu=85.1MB]", file=sys.stderr)
@@ -180,7 +184,7 @@ def test_sog_is_made_by_a_gpu_or_in_one_iteration(tmp_path, tool, cards, options
     tiny.model().save(tmp_path / "out.sog", provenance={})
     assert tool_request(tool)[0] == ["--quiet", "--overwrite", *options]
     tiny.model().save(tmp_path / "out.spz", provenance={})
-    assert tool_request(tool)[0] == ["--quiet", "--overwrite", "--gpu", "cpu"]
+    assert tool_request(tool)[0] == ["--quiet", "--overwrite", "--gpu", "cpu", "--spz-version", "3"]
 
 
 def test_a_failed_writing_leaves_the_old_file(tmp_path, tool):
@@ -251,6 +255,9 @@ def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_
     with pytest.raises(SettingsError, match=r"splat-transform 2.7.1 is too old for it, and 3.0 or newer is needed"):
         tiny.model().refuse_output(tmp_path / "a.sog", overwrite=False, networks_move=False)
     tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.0.6', file=sys.stderr)\n")
+    with pytest.raises(SettingsError, match=r"2.0.6 is too old for it, and 2.1 or newer is needed; run: npm install -g \S+; or give a .ply"):
+        tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
 
 
 def test_an_error_of_node_is_told(tmp_path, tool):

@@ -33,8 +33,12 @@ EXCHANGE = {
 WRITTEN = (".spz", ".sog", ".compressed.ply")
 READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
-# SOG, by itself or as a ladder with a lod-meta.json, and the oldest version of splat-transform that knows the options of `table_options`.
-WITH_TABLES, OLDEST_WITH_TABLES = (".sog", ".json"), 3
+# Suffix -> the oldest version of splat-transform that writes it: SOG, by itself or as a ladder with a lod-meta.json, needs the options of
+# `table_options`.
+OLDEST: dict[str, tuple[int, ...]] = {".sog": (3, 0), ".json": (3, 0), ".spz": (2, 1)}
+
+# The last version of SPZ that Spark 2.2 and GaussianSplats3D read; splat-transform's own choice is 4.
+SPZ_VERSION = "3"
 
 # Suffixes of other files: who asks for one does not expect a folder of that name.
 OF_FILES = (".pt", ".pth", ".ckpt", ".npz", ".npy", ".glb", ".gltf", ".obj", ".usd", ".usdz", ".html", ".json", ".csv", ".txt", ".zip", ".png")
@@ -60,21 +64,27 @@ def refuse_exchange(path: Path) -> list[str]:
     if tool is None:
         instead = "; or give a .ply" if path.suffix else ""  # of a file
         raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}{instead}")
-    version = _version(tool) if path.suffix.lower() in WITH_TABLES else ""
-    if version and int(version.split(".")[0]) < OLDEST_WITH_TABLES:
-        newer = f"{TOOL} {version} is too old for it, and {OLDEST_WITH_TABLES}.0 or newer is needed, which needs Node.js 22"
-        raise SettingsError(f"{path}: {newer}; run: {INSTALL}@latest; or give a .spz or a .ply")
+    oldest = OLDEST.get(path.suffix.lower(), ())
+    version = _version(tool) if oldest else ()
+    if version and version < oldest:
+        node, instead = (", which needs Node.js 22", " a .spz or") if oldest >= (3, 0) else ("", "")
+        newer = f"{TOOL} {_dotted(version)} is too old for it, and {_dotted(oldest)} or newer is needed{node}"
+        raise SettingsError(f"{path}: {newer}; run: {INSTALL}@latest; or give{instead} a .ply")
     return tool
 
 
-def _version(tool: Sequence[str]) -> str:
-    """The version of splat-transform, such as 3.7.0; empty if it does not say."""
+def _version(tool: Sequence[str]) -> tuple[int, ...]:
+    """The version of splat-transform, such as (3, 7, 0); empty if it does not say."""
     try:
         told = subprocess.run([*tool, "--version"], capture_output=True, text=True, errors="replace", timeout=60, check=False)
     except (OSError, subprocess.TimeoutExpired):
-        return ""
+        return ()
     found = re.search(r"\d+(\.\d+)+", told.stdout + told.stderr)
-    return found[0] if found else ""
+    return tuple(map(int, found[0].split("."))) if found and told.returncode == 0 else ()
+
+
+def _dotted(version: Sequence[int]) -> str:
+    return ".".join(map(str, version))
 
 
 def refuse_as_folder(path: Path) -> None:
@@ -175,6 +185,7 @@ def convert(inputs: Sequence[str | Path], output: Path) -> None:
 def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
     """Run splat-transform. Returns its error message, empty on success."""
     options = table_options(graphics_card(tool)) if target.suffix.lower() == ".sog" else ["--gpu", "cpu"]
+    options += ["--spz-version", SPZ_VERSION] if _is_spz(target) else []
     command = [*tool, "--quiet", "--overwrite", *options, *map(str, inputs), str(target)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=LONGEST, check=False)
@@ -186,6 +197,10 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
     if done.returncode == 0 and target.is_file():
         return ""
     return _reason(done.stderr + done.stdout) or f"exit code {done.returncode}"
+
+
+def _is_spz(path: Path) -> bool:
+    return path.name.lower().endswith(".spz")
 
 
 def _reason(said: str) -> str:
