@@ -22,6 +22,8 @@ from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
+from mipmap_plugin.splatting.harmonics import basis
+from mipmap_plugin.splatting.projection import axes_of
 
 # FORMATS §13, T5: a real record of a .splat file.
 RECORD = bytes.fromhex("7a72abc1b6e792c1f011b5c1b6cbe23f9f59683f0c309c4075c9fffff779599a")
@@ -258,6 +260,33 @@ def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_
     (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.0.6', file=sys.stderr)\n")
     with pytest.raises(SettingsError, match=r"2.0.6 is too old for it, and 2.1 or newer is needed; run: npm install -g \S+; or give a .ply"):
         tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
+
+
+def seen(splats, turn):
+    """Places, covariances, and colors in every direction, of splats after a turn [3, 3] of the scene."""
+    axes = turn @ axes_of(splats.quats, splats.scales)
+    directions = torch.nn.functional.normalize(torch.randn(9, 1, 3, generator=torch.Generator().manual_seed(0)), dim=2)
+    colors = (basis(directions @ turn, 4)[..., None] * splats.sh).sum(2)  # a direction of the turned scene, turned back
+    return splats.means @ turn.T, axes @ axes.mT, colors
+
+
+@pytest.mark.parametrize(("version", "turns"), [("2.0.6", False), ("2.1.0", True), ("2.7.1", True), ("3.0.0", False)])
+def test_spz_is_read_and_written_as_it_is_stored_by_every_version(tmp_path, tool, version, turns):
+    """From 2.1 until 3.0 splat-transform turns SPZ by half a turn about x. The stand-in does not, so that what takes it back is seen."""
+    (tool / "splat-transform").write_text((tool / "splat-transform").read_text().replace("3.7.0", version))
+    stored = tiny.model(degree=4)
+    stored.save(tool / "answer.ply", provenance={}, overwrite=True)
+    (tmp_path / "a.spz").write_bytes(SPZ)
+    read = load_model(tmp_path / "a.spz")
+    still, turn = torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, -1.0]) if turns else torch.ones(3))
+    for found, expected in zip(seen(read.gaussians(), still), seen(stored.gaussians(), turn), strict=True):
+        assert torch.allclose(found, expected, atol=1e-5)
+    if version >= "2.1":
+        read.save(tmp_path / "b.spz", provenance={})
+        written = read_ply(tmp_path / "b.spz").columns
+        assert all(np.array_equal(column, written[name]) for name, column in read_ply(tool / "answer.ply").columns.items())
+    (tmp_path / "a.splat").write_bytes(RECORD * 3)
+    assert torch.equal(load_model(tmp_path / "a.splat").parameters()["means"], stored.parameters()["means"])  # only SPZ was turned
 
 
 def test_an_error_of_node_is_told(tmp_path, tool):

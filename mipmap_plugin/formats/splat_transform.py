@@ -40,6 +40,10 @@ OLDEST: dict[str, tuple[int, ...]] = {".sog": (3, 0), ".json": (3, 0), ".spz": (
 # The last version of SPZ that Spark 2.2 and GaussianSplats3D read; splat-transform's own choice is 4.
 SPZ_VERSION = "3"
 
+# From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them
+# in the frame in which they are stored.
+TURNS_SPZ = ((2, 1), (3, 0))
+
 # Suffixes of other files: who asks for one does not expect a folder of that name.
 OF_FILES = (".pt", ".pth", ".ckpt", ".npz", ".npy", ".glb", ".gltf", ".obj", ".usd", ".usdz", ".html", ".json", ".csv", ".txt", ".zip", ".png")
 
@@ -115,6 +119,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
         plain = Path(folder, "plain.ply")
         if reason := _run(tool, [source], plain):
             raise CheckpointError(f"{path} is {name}, but {TOOL} does not read it ({reason}); export it again")
+        _settle_frame(tool, source, plain)
         yield plain
 
 
@@ -140,6 +145,7 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
         ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
         plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
         write(plain)
+        _settle_frame(tool, converted, plain)
         if reason := _run(tool, [plain], converted):
             raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
         shutil.copyfile(converted, temporary)
@@ -197,6 +203,14 @@ def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str
     if done.returncode == 0 and target.is_file():
         return ""
     return _reason(done.stderr + done.stdout) or f"exit code {done.returncode}"
+
+
+def _settle_frame(tool: Sequence[str], file: Path, ply: Path) -> None:
+    """Turn the splats of a PLY that were, or will be, turned on their way from or to `file`."""
+    if _is_spz(file) and TURNS_SPZ[0] <= _version(tool) < TURNS_SPZ[1]:
+        from mipmap_plugin.formats.half_turn import half_turned  # and NumPy, without which options are read
+
+        half_turned(ply)
 
 
 def _is_spz(path: Path) -> bool:
