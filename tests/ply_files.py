@@ -26,7 +26,7 @@ def write(
     path: Path, columns: dict[str, np.ndarray], form: str = "binary_little_endian", newline: str = "\n", comments: tuple[str, ...] = ()
 ) -> Path:
     """One vertex element with these columns, in their own types."""
-    types = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
+    types = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}
     order = ">" if form == "binary_big_endian" else "<"
     count = len(next(iter(columns.values())))
     lines = ["ply", f"format {form} 1.0", *(f"comment {text}" for text in comments), f"element vertex {count}"]

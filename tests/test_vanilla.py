@@ -17,7 +17,8 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import inria_folder, load_model
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.raw import MIN_SCALE, OPACITY_MARGIN
+from mipmap_plugin.models.columns import OPACITY_MARGIN
+from mipmap_plugin.models.raw import MIN_SCALE
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
@@ -77,6 +78,15 @@ def test_double_columns_beyond_float32_are_dropped_not_spread(tmp_path):
     columns = {name: column.astype(np.float64) for name, column in splat_columns(3, 0).items()}
     columns["x"][1] = 1e300
     assert len(load_vanilla(write(tmp_path / "a.ply", columns))) == 2
+
+@pytest.mark.parametrize("full", [np.uint8(255), np.uint16(65535)])
+def test_opacities_that_are_whole_numbers_are_fractions_and_no_logits(tmp_path, full):
+    path = write(tmp_path / "a.ply", {**splat_columns(3), "opacity": np.array([0, full // 5, full], full.dtype)})
+    model = load_vanilla(path)
+    torch.testing.assert_close(model.gaussians().opacities, torch.tensor([OPACITY_MARGIN, 0.2, 1 - OPACITY_MARGIN]))
+    assert f"its opacities are whole numbers ({full.dtype}), read as fractions of the largest" in model.notes
+    assert "opacity" not in model.extras
+
 
 
 @pytest.mark.parametrize("full", [np.uint8(255), np.float32(1)])

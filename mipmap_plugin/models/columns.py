@@ -16,6 +16,9 @@ from mipmap_plugin.splatting.harmonics import C0
 # Number of f_rest columns -> SH degree.
 SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 
+# Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
+OPACITY_MARGIN = 1e-6
+
 # Rows that are transposed together: 1 to 2 MB of a file, which stay in the cache while columns are copied.
 CHUNK = 8192
 
@@ -33,7 +36,7 @@ def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Te
     means [N, 3], scales [N, 3] log, quats [N, 4] wxyz, opacities [N] logit, sh0 [N, 1, 3], shN [N, K, 3] basis-major.
     Raises CheckpointError for missing columns and for a number of f_rest columns that fits no SH degree.
     """
-    columns = _with_dc(columns)
+    columns = _with_logits(_with_dc(columns))
     missing = [name for name in (*POSITION, *DC, "opacity", *SCALE, *QUATERNION) if name not in columns]
     if missing:
         raise CheckpointError(f"{path} is no 3DGS checkpoint: it lacks the columns {', '.join(missing)}; export it again with them")
@@ -102,6 +105,19 @@ def _with_dc(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
     if DC[0] in columns or not all(name in columns for name in RGB):
         return columns
     return {**columns, **{dc: (_unit(columns[name]) - 0.5) / C0 for dc, name in zip(DC, RGB, strict=True)}}
+
+
+def _with_logits(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    """The columns with logits of opacities that are whole numbers of full range, as of point clouds: logits are none."""
+    if not whole_opacities(columns):
+        return columns
+    opacities = _unit(columns["opacity"]).clip(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    return {**columns, "opacity": np.log(opacities / (1 - opacities))}
+
+
+def whole_opacities(columns: Mapping[str, np.ndarray]) -> str:
+    """The type of opacities that are whole numbers; "" if they are floats, or missing."""
+    return columns["opacity"].dtype.name if "opacity" in columns and columns["opacity"].dtype.kind in "iu" else ""
 
 
 def _unit(column: np.ndarray) -> np.ndarray:

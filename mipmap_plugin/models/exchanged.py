@@ -9,10 +9,10 @@ import torch
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.splat_transform import EXCHANGE, as_ply
+from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import find_family
 from mipmap_plugin.models.family import Files
-from mipmap_plugin.models.raw import OPACITY_MARGIN
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 
 

@@ -7,13 +7,10 @@ from torch import Tensor
 
 from mipmap_plugin.errors import ShapeError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.columns import SH_DEGREES
+from mipmap_plugin.models.columns import OPACITY_MARGIN, SH_DEGREES
 
 # World units: about the shortest length whose square is a normal float32. Its logarithm is finite, so it can be optimized.
 MIN_SCALE = 1e-18
-
-# Opacities keep this distance from 0 and 1, whose logits are infinite: far below one step of 8 bits, yet resolved by float32.
-OPACITY_MARGIN = 1e-6
 
 
 def check(parameters: dict[str, Tensor]) -> None:

@@ -19,11 +19,11 @@ from mipmap_plugin.formats.tags import render_mode
 from mipmap_plugin.formats.torch_file import load_torch, save_torch, step_and_comments
 from mipmap_plugin.formats.yaml_scalars import read_scalars, with_scalar
 from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.health import without_invalid
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.places import SPLATFACTO
-from mipmap_plugin.models.raw import OPACITY_MARGIN
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.splatting.harmonics import C0
 

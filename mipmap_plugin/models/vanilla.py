@@ -20,7 +20,7 @@ from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, w
 from mipmap_plugin.formats.tags import render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.models.columns import extra_columns, to_columns, to_parameters
+from mipmap_plugin.models.columns import extra_columns, to_columns, to_parameters, whole_opacities
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, without_invalid
@@ -271,6 +271,7 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     screen_filter = render_mode(ply.comments)
     origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
     model = kind(parameters, trained_scale(options, screen_filter), origin, [*checkpoint.notes, *ply.notes, *notes])
+    model.notes += [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if (whole := whole_opacities(ply.columns)) else []
     del ply  # as large as the model, and no longer needed
     model.notes += companion_notes(options, model.sh_degree, model.traits.exposures, screen_filter)
     if screen_filter:
