@@ -96,6 +96,10 @@ MALFORMED = {
     "negative": (header("format ascii 1.0", "element vertex -1", F4, "end_header"), "line 3 .* cannot be read"),
     "no count": (header("format ascii 1.0", "element vertex", F4, "end_header"), "line 3 .* cannot be read"),
     "no vertex": (header("format ascii 1.0", "element face 1", F4, "end_header") + b"1\n", "no vertex element"),
+    "two vertex": (
+        header("format ascii 1.0", "element vertex 1", F4, "element face 1", F4, "element vertex 2", F4, "end_header") + b"1\n2\n3\n4\n",
+        "has 2 vertex elements, and 2 rows would be lost; export the file again with one element",
+    ),
     "no property": (header("format ascii 1.0", "element vertex 99999999999999", "end_header"), "no vertex element"),
     "list": (header("format ascii 1.0", "element vertex 1", "property list uchar float x", "end_header") + b"1 1\n", "list properties"),
     "truncated": (header("format binary_little_endian 1.0", "element vertex 1000", F4, "end_header") + bytes(4 * 990 + 3), "10 of them are missing"),

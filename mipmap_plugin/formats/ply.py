@@ -202,6 +202,9 @@ def _sized(path: Path, header: Header, size: int) -> Header:
     if not vertices:
         raise CheckpointError(f"{path} has no vertex element, so it holds no splats; its elements are {[e.name for e in header.elements]}")
     vertex = vertices[0]
+    if further := sum(element.count for element in vertices[1:]):
+        lost = f"{path} has {len(vertices)} vertex elements, and {further:,} rows would be lost"
+        raise CheckpointError(f"{lost}; export the file again with one element")
     if vertex.has_lists:
         raise CheckpointError(f"{path} has list properties in its vertex element, so it is a mesh or another format; give a trained model")
     available = size + (header.format == "ascii")  # the last value needs no blank behind it
