@@ -157,6 +157,19 @@ def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("ending", [".spz", ".compressed.ply"])
+def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tmp_path, tool, ending, capsys):
+    """Normals that are not 0 too, which 3DGS does not have."""
+    columns = {**read_ply(tiny.ply(tmp_path / "a.ply")).columns, "confidence": np.ones(60, np.float32), "nx": np.ones(60, np.float32)}
+    write(tmp_path / "b.ply", columns)
+    told = f"the extra columns nx, ny, nz, confidence are dropped, since {ending} has no place for them; a .ply has"
+    assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(tmp_path / f"c{ending}")]) == 0
+    assert capsys.readouterr().err.count(told) == 1
+    assert told in json.loads((tmp_path / f"c{ending}.adaptation.json").read_text())["notes"]
+    assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(tmp_path / "d.ply")]) == 0
+    assert json.loads((tmp_path / "d.ply.adaptation.json").read_text())["notes"] == []
+
+
 def test_a_format_that_is_only_read_is_saved_as_a_ply(tmp_path, tool):
     (tmp_path / "phone.splat").write_bytes(RECORD * 3)
     assert main(["adapt", str(tmp_path / "phone.splat"), "--scale", "1/4", "--recipe", "instant"]) == 0

@@ -22,7 +22,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image
 from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of
 from mipmap_plugin.models.exposure import exposed
-from mipmap_plugin.models.outputs import parts_of
+from mipmap_plugin.models.outputs import parts_of, without_place
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.torch_modes import usual_modes
@@ -84,10 +84,15 @@ class Adapted:
         refuse_output(Path(path), overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
         with together(Path(path)), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
             saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
-            write_json(saved.with_name(saved.name + REPORT), self.report.model_dump(), overwrite=overwrite)
+            write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
             state.remove()
         return saved
+
+    def report_of(self, path: Path) -> Report:
+        """The report of the file at `path`, which also says what its format has no place for."""
+        lost = without_place(path, getattr(self.model, "extras", ()))
+        return self.report.model_copy(update={"notes": [*self.report.notes, lost]}) if lost else self.report
 
 
 @torch.no_grad()

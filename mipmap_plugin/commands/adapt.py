@@ -163,7 +163,7 @@ def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> d
     saved = adapted.save(target, overwrite=overwrite)
     if not quiet:
         _say(saved, adapted)
-    return {"file": str(saved), **adapted.report.model_dump()}
+    return {"file": str(saved), **adapted.report_of(saved).model_dump()}
 
 
 def _requests(scales: Sequence[float], viewers: tuple[str, ...]) -> list[tuple[float, str | None]]:

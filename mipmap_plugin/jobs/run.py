@@ -50,4 +50,4 @@ def _adapt(job: Job, threads: int | None) -> Outcome:
     scene = None if job.images is None else load_scene(job.images)
     adapted = base.adapt(job.scale, recipe=job.recipe, viewer=job.viewer, resume=state_path(job.target), images=scene, **job.settings)
     file = adapted.save(job.target, overwrite=job.overwrite)
-    return Outcome(job, "done", file, adapted.report.model_dump())
+    return Outcome(job, "done", file, adapted.report_of(file).model_dump())

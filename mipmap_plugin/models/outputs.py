@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import torch
@@ -13,7 +13,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import refuse_as_folder
+from mipmap_plugin.formats.splat_transform import is_written, refuse_as_folder
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.places import CONVERTED, REPORT, STATE
@@ -70,6 +70,13 @@ def refuse_own_filter(path: Path, trained: TrainedScale) -> None:
     if trained.keeps_filter:
         own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
+
+
+def without_place(path: Path, extras: Iterable[str]) -> str:
+    """That the format of `path` has no place for the columns that 3DGS does not define, in a sentence; "" if it has, or if there are none."""
+    names = ", ".join(extras) if is_written(path) else ""
+    ending = ".compressed.ply" if path.name.lower().endswith(".compressed.ply") else path.suffix.lower()
+    return f"the extra columns {names} are dropped, since {ending} has no place for them; a .ply has" if names else ""
 
 
 def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposure
 from mipmap_plugin.models.health import LARGEST, without_invalid
 from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
-from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts
+from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts, without_place
 from mipmap_plugin.models.raw import check, log, logit, moved, raw_parameters
 from mipmap_plugin.splatting.bands import joined, neighbors
 from mipmap_plugin.splatting.rotations import unit_quaternions
@@ -202,6 +203,8 @@ class VanillaModel:
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance)
         if is_written(path):
             refuse_own_filter(path, self.trained)
+            if lost := without_place(path, self._origin.extras):
+                warnings.warn(lost, stacklevel=2)
             return write_exchange(path, lambda ply: write_ply(ply, self._columns(parameters), comments), overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
