@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -75,16 +75,14 @@ def to_columns(parameters: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
 
 
 def extra_columns(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Copies of the columns that 3DGS does not define, such as a confidence or a segment id, in this machine's byte order; also of normals that are
-    not 0, as those of 3DGS are."""
-    normals = NORMAL if any(columns[name].any() for name in NORMAL if name in columns) else ()
-    kept = {*extra_names(columns), *normals}
-    return {name: column.astype(column.dtype.newbyteorder("=")) for name, column in columns.items() if name in kept}
+    """Copies of the columns of `extra_names`, in this machine's byte order."""
+    return {name: columns[name].astype(columns[name].dtype.newbyteorder("=")) for name in extra_names(columns)}
 
 
-def extra_names(columns: Collection[str]) -> list[str]:
-    """Which of these columns 3DGS does not define."""
-    known = {*POSITION, *NORMAL, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+def extra_names(columns: Mapping[str, np.ndarray]) -> list[str]:
+    """Which of these columns 3DGS does not define, such as a confidence or a segment id; also normals that are not 0, as those of 3DGS are."""
+    known = {*POSITION, *DC, "opacity", *SCALE, *QUATERNION, *rest_names(columns)}
+    known |= set() if any(columns[name].any() for name in NORMAL if name in columns) else set(NORMAL)
     known |= set() if DC[0] in columns else set(RGB)
     return [name for name in columns if name not in known]
 

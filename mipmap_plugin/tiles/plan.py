@@ -24,7 +24,7 @@ from mipmap_plugin.tiles.scene import find_splats, make_cut
 PLAN = "plan.json"
 
 # Of the folder's files: those of another format are not gone on with.
-FORMAT = 3
+FORMAT = 4
 
 
 def refuse(job: Job, tiles: int) -> None:

@@ -12,7 +12,6 @@ from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.effects import explain
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.models.base import effects_of
-from mipmap_plugin.models.columns import extra_names
 from mipmap_plugin.tiles.scene import TiledScene
 
 
@@ -22,7 +21,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
     model, config = scene.wrapped.model, scene.config
     large = fewer_note(scene.asked_steps, config)
     effects = explain(scene.target, model.gaussians(scene.wrapped.any_camera()), effects_of(model), config, scene.scale)
-    lost = [f"the extra columns {', '.join(names)} are dropped, since tiles hold none"] if (names := extra_names(scene.columns)) else []
+    lost = [f"the extra columns {', '.join(scene.extras)} are dropped, since tiles hold none"] if scene.extras else []
     for note in lost:
         warnings.warn(note, stacklevel=2)
     psnr = validation.get(returned, 0.0)

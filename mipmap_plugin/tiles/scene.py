@@ -29,6 +29,7 @@ from mipmap_plugin.formats.tags import render_mode
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.jobs.base import COLORS, Base
 from mipmap_plugin.models import Checkpoint, detect
+from mipmap_plugin.models.columns import extra_names
 from mipmap_plugin.models.exposure import read_exposures
 from mipmap_plugin.models.health import coarse, examine
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
@@ -82,7 +83,7 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     checkpoint, kind = find_splats(path)
     rows = PlyRows(checkpoint.path)
     found = _Found()
-    write_pieces(folder / BASE, len(rows), (found(kind, part) for part in _read(kind, rows)))
+    write_pieces(folder / BASE, len(rows), (found(kind, part, rows.path) for part in _read(rows)))
     splats = Splats.of(kind, [Store(folder / BASE)])
     valid = torch.cat(found.valid)
     kept = valid.nonzero()[:, 0]
@@ -96,27 +97,31 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
     sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()
     places = torch.where(valid[:, None], splats.places, torch.nan)  # an invalid splat is seen by no camera
-    stored = {"places": places, "cores": cores, "tree": tree, "sample": sample, "digest": sha256(checkpoint.path)}
+    stored = {"places": places, "cores": cores, "tree": tree, "sample": sample, "digest": sha256(checkpoint.path),
+              "extras": [name for name in rows.header.vertex.names if name in found.extras]}  # fmt: skip
     save_torch(folder / CUT, stored, overwrite=True)
 
 
-def _read(kind: type[VanillaModel], rows: PlyRows) -> Iterator[dict[str, Tensor]]:
-    """The raw parameters of a PLY, some rows at a time."""
+def _read(rows: PlyRows) -> Iterator[dict[str, Any]]:
+    """The columns of a PLY, some rows at a time."""
     for start in range(0, len(rows), CHUNK):
-        yield kind.parameters_of(rows.columns(slice(start, start + CHUNK)), rows.path)
+        yield rows.columns(slice(start, start + CHUNK))
         rows.release()
 
 
 class _Found:
-    """Which splats are finite, whether one is drawn, and one that has the highest SH band of all that are not zero."""
+    """Which splats are finite, whether one is drawn, one that has the highest SH band that is not zero, and columns that tiles do not hold."""
 
     def __init__(self) -> None:
         self.valid: list[Tensor] = []
         self.degree_at, self.highest, self.drawn = 0, -1, False
         self.rounded, self.step = 0, 0.0  # as of `Health`; the largest step
+        self.extras: set[str] = set()
 
-    def __call__(self, kind: type[VanillaModel], parameters: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Examine the next splats, and return them."""
+    def __call__(self, kind: type[VanillaModel], columns: dict[str, Any], path: Path) -> dict[str, Tensor]:
+        """Examine the next splats, and return their raw parameters."""
+        parameters = kind.parameters_of(columns, path)
+        self.extras.update(extra_names(columns))
         health = examine(kind(parameters))
         valid = ~health.invalid
         self.drawn |= health.invisible < health.splats
@@ -141,8 +146,8 @@ class TiledScene:
         self.base = Splats(self.kind, [Store(folder / BASE)], stored["places"])
         self.cores: list[Tensor] = stored["cores"]
         self.tree: Tree = stored["tree"]
-        header = PlyRows(self.checkpoint.path).header
-        self.comments, self.columns = header.comments, header.vertex.names
+        self.comments = PlyRows(self.checkpoint.path).header.comments
+        self.extras: list[str] = stored["extras"]  # columns of the base that tiles do not hold
         self.digest: str = stored["digest"]
         self.options, _ = read_options(self.checkpoint.folder)
         self.wrapped = self._wrapped(base, stored["sample"])
