@@ -211,6 +211,22 @@ def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not
     assert cli.main(words) == 0 and (tmp_path / "ladder" / "level_0.ply").is_file()
 
 
+@pytest.mark.parametrize("at", ["mipmap_plugin.levels.ladder.write_ladder", "mipmap_plugin.levels.store.LevelStore._loaded"])
+def test_a_disk_that_fills_leaves_the_finished_levels_for_the_same_command(tmp_path, capsys, monkeypatch, at):
+    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
+    words += ["--by", "zoom", "--steps", "1", "--views", "given", "--backend", "reference"]
+
+    def full(*arguments):
+        raise OutputError("the disk is full")
+
+    with monkeypatch.context() as first:
+        first.setattr(at, full)
+        assert cli.main(words) == 2
+    told = f"the disk is full; run the same command again to go on with the levels that {tmp_path / 'ladder.resume'} keeps"
+    assert told in capsys.readouterr().err and not (tmp_path / "ladder").exists()
+    assert cli.main(words) == 0 and (tmp_path / "ladder" / "level_1.ply").is_file()
+
+
 @pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt, 130), (lambda: OutputError("the disk is full"), 2)], ids=["Ctrl-C", "error"])
 def test_an_export_that_ends_early_loses_no_level(tmp_path, tool, capsys, monkeypatch, error, code):
     words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]

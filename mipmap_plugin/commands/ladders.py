@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError
 from mipmap_plugin.formats.splat_transform import refuse_exchange
 from mipmap_plugin.progress import announced
 
@@ -65,12 +66,14 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once, but for
     Streamed SOG of a ladder that comes out as a single level, because that has few enough splats or no other is of use."""
     from mipmap_plugin import threads
-    from mipmap_plugin.levels.manifest import level_name, read_manifest, refuse_ladder
+    from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
+    from mipmap_plugin.levels.room import room_for
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
     from mipmap_plugin.wrap import state_path
 
     unfinished = state_path(output)
-    refuse_ladder(output, wrapped, overwrite=overwrite, twice=not (unfinished / level_name(0)).exists())
+    refuse_ladder(output, wrapped, overwrite=overwrite)
+    refuse_ladder(output, wrapped, overwrite=overwrite, room=room_for(wrapped, request, unfinished))
     if exports.streamed_sog and _is_single(wrapped, request):
         raise SettingsError(SINGLE_LEVEL)
     if not wrapped.cameras:
@@ -78,7 +81,8 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     ladder = _made(wrapped, request, unfinished)
     if exports.streamed_sog and len(ladder.levels) == 1:
         raise SettingsError(f"{SINGLE_LEVEL}, or leave --streamed-sog out, which goes on from what is made")
-    folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
+    with _kept(unfinished):
+        folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
     try:
         with threads.limited(wrapped.threads, shared=getattr(wrapped.backend()[0], "own_threads", False)):
             files = exports.write(folder, ladder.contents)
@@ -90,15 +94,24 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
 
 
 def _made(wrapped: Wrapped, request: LadderRequest, unfinished: Path) -> Ladder | DistanceLadder:
-    """The ladder, whose levels `unfinished` keeps as they are made. Raises what `make_levels` raises; an interruption says that levels are kept."""
+    """The ladder, whose levels `unfinished` keeps as they are made. Raises what `make_levels` raises."""
     from mipmap_plugin.levels.ladder import make_levels
 
-    try:
+    with _kept(unfinished):
         return make_levels(wrapped, request, resume=unfinished)
-    except KeyboardInterrupt as interrupt:
-        if str(interrupt) or not any(unfinished.glob("level_*.ply")):  # within a level's steps it says more
+
+
+@contextmanager
+def _kept(unfinished: Path) -> Iterator[None]:
+    """An interruption, and an output that cannot be written, such as to a full disk, say that the finished levels are kept."""
+    try:
+        yield
+    except (KeyboardInterrupt, OutputError) as error:
+        within = isinstance(error, KeyboardInterrupt) and str(error)  # a level's steps, where it says more
+        if within or not any(unfinished.glob("level_*.ply")):
             raise
-        raise KeyboardInterrupt(f"interrupted; run the same command again to go on with the levels that {unfinished} keeps") from interrupt
+        again = f"run the same command again to go on with the levels that {unfinished} keeps"
+        raise type(error)(f"{str(error) or 'interrupted'}; {again}") from error
 
 
 def _is_single(wrapped: Wrapped, request: LadderRequest) -> bool:

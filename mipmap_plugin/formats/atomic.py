@@ -128,9 +128,9 @@ def refuse_output(path: Path, overwrite: bool, base: Iterable[Path] = (), *, is_
         raise OutputExists(f"{path} exists already; pass --overwrite (overwrite=True) to replace it, or choose another path")
 
 
-def refuse_unwritable(path: Path, room: int = 0, *, twice: bool = False) -> None:
-    """Raise OutputError if `path` could not be written: no permission, a read-only disk, fewer than `room` bytes free, which the base takes; fewer
-    than twice as many with `twice`, for work that keeps a copy beside `path` until it is done."""
+def refuse_unwritable(path: Path, room: int = 0, *, what: str = "the base takes", why: str = "") -> None:
+    """Raise OutputError if `path` could not be written: no permission, a read-only disk, fewer than `room` bytes free. `what` takes so many, and what
+    else there is to say of them, are parts of the sentence."""
     with _as_output_error(path):
         place = absolute(path)
         if place.parent.is_dir():
@@ -141,8 +141,8 @@ def refuse_unwritable(path: Path, room: int = 0, *, twice: bool = False) -> None
         if not os.access(there, os.W_OK | os.X_OK):
             raise OSError(errno.EACCES, f"no permission to write to {there}")
         free = shutil.disk_usage(there).free
-    if free < room * (1 + twice):
-        reason = f"its disk has {free:,} bytes free, and the base takes {room:,}{', twice until all is done' if twice else ''}"
+    if free < room:
+        reason = f"its disk has {free:,} bytes free, and {what} {room:,}{why}"
         raise OutputError(f"{path} cannot be written: {reason}; free some, or choose another disk")
 
 

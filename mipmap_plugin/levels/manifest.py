@@ -27,16 +27,15 @@ def level_name(number: int) -> str:
     return f"level_{number}.ply"
 
 
-def refuse_ladder(folder: Path, base: Wrapped, *, overwrite: bool, twice: bool = False) -> None:
+def refuse_ladder(folder: Path, base: Wrapped, *, overwrite: bool, room: int = 0) -> None:
     """Raise what writing a ladder to `folder` would raise. A folder with other things in it is never replaced. Raises OutputExists, OutputError.
 
-    The disk needs room for level 0, which is as large as the base. `twice`: and for the unfinished ladder's.
+    `room`: bytes that its disk needs (`room.room_for`).
     """
     source = base.model.source
     refuse_output(folder, overwrite, [] if source is None else [source])
     refuse_to_lose(folder, base.model.folder, MANIFEST, WRITTEN)
-    room = source.stat().st_size if source is not None and source.is_file() else 0  # it may be gone when the levels are finished
-    refuse_unwritable(folder, room, twice=twice)
+    refuse_unwritable(folder, room, what="the levels take about", why=", with what is kept of them until all are done")
 
 
 def write_ladder(ladder: Contents, folder: Path, overwrite: bool) -> Path:

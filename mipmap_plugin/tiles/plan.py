@@ -44,7 +44,8 @@ def refuse(job: Job, tiles: int) -> None:
     if is_written(job.target):
         raise SettingsError(f"{job.target}: tiles are joined to a .ply or a model folder; give one of these, and convert it afterwards")
     refuse_output(job.target, job.overwrite, parts_of(base, None))
-    refuse_unwritable(job.target, base.stat().st_size, twice=not (work_folder(job.target) / CUT).exists())
+    copies = 1 if (work_folder(job.target) / CUT).exists() else 2  # one is kept beside the output until all is done
+    refuse_unwritable(job.target, copies * base.stat().st_size, what="the tiles take at least")
 
 
 def claim(jobs: Sequence[Job], tiles: int) -> None:
