@@ -1,14 +1,19 @@
 """Health: each fault is counted once and by its own name, and only poison is dropped unasked."""
 
+import json
 import math
 
 import numpy as np
 import pytest
+import tiny
 import torch
 from ply_files import splat_columns, write
 
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.health import drop, examine
+from mipmap_plugin.models.health import ACTIVATED, LINEAR, drop, examine
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 
@@ -88,6 +93,33 @@ def test_values_that_look_activated_are_reported_and_not_changed(name, flag):
     assert getattr(health, flag)
     assert any("export the file again" in sentence_found for sentence_found in health.sentences())
     assert torch.equal(model.parameters()[name], before)
+
+
+@pytest.mark.parametrize(("column", "sentence"), [("scale_{}", LINEAR), ("opacity", ACTIVATED)])
+@pytest.mark.parametrize("words", [["adapt", "--scale", "1/2", "--recipe", "instant"], *(
+    ["levels", "--viewer", "playcanvas", "--coarsest", "1/2", "--steps", "1", "--by", by] for by in ("zoom", "distance"))])  # fmt: skip
+def test_what_inspect_calls_doubtful_is_told_of_once_and_in_the_report(tmp_path, capsys, words, column, sentence):
+    path = tiny.folder(tmp_path / "base", count=120)
+    [ply] = path.rglob("*.ply")
+    columns = read_ply(ply).columns
+    wrong = {name: np.float32(1) / (1 + np.exp(-values)) for name, values in columns.items() if name in (column, *map(column.format, range(3)))}
+    write(ply, columns | wrong)
+    command, *options = words
+    assert main([command, str(path), *options, "--output", str(tmp_path / "new"), "--backend", "reference", "--views", "given"]) == 0
+    assert capsys.readouterr().err.count(sentence) == 1
+    reports = sorted((tmp_path / "new").rglob("*.adaptation.json"))
+    assert reports and all(json.loads(report.read_text())["notes"] == [sentence] for report in reports)
+
+
+@pytest.mark.parametrize("left", [0, 20, 21])
+def test_a_file_of_which_little_is_finite_is_refused_and_the_byte_order_named(tmp_path, left):
+    columns = splat_columns(100)
+    columns["x"][left:] = 1e20
+    path = write(tmp_path / "a.ply", columns)
+    few = f"only {left} of its 100 splats are" if left else "none of its 100 splats is"
+    told = rf"a.ply: {few} finite once activated, and below 1e\+12; its header may name the wrong byte order, or the training .* export it again"
+    with pytest.raises(CheckpointError, match=told) if left < 21 else pytest.warns(UserWarning, match="79 of 100 splats were dropped"):
+        load_vanilla(path)
 
 
 def test_a_few_splats_say_nothing_about_distributions():

@@ -29,6 +29,7 @@ from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.models.health import ACTIVATED
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
@@ -289,6 +290,17 @@ def test_places_that_float32_does_not_hold_are_told_of(job):
     folder.mkdir()
     with pytest.warns(UserWarning, match=r"80 of 80 splats lie so far .* steps of 0.5 units"):
         make_cut(job.base.checkpoint, 2, folder)
+
+
+def test_splats_that_are_doubtful_or_left_out_are_told_of(job):
+    [file] = job.base.checkpoint.rglob("*.ply")
+    columns = {name: np.tile(column, 2) for name, column in read_ply(file).columns.items()}
+    columns["opacity"], columns["x"][0] = np.linspace(0, 1, 160, dtype=np.float32), np.nan
+    write_ply(file, columns, overwrite=True)
+    with pytest.warns(UserWarning, match=r"the opacities look like 0..1"), pytest.warns(UserWarning, match="1 of 160 splats was dropped"):
+        scene, _ = cut_in_three(job)
+    doubts = [ACTIVATED, "1 of 160 splats was dropped: not finite once activated"]
+    assert make_report(scene, [file], {"total": 1.0}, {}, "the start").notes == doubts
 
 
 def whole_and_tiles(halved):

@@ -40,6 +40,7 @@ from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
 from mipmap_plugin.models.base import SplatModel, digest_of_parameters, effects_of
+from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.progress import announced
 
 # (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> True (Python's, NumPy's or torch's)
@@ -291,7 +292,7 @@ class Session:
             curve=curve,
             versions=versions(),
             inputs=self.inputs,
-            notes=notes,
+            notes=[*doubts_in(self.base.notes), *notes],
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +60,9 @@ class LevelStore:
         """A level as it is in its file. Every level is read, also one just made, so that a ladder is the same whether it was interrupted or not."""
         try:
             report = Report.model_validate(read_json(file.with_name(file.name + REPORT)))
-            model = load_model(file).to(self._base.model.parameters()["means"].device)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # what there is to say of its splats was said of the base's
+                model = load_model(file).to(self._base.model.parameters()["means"].device)
         except (ValueError, MipmapPluginError) as error:
             raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({error}); delete its folder to start anew") from error
         model.trained = _trained(self._base, self._target)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeVar
@@ -57,6 +57,17 @@ COARSE_STEP, COARSE_SHARE = 0.5, 0.1
 # The word in notes on rows that are left out.
 DROPPED = "dropped"
 
+# A file of which this fraction of the splats or more would be left out is no scene. A training or an export that failed in places leaves most of
+# them; of real files that are read in the wrong byte order, 0.03 % (SH degree 3) to 10 % (degree 0) are finite, by chance, and lie anywhere.
+MOST_DROPPED = 0.8
+
+# What is said of splats whose places float32 does not hold.
+ROUNDED = "so far from the origin that float32 rounds their positions"
+
+# What is said of splats whose stored values look like those of another convention.
+LINEAR = "the scales look like lengths, not like their logarithms; if the image is a fog, export the file again with log scales"
+ACTIVATED = "the opacities look like 0..1, not like logits; if the image is too transparent, export the file again with logits"
+
 # With fewer splats than this, the distribution of a parameter is not judged.
 MIN_DISTRIBUTION = 100
 
@@ -89,17 +100,15 @@ class Health:
             (self.invisible, "have an opacity below 1/255 and are never drawn"),
         ]
         remarks = [*self.non_finite(), *(f"{count:,} of {self.splats:,} splats {what}" for count, what in counts if count)]
-        remarks += [sentence] if (sentence := self.coarse()) else []
-        if self.scales_look_linear:
-            remarks.append("the scales look like lengths, not like their logarithms; if the image is a fog, export the file again with log scales")
-        if self.opacities_look_activated:
-            remarks.append("the opacities look like 0..1, not like logits; if the image is too transparent, export the file again with logits")
-        return remarks
+        return remarks + self.doubts()
 
     def spoilt(self) -> bool:
         """Whether some splats spoil images, none is drawn, places are lost, or stored values look like those of another convention."""
-        spoilt = bool(self.invalid.any()) or 0 < self.splats == self.invisible or bool(self.coarse())
-        return spoilt or self.scales_look_linear or self.opacities_look_activated
+        return bool(self.invalid.any()) or 0 < self.splats == self.invisible or bool(self.doubts())
+
+    def doubts(self) -> list[str]:
+        """That places are lost, or that stored values look like those of another convention, in sentences."""
+        return doubts(self.coarse(), self.scales_look_linear, self.opacities_look_activated)
 
     def coarse(self) -> str:
         """That many splats lie too far from the origin for float32, in a sentence; "" if few do."""
@@ -111,12 +120,17 @@ class Health:
         return [f"{count:,} of {self.splats:,} splats hold {kind} in {name}" for kind, name, count in counts if count]
 
 
+def doubts(lost: str, linear: bool, activated: bool) -> list[str]:
+    """`Health.doubts`, of `coarse` and its two flags."""
+    return [sentence for sentence, doubtful in ((lost, bool(lost)), (LINEAR, linear), (ACTIVATED, activated)) if doubtful]
+
+
 def coarse(rounded: int, splats: int, step: float) -> str:
     """`Health.coarse`, of its three numbers."""
     if rounded <= COARSE_SHARE * splats:
         return ""
     count, remedy = f"{rounded:,} of {splats:,} splats", "export the scene again, moved near the origin together with its cameras"
-    why = f"lie so far from the origin that float32 rounds their positions to steps of {step:.2g} units, which is much for their size"
+    why = f"lie {ROUNDED} to steps of {step:.2g} units, which is much for their size"
     return f"{count} {why}; {remedy}"
 
 
@@ -169,20 +183,36 @@ def drop(model: Model, mask: Tensor, why: str, source: Path | str | None) -> Mod
 
 
 def without_invalid(model: Read) -> Read:
-    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none is left.
+    """The model without splats that are not finite once activated, with a note. Raises CheckpointError if none or few are left (`refuse_few`).
 
-    Once for each model it warns of positions that float32 does not hold: a file of doubles loses them only here.
+    Once for each model it warns of what is doubtful (`Health.doubts`), such as positions that float32 does not hold: a file of doubles loses them
+    only here.
     """
     health = examine(model)
-    if (lost := health.coarse()) and lost not in model.notes:
-        warnings.warn(f"{model.source or 'this model'}: {lost}", stacklevel=2)
-        model = model.noted(lost)
+    refuse_few(health.invalid, model.source)
+    for doubt in health.doubts():
+        if doubt not in model.notes:
+            warnings.warn(f"{model.source or 'this model'}: {doubt}", stacklevel=2)
+            model = model.noted(doubt)
     if not health.invalid.any():
         return model
-    if health.invalid.all():
-        what = f"none of its {health.splats:,} splats is finite once activated, and below {LARGEST:g}"
-        raise CheckpointError(f"{model.source or 'this model'}: {what}; the training or the export failed")
     return drop(model, health.invalid, "; ".join(why_invalid(model, health.invalid)), model.source)
+
+
+def refuse_few(invalid: Tensor, source: Path | str | None) -> None:
+    """Raise CheckpointError if the splats that are not `invalid` [N] are too few to be a scene. `source`: where they come from."""
+    count, lost = len(invalid), int(invalid.sum())
+    if count and lost >= MOST_DROPPED * count:
+        left = count - lost
+        few = f"none of its {count:,} splats is" if left == 0 else f"only {left:,} of its {count:,} splats are"
+        order = "its header may name the wrong byte order, or " if str(source).lower().endswith(".ply") else ""
+        why = f"{order}the training or the export failed; export it again"
+        raise CheckpointError(f"{source or 'this model'}: {few} finite once activated, and below {LARGEST:g}; {why}")
+
+
+def doubts_in(notes: Iterable[str]) -> list[str]:
+    """Which of a model's notes are doubts about the splats of its file: those of `Health.doubts`, and on splats that were left out."""
+    return [note for note in notes if note in (LINEAR, ACTIVATED) or DROPPED in note or ROUNDED in note]
 
 
 def dropped(mask: Tensor, rows: str, why: str, source: Path | str | None) -> str:

@@ -43,5 +43,5 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         validation=validation,
         curve=[CurvePoint(step=config.steps, seconds=seconds["total"], psnr_db=None, validation_db=psnr, gaussians=after)],
         versions=versions(),
-        notes=lost,
+        notes=[*scene.doubts, *lost],
     )

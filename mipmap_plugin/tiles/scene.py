@@ -31,7 +31,7 @@ from mipmap_plugin.jobs.base import COLORS, Base
 from mipmap_plugin.models import Checkpoint, detect
 from mipmap_plugin.models.columns import extra_names
 from mipmap_plugin.models.exposure import read_exposures
-from mipmap_plugin.models.health import coarse, examine
+from mipmap_plugin.models.health import MIN_DISTRIBUTION, coarse, doubts, dropped, examine, refuse_few
 from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
@@ -86,19 +86,22 @@ def make_cut(path: Path, tiles: int, folder: Path) -> None:
     write_pieces(folder / BASE, len(rows), (found(kind, part, rows.path) for part in _read(rows)))
     splats = Splats.of(kind, [Store(folder / BASE)])
     valid = torch.cat(found.valid)
+    refuse_few(~valid, checkpoint.path)
     kept = valid.nonzero()[:, 0]
     if len(kept) < tiles:
         raise CheckpointError(f"{checkpoint.path} has {len(kept):,} splats, which cannot be cut into {tiles} tiles; give fewer")
     cores, tree = cut(splats.places, kept, tiles)
     if not found.drawn:
         raise CheckpointError(f"{checkpoint.path}: every splat has an opacity below 1/255, so none is drawn; the training or the export failed")
-    if lost := coarse(found.rounded, len(rows), found.step):
-        warnings.warn(f"{checkpoint.path}: {lost}", stacklevel=2)
+    told = found.doubts(len(rows))
+    for doubt in told:
+        warnings.warn(f"{checkpoint.path}: {doubt}", stacklevel=2)
+    told += [] if valid.all() else [dropped(~valid, "splats", "not finite once activated", checkpoint.path)]
     degree_at = found.degree_at if found.highest >= 0 else int(kept[0])
     sample = torch.cat([kept[:: -(-len(kept) // SAMPLE)], torch.tensor([degree_at])]).unique()
     places = torch.where(valid[:, None], splats.places, torch.nan)  # an invalid splat is seen by no camera
     stored = {"places": places, "cores": cores, "tree": tree, "sample": sample, "digest": sha256(checkpoint.path),
-              "extras": [name for name in rows.header.vertex.names if name in found.extras]}  # fmt: skip
+              "extras": [name for name in rows.header.vertex.names if name in found.extras], "doubts": told}  # fmt: skip
     save_torch(folder / CUT, stored, overwrite=True)
 
 
@@ -116,6 +119,7 @@ class _Found:
         self.valid: list[Tensor] = []
         self.degree_at, self.highest, self.drawn = 0, -1, False
         self.rounded, self.step = 0, 0.0  # as of `Health`; the largest step
+        self.looks: list[tuple[bool, bool]] = []  # whether scales look linear, and opacities activated, where so many splats say anything
         self.extras: set[str] = set()
 
     def __call__(self, kind: type[VanillaModel], columns: dict[str, Any], path: Path) -> dict[str, Tensor]:
@@ -132,7 +136,14 @@ class _Found:
             if band > self.highest:
                 self.degree_at, self.highest = sum(map(len, self.valid)) + row, band
         self.valid.append(valid)
+        if health.splats >= MIN_DISTRIBUTION:
+            self.looks.append((health.scales_look_linear, health.opacities_look_activated))
         return parameters
+
+    def doubts(self, splats: int) -> list[str]:
+        """As of `Health`, of all splats."""
+        linear, activated = map(all, zip(*self.looks, strict=True)) if self.looks else (False, False)
+        return doubts(coarse(self.rounded, splats, self.step), linear, activated)
 
 
 class TiledScene:
@@ -147,6 +158,7 @@ class TiledScene:
         self.cores: list[Tensor] = stored["cores"]
         self.tree: Tree = stored["tree"]
         self.comments = PlyRows(self.checkpoint.path).header.comments
+        self.doubts: list[str] = stored["doubts"]  # about the base's splats, in sentences
         self.extras: list[str] = stored["extras"]  # columns of the base that tiles do not hold
         self.digest: str = stored["digest"]
         self.options, _ = read_options(self.checkpoint.folder)

@@ -42,6 +42,7 @@ from mipmap_plugin.levels.distance.rule import DistanceRule, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, foreground
 from mipmap_plugin.levels.request import MERGING_COSTS, LadderRequest
 from mipmap_plugin.models.base import Rebuilt, SplatModel, digest_of_parameters, effects_of
+from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.progress import announced
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.wrap import Wrapped
@@ -259,6 +260,7 @@ class LevelRun:
             curve=curve,
             versions=versions(),
             inputs=scene.base.asked,
+            notes=doubts_in(scene.base.model.notes),
         )
 
 
