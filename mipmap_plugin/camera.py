@@ -21,6 +21,10 @@ Item = TypeVar("Item")
 # Hexadecimal digits of a hash that tells one set of cameras or photographs from another.
 DIGITS = 16
 
+# How far a pose may be from a rotation. One of three decimals is off by 1e-2, and a scene may be moved by another such transform; the usual
+# slips (one axis flipped, one stretched, intrinsics multiplied in) are off by far more.
+POSE_TOLERANCE = 3e-2
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -35,7 +39,8 @@ class Camera:
         fy: Focal length in y, px.
         cx: Principal point, px from the left edge of the image, which is 0.
         cy: Principal point, px from the upper edge.
-        viewmat: [4, 4] float64 on the CPU, from the world to the camera; given as a tensor or an array of any type, which is copied.
+        viewmat: [4, 4] float64 on the CPU, from the world to the camera: a rotation and a translation. Given as a tensor or an array of any type,
+            which is copied; a scale that all axes share is divided out, which changes no image.
         name: Of the view, as in messages and files: that of its photograph, for example.
         split: Whether the base was trained on it; views of "test" are for judging.
         time: 0..1, for moving scenes; None: the scene does not move.
@@ -89,8 +94,25 @@ class Camera:
             raise SettingsError(f"camera {self.name!r}: the pose contains NaN or infinity")
         if not torch.allclose(pose[3], pose.new_tensor([0, 0, 0, 1])):
             raise SettingsError(f"camera {self.name!r}: the last row of viewmat must be 0 0 0 1; it may have to be transposed, as that of 3DGS has")
-        if torch.linalg.det(pose) == 0:
+        return self._rigid(pose)
+
+    def _rigid(self, pose: Tensor) -> Tensor:
+        """The pose [4, 4] without a scale that its axes share. Raises SettingsError for one that mirrors, stretches or shears."""
+        determinant = torch.linalg.det(pose[:3, :3]).item()
+        if determinant == 0:
             raise SettingsError(f"camera {self.name!r}: viewmat cannot be inverted")
+        if determinant < 0:
+            slip = "as when one axis alone is flipped between OpenGL and OpenCV; flip y and z together"
+            raise SettingsError(f"camera {self.name!r}: viewmat mirrors the scene (determinant {determinant:.3g}), {slip}")
+        scale = determinant ** (1 / 3)
+        rotation = pose[:3, :3] / scale
+        off = (rotation @ rotation.T - torch.eye(3, dtype=pose.dtype, device=pose.device)).abs().max().item()
+        if not off <= POSE_TOLERANCE:
+            advice = "give a rotation and a translation, and the intrinsics as fx, fy, cx and cy"
+            wrong = f"the axes of viewmat are not at right angles or not of one length (off by {off:.2g})"
+            raise SettingsError(f"camera {self.name!r}: {wrong}; {advice}")
+        if abs(scale - 1) > POSE_TOLERANCE:  # the near plane and depths are measured in units of the world
+            pose[:3] /= scale
         return pose
 
     @property
@@ -144,7 +166,7 @@ class Camera:
     def moved(self, similarity: Tensor) -> Camera:
         """The same view after the whole scene, this camera included, was transformed by `similarity` [4, 4] (rotation, scale, translation)."""
         linear = similarity[:3, :3].to("cpu", torch.float64)
-        rotation = linear / torch.linalg.det(linear).pow(1 / 3)
+        rotation = linear / torch.linalg.det(linear).abs().pow(1 / 3)
         viewmat = torch.eye(4, dtype=torch.float64)
         viewmat[:3, :3] = self.viewmat[:3, :3] @ rotation.T
         viewmat[:3, 3] = -viewmat[:3, :3] @ (linear @ self.center + similarity[:3, 3].to("cpu", torch.float64))

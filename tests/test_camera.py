@@ -116,7 +116,28 @@ def test_numbers_of_other_libraries_become_those_of_python():
     (dict(viewmat="eye"), "expected a tensor or an array of shape"),
     (dict(viewmat=torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 5, 1]])), "the last row of viewmat must be 0 0 0 1"),
     (dict(viewmat=torch.diag(torch.tensor([1.0, 1, 0, 1]))), "viewmat cannot be inverted"),
+    (dict(viewmat=torch.diag(torch.tensor([1.0, -1, 1, 1])) @ VIEWMAT.float()), r"mirrors the scene \(determinant -1\).*flip y and z together"),
+    (dict(viewmat=torch.diag(torch.tensor([1.0, 1.5, 1, 1]))), "the axes of viewmat are not at right angles or not of one length"),
+    (dict(viewmat=torch.tensor([[1.0, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4], [0, 0, 0, 1]])), "not at right angles"),
+    (dict(viewmat=torch.tensor([[70.0, 0, 32, 0], [0, 72, 24, 0], [0, 0, 1, 4], [0, 0, 0, 1]])), "the intrinsics as fx, fy, cx and cy"),
 ])  # fmt: skip
 def test_what_is_no_camera_is_named(camera, change, sentence):
     with pytest.raises((SettingsError, ShapeError), match=sentence):
         replace(camera, **change)
+
+
+def test_a_scene_that_is_mirrored_with_its_cameras_is_refused(camera):
+    with pytest.raises(SettingsError, match="mirrors the scene"):
+        camera.moved(torch.diag(torch.tensor([1.0, 1, -1, 1])))
+
+
+def test_a_pose_of_few_digits_is_taken_as_it_is(camera):
+    few = (VIEWMAT * 1e3).round() / 1e3
+    assert torch.equal(replace(camera, viewmat=few).viewmat, few)
+    assert torch.equal(replace(camera, viewmat=VIEWMAT.half()).viewmat, VIEWMAT.half().double())
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.9, 250.0])
+def test_a_scale_of_the_whole_pose_is_divided_out(camera, scale):
+    scaled = VIEWMAT * torch.tensor([scale, scale, scale, 1.0], dtype=torch.float64)[:, None]
+    torch.testing.assert_close(replace(camera, viewmat=scaled).viewmat, VIEWMAT, rtol=0, atol=1e-8)

@@ -134,6 +134,14 @@ def test_broken_models_are_refused_in_one_sentence(tmp_path):
         load_scene(tmp_path / "torn")
 
 
+def test_a_quaternion_that_is_not_of_norm_1_is_refused(tmp_path):
+    write_text_model(tmp_path / "sparse/0", ["a.png"])
+    lines = (tmp_path / "sparse/0/images.txt").read_text().split(" ")
+    (tmp_path / "sparse/0/images.txt").write_text(" ".join([lines[0], str(2 * float(lines[1])), *lines[2:]]))
+    with pytest.raises(SceneError, match=r"a\.png: is not a rotation"):
+        load_scene(tmp_path)
+
+
 def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):
     write_text_model(tmp_path / "sparse/0", names(1))
     monkeypatch.setitem(sys.modules, "pycolmap", None)
