@@ -19,7 +19,7 @@ import torch
 
 from mipmap_plugin.backends import get_backend, register_backend
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.conformance import check_backend
+from mipmap_plugin.backends.conformance import check_backend, summary
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -48,5 +48,4 @@ if __name__ == "__main__":
     for outcome in outcomes:
         result = "skipped" if outcome.skipped else "passed" if outcome.passed else "FAILED"
         print(f"{outcome.case:45} {result:8} {outcome.max_error:8.1e}  {outcome.message}")
-    failed = sum(not outcome.passed for outcome in outcomes)
-    print(f"{len(outcomes)} cases, {failed} failed")
+    print(summary(outcomes))

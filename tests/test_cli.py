@@ -376,8 +376,12 @@ def test_backends_check_prints_a_table_and_fails_if_a_case_does(run, monkeypatch
     code, out, err = run("backends", "--check", "reference")
     assert code == 2 and "FAIL: the image differs" in out and "| fine " in out
     assert err == "mipmap-plugin: backend 'reference' fails 1 of 2 cases: odd\n"
+    assert out.rstrip().endswith("2 cases: 2 run, 0 skipped, 1 failed")
     outcomes.pop()
     assert run("backends", "--check", "reference")[0] == 0
+    outcomes += [Outcome(f"other {i}", 0.0, True, True, "it has no colors", skipped=True) for i in range(20)]
+    code, _, err = run("backends", "--check", "reference")
+    assert code == 2 and "passes 1 of 21 cases, too few to tell whether it is right; of the others it says: it has no colors\n" in err
     refused(run("backends", "--check", "gpu"), "there is no 'gpu'")
     refused(run("backends", "--full"), "give --check NAME")
 

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -14,7 +15,7 @@ import torch
 
 from mipmap_plugin.backends import get_backend, reference
 from mipmap_plugin.backends.base import Capabilities, Rendered
-from mipmap_plugin.backends.conformance import CASES, MORE, TOLERANCE, check_backend
+from mipmap_plugin.backends.conformance import CASES, MORE, TOLERANCE, check_backend, summary
 from mipmap_plugin.backends.conformance.cases import random_scene
 from mipmap_plugin.backends.conformance.checks import check_steps, check_views
 from mipmap_plugin.backends.conformance.suite import BackendSuite
@@ -164,6 +165,40 @@ def test_what_a_backend_lacks_is_skipped_with_its_reason():
     assert all(outcome.passed for outcome in outcomes.values())
 
 
+class OfDegree0(ReferenceBackend):
+    """Constant colors, classic, no gradients."""
+
+    capabilities = Capabilities(None, frozenset({torch.float32}), frozenset({"classic"}), gradients=False, max_sh_degree=0)
+
+    def render(self, gaussians, camera, effects):
+        assert effects.sh_degree == 0
+        with torch.no_grad():
+            return super().render(gaussians, camera, effects)
+
+
+class IgnoresTheNearPlane(OfDegree0):
+    def render(self, gaussians, camera, effects):
+        return super().render(gaussians, camera, replace(effects, near_plane=0.0))
+
+
+def test_a_backend_of_degree_0_is_run_and_its_faults_are_found():
+    outcomes = {outcome.case: outcome for outcome in check_backend(OfDegree0())}
+    assert all(outcome.passed for outcome in outcomes.values())
+    of_its_own = [name for name in CASES if name.endswith("-classic") and name != "covariances-classic"]
+    assert len(of_its_own) > 40 and not any(outcomes[name].skipped for name in of_its_own)
+    assert outcomes["sh-degree-1"].skipped and not outcomes["sh-degree-0"].skipped
+    type("Suite", (BackendSuite,), {"backend": OfDegree0()})().test_leaves_its_input_as_it_is()
+    near = {name: build for name, build in CASES.items() if "near-plane-classic" in name}
+    assert {each.case for each in check_backend(IgnoresTheNearPlane(), near) if not each.passed} == {
+        "on-the-near-plane-classic", "just-behind-the-near-plane-classic",
+    }  # fmt: skip
+
+
+def test_the_summary_counts_what_was_run():
+    assert summary(check_backend(WithoutGradients(), FEW)) == "5 cases: 4 run, 1 skipped, 0 failed"
+    assert summary(check_backend(Raises(), FEW)) == "5 cases: 5 run, 0 skipped, 1 failed"
+
+
 def test_a_dtype_without_tolerances_is_refused():
     with pytest.raises(SettingsError, match=r"no tolerances for torch\.float16"):
         check_backend(ReferenceBackend(), FEW, dtype=torch.float16)
@@ -202,4 +237,4 @@ def test_the_example_runs_where_pytest_is_missing():
     run = f"import runpy, sys; sys.modules['pytest'] = None; {few}; runpy.run_path('examples/register_backend.py', run_name='__main__')"
     environment = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", run], cwd=root, env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.rstrip().endswith("20 cases, 0 failed"), done.stdout + done.stderr
+    assert done.stdout.rstrip().endswith("20 cases: 4 run, 16 skipped, 0 failed"), done.stdout + done.stderr

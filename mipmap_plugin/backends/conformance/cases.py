@@ -28,6 +28,7 @@ class HardCase(NamedTuple):
     gaussians: Gaussians  # float64
     camera: Camera
     effects: Effects
+    about_degree: bool = False  # whether it is about the degree of SH, so that it tells nothing of a backend that evaluates a lower one
 
 
 Builder = Callable[[], HardCase]
@@ -73,7 +74,7 @@ def seen_by(camera: Camera, screen_filter: str = "classic") -> HardCase:
 
 def of_degree(degree: int, evaluated: int) -> HardCase:
     """Coefficients of SH `degree`, of which the bands up to `evaluated` are rendered."""
-    return HardCase(crowd(degree=degree), view(turned=True), Effects(evaluated))
+    return HardCase(crowd(degree=degree), view(turned=True), Effects(evaluated), about_degree=True)
 
 
 def random_scene(seed: int, screen_filter: str, eps2d: float, degree: int = 3) -> HardCase:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
@@ -45,7 +45,8 @@ def check_backend(
 ) -> list[Outcome]:
     """Render and differentiate every case, by default all of `CASES`, on `device`.
 
-    Whatever `backend` raises becomes a failed outcome. Raises SettingsError for a dtype without tolerances.
+    Colors are of the highest degree of SH that the backend evaluates, except in cases about that degree; a case that it cannot draw for another
+    reason is skipped (`summary` counts). Whatever `backend` raises becomes a failed outcome. Raises SettingsError for a dtype without tolerances.
     """
     tolerance_for(dtype)
     outcomes = []
@@ -62,18 +63,35 @@ def check_case(backend: Backend, name: str, build: Builder, *, dtype: torch.dtyp
     `check_backend` does."""
     case = build()
     case = case._replace(gaussians=case.gaussians.to(device, dtype))
+    case = case if case.about_degree else lowered(backend, case)
     needs = Needs.of(case.gaussians, case.effects, gradients=True)
     reasons = backend.lacking(replace(needs, gradients=False))
     if reasons:
         return Outcome(name, float("nan"), True, True, "; ".join(reasons), skipped=True)
     actual = draw(backend, case, differentiate=not backend.lacking(needs))
-    return compare(name, actual, expected_answer(build, dtype), dtype)
+    return compare(name, actual, expected_answer(build, dtype, case.effects.sh_degree), dtype)
+
+
+def lowered(backend: Backend, case: HardCase) -> HardCase:
+    """The case with its colors evaluated to the highest degree that the backend has; as it is if the backend lacks something else."""
+    for degree in range(case.effects.sh_degree, -1, -1):
+        lower = case._replace(effects=replace(case.effects, sh_degree=degree))
+        if not backend.lacking(Needs.of(lower.gaussians, lower.effects, gradients=False)):
+            return lower
+    return case
+
+
+def summary(outcomes: Sequence[Outcome]) -> str:
+    """How many cases were run, skipped and failed: "421 cases: 300 run, 121 skipped, 0 failed"."""
+    skipped, failed = sum(each.skipped for each in outcomes), sum(not each.passed for each in outcomes)
+    return f"{len(outcomes)} cases: {len(outcomes) - skipped} run, {skipped} skipped, {failed} failed"
 
 
 def check_views(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Outcome:
     """Check that `render_views`, which few backends have, draws a case and another view of it as `render` does, and sums their gradients."""
     case = build()
-    splats = case.gaussians.to(device, dtype)
+    case = lowered(backend, case._replace(gaussians=case.gaussians.to(device, dtype)))
+    splats = case.gaussians
     shots = [(case.camera, case.effects), (case.camera.zoomed(0.5), case.effects)]
     answers = []
     for renders in (backend.render_views, lambda splats, shots: [backend.render(splats, *shot) for shot in shots]):  # type: ignore[attr-defined]
@@ -92,7 +110,8 @@ def check_views(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.
 def check_steps(backend: Backend, build: Builder, *, dtype: torch.dtype = torch.float32, device: str = "cpu") -> Outcome:
     """Check that a `stepper`, which few backends have, draws a case as `render` does, and hands the right gradients to Adam."""
     case = build()
-    g = case.gaussians.to(device, dtype)
+    case = lowered(backend, case._replace(gaussians=case.gaussians.to(device, dtype)))
+    g = case.gaussians
     raw = {"means": g.means, "quats": 2 * g.quats, "scales": g.scales.log(), "opacities": g.opacities.logit(), "sh": g.sh}
     actual, expected = _step_answer(backend, raw, case), _raw_answer(backend, raw, case)
     return compare("steps", actual, expected, dtype)
@@ -141,12 +160,13 @@ def draw(backend: Backend, case: HardCase, *, differentiate: bool = True) -> Ans
 
 
 @cache
-def expected_answer(build: Builder, dtype: torch.dtype) -> Answer:
-    """The answer of the float64 reference to a case whose numbers were rounded to `dtype`.
+def expected_answer(build: Builder, dtype: torch.dtype, sh_degree: int) -> Answer:
+    """The answer of the float64 reference to a case whose numbers were rounded to `dtype`, with colors evaluated to `sh_degree`.
 
     A splat that is not finite must have no effect: it is left out, and its gradient is 0.
     """
     case = build()
+    case = case._replace(effects=replace(case.effects, sh_degree=sh_degree))
     rounded = case.gaussians.to(dtype=dtype).to(dtype=torch.float64)
     finite = finite_rows(rounded)
     answer = draw(ReferenceBackend(), case._replace(gaussians=rounded[finite]))
