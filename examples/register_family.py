@@ -38,7 +38,7 @@ def load(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
         return VanillaModel({name: torch.from_numpy(arrays[name]) for name in NAMES}, origin=Origin(source=Path(path)))
 
 
-FAMILY = Family("npz", "splats in a NumPy archive", recognize, api_version=1, load=load)
+FAMILY = Family("npz", "splats in a NumPy archive", recognize, api_version=1, load=load, saves=".ply")
 
 if __name__ == "__main__":
     register_model("npz", FAMILY)

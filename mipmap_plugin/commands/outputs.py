@@ -9,22 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.splat_transform import READ_ONLY, WRITTEN
+from mipmap_plugin.formats.splat_transform import WRITTEN
 
 if TYPE_CHECKING:
     from mipmap_plugin.camera import Camera
 
 
 def adapted_path(checkpoint: Path, output: Path | None, scale: float, viewer: str | None = None, *, several: bool) -> Path:
-    """The path of an adapted model: beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark, or `output`; a folder for all if `several`.
+    """The path of an adapted model: beside the checkpoint as NAME_x0.25 or NAME_x0.25_spark (`adapted_name`), or `output`; a folder for all if
+    `several`. Raises SettingsError for a folder with the name of a file."""
+    from mipmap_plugin.models.adapted_name import adapted_name
 
-    Exchange formats that can only be read are written as a PLY. Raises SettingsError for a folder with the name of a file.
-    """
-    checkpoint_name = checkpoint.resolve().name
-    known = (*WRITTEN, ".ply", *READ_ONLY) if checkpoint.is_file() or checkpoint.suffix == ".ply" else ()
-    suffix = next((ending for ending in known if checkpoint_name.lower().endswith(ending)), "")
-    written = ".ply" if suffix in READ_ONLY else suffix
-    name = f"{checkpoint_name[: len(checkpoint_name) - len(suffix)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
+    name = adapted_name(checkpoint, scale, viewer)
     if output is None:
         return checkpoint.resolve().parent / name
     if several and output.name.lower().endswith((".ply", *WRITTEN)):

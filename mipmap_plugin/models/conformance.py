@@ -15,6 +15,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.base import PARAMETERS, Filtered, Rebuilt, SplatModel, lacking
 from mipmap_plugin.scenes.trajectories import orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -106,6 +107,11 @@ class ModelSuite:
         view = base.cameras[0].zoomed(self.scale)
         images = [adapted.render(view).image, wrap_model(again, cameras=base.cameras, backend="reference").render(view).image]
         assert (images[0] - images[1]).abs().max() <= SAME
+
+    def test_is_read_again_under_the_name_that_the_command_line_gives(self, base: Wrapped, checkpoint: Path) -> None:
+        path = checkpoint.with_name(adapted_name(checkpoint, self.scale))
+        base.model.copy().save(path, provenance={})
+        assert len(load_model(path).parameters()["means"]) == len(base.model.parameters()["means"])
 
     def test_what_exists_is_not_replaced_unasked(self, base: Wrapped, tmp_path: Path) -> None:
         saved = base.model.copy().save(tmp_path / self.saved_as, provenance={})

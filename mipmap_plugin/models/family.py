@@ -129,6 +129,8 @@ class Family:
         place: In a result folder: the subfolder and the pattern of file names, which may have a group `step`.
         api_version: `API_VERSION` of the contract that it was written for.
         not_loaded: Addition to the message for a family that is not loaded.
+        saves: Suffix of the files that its models save, such as ".ply"; None: that of the file that was read. It ends the names that the
+            command line gives.
     """
 
     name: str
@@ -139,3 +141,4 @@ class Family:
     before: tuple[str, ...] = ()
     place: tuple[str, str] | None = None
     not_loaded: str = ""
+    saves: str | None = None
