@@ -177,7 +177,7 @@ class Wrapped:
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to continue from if it exists; Ctrl-C writes it
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe(step, seconds, render)` is
         called before the first step and after each (of the conversion before a zoom-in, too: `adaptation.conversion`); `render(camera)` is
-        the current image, and the run ends where it returns True.
+        the current image [H, W, 3], without gradients, and the run ends where it returns True.
         `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
         `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
         Raises SettingsError and BackendUnavailable.

@@ -502,6 +502,13 @@ def test_an_observer_ends_a_run_by_true_of_any_library(answer):
     assert wrapped().adapt(1 / 4, **BRIEF, observe=lambda step, *_: step == 2 and answer).report.ended_by == "its observer"
 
 
+def test_an_observer_sees_images_without_gradients():
+    seen, view = [], tiny.cameras(1)[0].zoomed(1 / 4)
+    wrapped().adapt(1 / 4, **BRIEF, observe=lambda step, seconds, render: seen.append(render(view)))
+    assert len(seen) == 8 and not any(image.requires_grad for image in seen)
+    assert seen[0].numpy().shape == (*view.size, 3) and not torch.equal(seen[0], seen[-1])
+
+
 @pytest.mark.parametrize("answer", [None, 1, "yes", torch.ones(2, 2), [True]])
 def test_no_other_answer_of_an_observer_ends_a_run(answer):
     assert wrapped().adapt(1 / 4, **BRIEF, observe=lambda *_: answer).report.ended_by == "7 steps"

@@ -242,6 +242,7 @@ def unresolved(code: str) -> list[str]:
         if isinstance(node, ast.ImportFrom):
             known |= {alias.asname or alias.name for alias in node.names}
             absent += [alias.name for alias in node.names if not hasattr(importlib.import_module(node.module), alias.name)]
+        known |= {node.name} if isinstance(node, ast.FunctionDef) else {node.arg} if isinstance(node, ast.arg) else set()
         if isinstance(node, ast.Import):
             known |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
     return absent + [node.id for node in names if isinstance(node.ctx, ast.Load) and node.id not in known]

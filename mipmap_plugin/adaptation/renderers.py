@@ -13,6 +13,7 @@ from mipmap_plugin.backends.base import Backend, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.packing import in_two_steps, packed
 
 # For a rounding that does not depend on it.
@@ -34,6 +35,10 @@ class Renderer:
 
     def __call__(self, gaussians: Gaussians, camera: Camera) -> Tensor:
         return self.backend.render(gaussians, camera, self.effects).image
+
+    def of_model(self, model: SplatModel) -> Callable[[Camera], Tensor]:
+        """What renders a model without gradients."""
+        return torch.no_grad()(lambda camera: self(model.gaussians(camera), camera))
 
     def of(self, gaussians: Gaussians) -> Callable[[Camera], Tensor]:
         """What renders these splats alone, several times: a viewer's rounding of them takes longer than an image, and most is the same for all.

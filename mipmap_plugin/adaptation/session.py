@@ -43,8 +43,8 @@ from mipmap_plugin.models.base import SplatModel, digest_of_parameters, effects_
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.progress import announced
 
-# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model) -> True (Python's, NumPy's or torch's)
-# to end the run with this step, and anything else to go on. Its time is not counted.
+# (step, seconds of adapting so far, function that renders a camera of the new scale with the current model, without gradients)
+# -> True (Python's, NumPy's or torch's) to end the run with this step, and anything else to go on. Its time is not counted.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], object]
 
 
@@ -192,7 +192,7 @@ class Session:
 
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
-            answer = observe and observe(run.step, run.watch.seconds, lambda camera: first(run.student.gaussians(camera), camera))
+            answer = observe and observe(run.step, run.watch.seconds, first.of_model(run.student))
             return is_true(answer)
 
         if not run.ended_by:
