@@ -50,9 +50,9 @@ def naming_any(plugins: Mapping[str, Any]) -> Iterator[None]:
 
 
 def _is_of(frame: FrameType, thing: Any) -> bool:
-    """Whether a frame is of an object's method, or of its module; a script may have other things in it, such as an observer."""
+    """Whether a frame is of a method of an object or of its copies, or of its module; a script may have other things in it, such as an observer."""
     module = frame.f_globals.get("__name__")
-    return frame.f_locals.get("self") is thing or (module == _module(thing) and module != "__main__")
+    return type(frame.f_locals.get("self")) is type(thing) or (module == _module(thing) and module != "__main__")
 
 
 @contextmanager

@@ -155,6 +155,53 @@ def test_what_a_family_does_wrong_is_told_by_its_name(gaussians, said):
         family(gaussians=gaussians).adapt(0.5, **BRIEF)
 
 
+def opaque(self, camera=None):
+    splats = VanillaModel.gaussians(self, camera)
+    return replace(splats, opacities=3 * splats.opacities)
+
+
+def detached(self, camera=None):
+    return VanillaModel.gaussians(self, camera).detach()
+
+
+def frozen(self):
+    return type(self)({name: tensor.detach().clone() for name, tensor in self.parameters().items()})
+
+
+@pytest.mark.parametrize(
+    ("methods", "said"),
+    [
+        (dict(copy=lambda self: self), r"family 'theirs': copy\(\) shares means, .*; clone the tensors"),
+        (dict(copy=lambda self: type(self)(self.parameters())), r"family 'theirs': copy\(\) shares means, .*; clone the tensors"),
+        (dict(copy=frozen), r"family 'theirs': copy\(\) has to return parameters that are leaves and require gradients; means, .* cannot"),
+        (dict(gaussians=detached), r"family 'theirs': gaussians\(\) returned splats without gradients"),
+        (dict(gaussians=opaque), r"family 'theirs': gaussians\(\) returned opacities from 1\.03 to 2\.84, which have to lie in 0\.\.1"),
+        (dict(row_opacities=lambda self, views=(): torch.ones(3)), r"row_opacities\(\) has to return 60 numbers, .*; it returned a tensor \[3\]"),
+        (dict(row_opacities=lambda self, views=(): None), r"row_opacities\(\) has to return 60 numbers, .*; it returned a NoneType"),
+        (dict(__module__="__main__", rebuild=lambda self, form: {}["zz"]), "family 'theirs' failed: KeyError: 'zz'"),  # of a script; a copy's method
+    ],
+)
+def test_a_family_that_breaks_its_contract_is_told_before_the_base_changes(methods, said):
+    theirs = type("Theirs", (VanillaModel,), {"family": "theirs", **methods})
+    model = theirs({name: tensor.clone().requires_grad_() for name, tensor in tiny.model().parameters().items()})
+    before = {name: tensor.detach().clone() for name, tensor in model.parameters().items()}
+    with pytest.raises(PluginError, match=said):
+        wrap_model(model, cameras=tiny.cameras(2), backend="reference").adapt(0.5, steps=3, extra_views=2, validation_views=2)
+    assert all(torch.equal(before[name], tensor) for name, tensor in model.parameters().items())
+
+
+def test_splats_without_gradients_may_be_adapted_without_steps():
+    assert family(gaussians=detached).adapt(0.5, recipe="instant", merge_to=1.0).report.gaussians_after == 60
+
+
+def test_a_family_that_does_not_say_what_it_wrote_is_told(tmp_path):
+    def save(self, path, *, provenance, overwrite=False):
+        VanillaModel.save(self, path, provenance=provenance, overwrite=overwrite)
+
+    with pytest.raises(PluginError, match=r"family 'theirs': save\(\) has to return the path .* returned a NoneType, so that .*new\.ply is left"):
+        family(save=save).adapt(0.5, recipe="instant").save(tmp_path / "new.ply")
+
+
 def test_a_family_that_ignores_what_is_there_replaces_nothing(tmp_path):
     def save(self, path, *, provenance, overwrite=False):
         return VanillaModel.save(self, path, provenance=provenance, overwrite=True)

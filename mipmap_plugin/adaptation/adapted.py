@@ -20,6 +20,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, together, write_json
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image
+from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.outputs import parts_of, without_place
@@ -83,7 +84,7 @@ class Adapted:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
         refuse_output(Path(path), overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
         with together(Path(path)), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
-            saved = self.model.save(path, provenance=self.report.provenance(), overwrite=overwrite)
+            saved = contract.save(self.model, Path(path), self.report.provenance(), overwrite=overwrite)
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
             state.remove()

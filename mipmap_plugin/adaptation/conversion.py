@@ -16,6 +16,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.optimization.loop import STOPPED
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import count_of_views
+from mipmap_plugin.adaptation.renderers import NO_CAMERA
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
@@ -23,6 +24,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.models.contract import refuse_broken
 from mipmap_plugin.models.places import conversion_state
 from mipmap_plugin.recipes import recipe as make_config
 
@@ -59,6 +61,7 @@ class Stages:
 
     def adapt(self, scale: float, config: AdaptConfig, first: AdaptConfig | None) -> Adapted:
         """Adapt to `scale`; `first`: the settings of a conversion before. Raises as `Session.run` does."""
+        refuse_broken(self.request.images.model, next(iter(self.cameras), NO_CAMERA), steps=config.steps > 0)
         if first is None:
             return Session(self.request, scale, config, self.cameras, self.photographs).run(self.resume, self.observe)
         session = Session(self.request, 1.0, first, self.cameras, None)

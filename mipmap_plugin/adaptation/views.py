@@ -19,6 +19,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, jittered, orbit
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
@@ -174,7 +175,7 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
 def _draws(view: Camera, model: SplatModel, near: float) -> bool:
     """Whether a row of the parameters that is opaque enough to be drawn lies in the view, farther than the near plane."""
     inside = view.in_picture(view.to_camera(model.parameters()["means"].detach()), near)
-    return bool(inside.any()) and bool((model.row_opacities([view])[inside] >= MIN_ALPHA).any())
+    return bool(inside.any()) and bool((row_opacities(model, [view])[inside] >= MIN_ALPHA).any())
 
 
 def too_unlike(views: Sequence[Camera]) -> str:

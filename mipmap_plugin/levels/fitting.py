@@ -13,6 +13,7 @@ from mipmap_plugin.adaptation.report import provenance, versions
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
+from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, digest_of_parameters
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 from mipmap_plugin.wrap import Wrapped
@@ -72,7 +73,7 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
     count = len(model.parameters()["means"])
     ending = next((each for each in ENDINGS if name.lower().endswith(each)), "")
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
-        own = model.save(Path(folder, f"all{ending}"), provenance=record)
+        own = contract.save(model, Path(folder, f"all{ending}"), record)
         besides, all_of_them = read_header(own).body if own.suffix == ".ply" else 0, own.stat().st_size
     if own.suffix == ".ply":
         fitting = (size - besides - UNKNOWN) * count // (all_of_them - besides)

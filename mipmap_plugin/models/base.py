@@ -22,6 +22,9 @@ from mipmap_plugin.plugin_errors import is_third_party
 # Name, among a model's parameters, of values that are never optimized but removed with their rows, such as an anchor's level.
 CARRIED = "carried"
 
+# By which the activation of a third-party family may leave 0..1.
+OPACITY_ROUNDING = 1e-4
+
 
 @dataclass(frozen=True)
 class TrainedScale:
@@ -207,6 +210,10 @@ def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
     tensors = {name: tensor for name, tensor in vars(gaussians).items() if isinstance(tensor, Tensor)}
     if wrong := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
         raise PluginError(f"family {model.family!r}: gaussians() returned NaN or infinity in {', '.join(wrong)}; leave such splats out while loading")
+    least, most = gaussians.opacities.detach().aminmax() if len(gaussians) else (0.0, 0.0)
+    if least < -OPACITY_ROUNDING or most > 1 + OPACITY_ROUNDING:
+        outside = f"opacities from {float(least):.3g} to {float(most):.3g}"
+        raise PluginError(f"family {model.family!r}: gaussians() returned {outside}, which have to lie in 0..1; activate or clamp them")
     return gaussians
 
 

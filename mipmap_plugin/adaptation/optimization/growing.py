@@ -19,6 +19,7 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.views import extent
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.limits import derived_seed
+from mipmap_plugin.models.contract import row_opacities
 
 
 @torch.no_grad()
@@ -28,7 +29,7 @@ def control_density(run: Run, task: Task, config: AdaptConfig) -> None:
     before = run.student.parameters()["means"]
     if run.gradients is not None:
         _grow(run, task, config, run.gradients.mean())
-    density.prune(run.student, run.optimizer, run.student.row_opacities(task.views) >= config.min_opacity)
+    density.prune(run.student, run.optimizer, row_opacities(run.student, task.views) >= config.min_opacity)
     means = run.student.parameters()["means"]
     run.gradients = None if run.gradients is None else density.ScreenGradients.of(means, config)
     run.rows_changed |= means is not before
