@@ -16,6 +16,7 @@ from mipmap_plugin import threads
 from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.adapted import render_model
+from mipmap_plugin.adaptation.choosing import choose
 from mipmap_plugin.adaptation.conversion import Stages, conversion
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
@@ -197,10 +198,8 @@ class Wrapped:
         photographs = None if images is None else Photographs(self.place(images), self.cameras, self.background)
         if cameras is None:
             cameras = photographs.cameras if photographs else self.cameras
-        needs = [replace(self._needs, gradients=True, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
-        needs_gradients = config.steps > 0 or config.merge_to < 1 or config.most_splats is not None
-        backend, note = choose_backend(self._backend, *(replace(need, gradients=needs_gradients) for need in needs), self._needs)
-        has_gradients = not any(backend.lacking(need) for need in needs)
+        needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
+        backend, note, has_gradients = choose(self._backend, config, needs, self._needs)
         if config.steps:
             largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
             check_image(largest.width, largest.height, self.model.parameters()["means"].device)

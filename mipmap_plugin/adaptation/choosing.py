@@ -1,0 +1,35 @@
+"""The choice of the backend that a model is adapted with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from mipmap_plugin.backends import choose_backend
+from mipmap_plugin.backends.base import Backend, Needs
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.errors import BackendUnavailable
+
+
+def choose(name: str, config: AdaptConfig, targets: Sequence[Needs], base: Needs) -> tuple[Backend, str, bool]:
+    """The backend for these settings, why it was chosen, and whether it has gradients.
+
+    `targets`: what the adapted model needs in each viewer; `base`: what the base needs. Raises BackendUnavailable, with what goes without
+    gradients where these alone are lacking.
+    """
+    merges = config.merge_to < 1 or config.most_splats is not None
+    try:
+        backend, note = _choice(name, targets, base, gradients=config.steps > 0 or merges)
+    except BackendUnavailable as error:
+        try:
+            _choice(name, targets, base, gradients=False)
+        except BackendUnavailable:
+            raise error from None
+        way = 'recipe="instant" alone needs none'
+        way += "" if config.steps else ", and neither does merge_to=1.0 without most_splats (--splats, --bytes)"
+        raise BackendUnavailable(f"{error}; {'steps' if config.steps else 'merging'} cannot do without gradients: {way}") from None
+    return backend, note, not any(backend.lacking(replace(need, gradients=True)) for need in targets)
+
+
+def _choice(name: str, targets: Sequence[Needs], base: Needs, *, gradients: bool) -> tuple[Backend, str]:
+    return choose_backend(name, *(replace(need, gradients=gradients) for need in targets), base)
