@@ -1,6 +1,9 @@
 """Live objects of other projects: copied by their attributes, never changed, adapted like a file."""
 
+from dataclasses import replace
+
 import anchor_checkpoints as checkpoints
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -120,7 +123,8 @@ class Anchors:
     ("thing", "sentence"),
     [
         (Empty(), "this Empty has no splats yet; load or train it first"),
-        (dict.fromkeys(splats()), "holds no tensor for means"),
+        (dict.fromkeys(splats()), "holds no tensor for means, .*; load or train it first, or give tensors or arrays"),
+        ({**splats(), "means": np.array(["a"])}, "holds no tensor for means"),
         (Mip(), "has a 3D filter .* give the path"),
         (Anchors(), "has anchors with networks .* give the path"),
         ({**splats(), "features": torch.zeros(30, 32)}, "a dict with means, .*is not a known kind of model"),
@@ -130,6 +134,49 @@ class Anchors:
 def test_other_objects_are_refused_in_one_sentence(thing, sentence):
     with pytest.raises(SettingsError, match=sentence):
         wrap_model(thing)
+
+
+def trainer(raw):
+    """As gsplat's simple_trainer keeps its splats."""
+    held = torch.nn.Module()
+    held.splats = torch.nn.ParameterDict({name: tensor.clone() for name, tensor in raw.items()})
+    return held
+
+
+@pytest.mark.parametrize(
+    "thing",
+    [
+        lambda raw: {name: tensor.numpy() for name, tensor in raw.items()},
+        lambda raw: {name: tensor.double().numpy() for name, tensor in raw.items()},
+        lambda raw: {"splats": raw},
+        lambda raw: {"step": 7, "splats": torch.nn.ParameterDict(raw)},
+        trainer,
+    ],
+)
+def test_splats_in_other_hands_are_those_of_gsplat(thing):
+    raw = splats()
+    held = thing(raw)
+    adopted = adopt(held)
+    assert all(torch.equal(adopted.parameters()[name], tensor) for name, tensor in raw.items())
+    with torch.no_grad():
+        for tensor in adopted.parameters().values():
+            tensor.zero_()
+    assert adopt(held).parameters()["means"].abs().sum() > 0
+
+
+def test_gaussians_are_taken_as_splats_of_3dgs():
+    given = adopt(splats()).gaussians().detach()
+    adopted = adopt(given)
+    taken = adopted.gaussians()
+    for name in ("means", "scales", "opacities", "sh"):
+        torch.testing.assert_close(getattr(taken, name), getattr(given, name))
+    with torch.no_grad():
+        adopted.parameters()["means"].zero_()
+    assert given.means.abs().sum() > 0
+    with pytest.raises(SettingsError, match="Gaussians with covariances cannot be stored"):
+        adopt(replace(given, covariances=torch.eye(3).expand(len(given), 3, 3)))
+    with pytest.raises(SettingsError, match="this Gaussians has no splats yet"):
+        adopt(given[:0])
 
 
 def test_scales_of_no_shape_are_refused():

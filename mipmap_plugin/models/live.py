@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mipmap_plugin.errors import SettingsError, ShapeError
+from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import splatfacto
 from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.networks import Weights
@@ -65,8 +68,9 @@ def adopt(model: Any) -> SplatModel:
     """A model of this package itself, or a copy of another project's live model.
 
     Accepted are a `GaussianModel` of INRIA's 3DGS or of a project that only trains it differently, Scaffold-GS's
-    `GaussianModel`, gsplat's `splats` (a dict or a ParameterDict), and splatfacto's model or its `gauss_params`. The copy is on
-    the original's device. Splats that are not finite are dropped, as when a file is loaded.
+    `GaussianModel`, gsplat's `splats` (a dict or a ParameterDict) or what holds them under that name, as its trainer and its checkpoints do,
+    splatfacto's model or its `gauss_params`, and `Gaussians`. Tensors may be NumPy arrays. The copy is on the original's device. Splats that
+    are not finite are dropped, as when a file is loaded.
     Raises SettingsError for another object, ShapeError for tensors that do not fit together, CheckpointError
     for networks that do not fit their anchors.
     """
@@ -74,6 +78,9 @@ def adopt(model: Any) -> SplatModel:
         if members := lacking(model):
             raise SettingsError(f"this {_name(model)} has gaussians() as a model has, but lacks {', '.join(members)}; see mipmap_plugin.models.base")
         return _checked(model)
+    if isinstance(model, Gaussians):
+        splats = replace(model, **_copied(model, {name: tensor for name, tensor in vars(model).items() if tensor is not None}))
+        return without_invalid(VanillaModel.from_gaussians(splats).noted("made of Gaussians"))
     parts = [what for name, what in MORE.items() if hasattr(model, name)]
     if parts == [MORE["_anchor"]] and _is_scaffold(model):
         return scaffold_in_memory(_anchors(model), _networks(model), _name(model))
@@ -88,7 +95,8 @@ def adopt(model: Any) -> SplatModel:
         adopted = _adopted(model, raw, TrainedScale(), Origin())
         adopted.notes += [] if hasattr(model, "capture") else [MAY_MOVE.format(name=_name(model))]
         return adopted
-    tensors = _mapping(getattr(model, "gauss_params", model))
+    tensors = _mapping(getattr(model, "gauss_params", getattr(model, "splats", model)))
+    tensors = _mapping(tensors["splats"]) if isinstance(tensors.get("splats"), Mapping | torch.nn.ParameterDict) else tensors
     if set(splatfacto.NAMES) <= set(tensors):
         raw = splatfacto.to_parameters(_copied(model, {name: tensors[name] for name in splatfacto.NAMES}))
         return _adopted(model, raw, TrainedScale(near_plane=splatfacto.NEAR_PLANE), Origin())
@@ -134,12 +142,17 @@ def _mapping(model: Any) -> dict[str, Any]:
 
 
 def _copied(model: Any, tensors: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Contiguous float32 copies. Raises SettingsError for values that are not tensors, and for empty ones."""
+    """Contiguous float32 copies. Raises SettingsError for values that are neither tensors nor arrays of numbers, and for empty ones."""
+    tensors = {name: torch.from_numpy(np.array(value, np.float32)) if _is_array(value) else value for name, value in tensors.items()}
     if missing := [name for name, tensor in tensors.items() if not torch.is_tensor(tensor)]:
-        raise SettingsError(f"this {_name(model)} holds no tensor for {', '.join(missing)}; load or train it first")
+        raise SettingsError(f"this {_name(model)} holds no tensor for {', '.join(missing)}; load or train it first, or give tensors or arrays")
     if any(len(tensor) == 0 for tensor in tensors.values()):
         raise SettingsError(f"this {_name(model)} has no splats yet; load or train it first")
     return {name: tensor.detach().to(torch.float32, copy=True, memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.ndim > 0 and value.dtype.kind in "fiu"
 
 
 def _adopted(model: Any, raw: dict[str, Tensor], trained: TrainedScale, origin: Origin, kind: type[VanillaModel] = VanillaModel) -> VanillaModel:
