@@ -181,6 +181,7 @@ class Wrapped:
         the current image [H, W, 3], without gradients, and the run ends where it returns True.
         `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
         `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
+        While it runs, torch's default dtype is float32, and torch may have one thread, in the whole process: torch has one of each.
         Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else checked(cameras, some=True)

@@ -9,6 +9,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.torch_modes import usual_modes
 from mipmap_plugin.wrap import wrap_model
 
 
@@ -48,3 +49,14 @@ def test_an_adaptation_is_the_same_in_any_mode(mode: str) -> None:
         other = adapted()
     assert all(torch.equal(tensor.detach(), other[name].detach()) for name, tensor in plain.items())
     assert torch.get_default_dtype() == torch.float32 and not torch.is_autocast_enabled("cpu")
+
+
+def test_a_thread_that_ends_leaves_the_default_dtype_to_those_that_go_on() -> None:
+    first, second = usual_modes(), usual_modes()
+    with default_dtype():
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert torch.get_default_dtype() == torch.float32
+        second.__exit__(None, None, None)
+        assert torch.get_default_dtype() == torch.float64
