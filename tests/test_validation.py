@@ -347,7 +347,7 @@ def test_a_budget_of_nothing_returns_the_start(closed_form):
 @pytest.mark.parametrize(
     ("settings", "checks"),
     [
-        (dict(steps=360), [*range(3, 37, 3), *range(50, 351, 50), 360]),
+        (dict(steps=360), [*range(4, 37, 4), *range(50, 351, 50), 360]),
         (dict(steps=40, warm_up=0.1), [1, 2, 3, 4, *range(6, 37, 6), 40]),
         (dict(steps=12, warm_up=0), [5, 10, 12]),
         (dict(steps=6, warm_up=0, check_every=2), [2, 4, 6]),
