@@ -134,12 +134,16 @@ def test_broken_models_are_refused_in_one_sentence(tmp_path):
         load_scene(tmp_path / "torn")
 
 
-def test_a_quaternion_that_is_not_of_norm_1_is_refused(tmp_path):
-    write_text_model(tmp_path / "sparse/0", ["a.png"])
-    lines = (tmp_path / "sparse/0/images.txt").read_text().split(" ")
-    (tmp_path / "sparse/0/images.txt").write_text(" ".join([lines[0], str(2 * float(lines[1])), *lines[2:]]))
-    with pytest.raises(SceneError, match=r"a\.png: is not a rotation"):
-        load_scene(tmp_path)
+def test_quaternions_may_have_any_norm(tmp_path):
+    def poses(factor):
+        file = tmp_path / str(factor) / "sparse/0/images.txt"
+        write_text_model(file.parent, ["a.png"])
+        number, *quaternion_and_more = file.read_text().split(" ")
+        quaternion = [str(factor * float(each)) for each in quaternion_and_more[:4]]
+        file.write_text(" ".join([number, *quaternion, *quaternion_and_more[4:]]))
+        return load_scene(tmp_path / str(factor)).cameras[0].viewmat
+
+    torch.testing.assert_close(poses(2.5), poses(1), rtol=0, atol=1e-12)
 
 
 def test_without_pycolmap_the_extra_is_named(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
-from mipmap_plugin.formats.json_file import pixels, rotation
+from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, photographs_folder, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
@@ -107,8 +107,9 @@ def _camera(model: pycolmap.Reconstruction, image: pycolmap.Image, split: Litera
     """The camera at COLMAP's size. `centered`: the principal point is moved to the center."""
     lens = model.cameras[image.camera_id]
     viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3] = torch.as_tensor(image.cam_from_world().matrix())
-    rotation(viewmat[:3, :3].tolist(), image.name)  # pycolmap does not normalize quaternions
+    pose = image.cam_from_world()
+    pose.rotation.normalize()  # as COLMAP does when it reads a text file, and pycolmap does not
+    viewmat[:3] = torch.as_tensor(pose.matrix())
     cx, cy = (lens.width / 2, lens.height / 2) if centered else (lens.principal_point_x, lens.principal_point_y)
     name = Path(image.name).with_suffix("").as_posix()
     width, height = (pixels(side, f"{image.name}, {what}") for what, side in (("width", lens.width), ("height", lens.height)))
