@@ -125,7 +125,8 @@ def test_the_base_as_it_is_is_what_the_viewer_shows_of_its_file(tmp_path, viewer
 def test_only_fused_splats_may_be_merged(tmp_path):
     twins = {name: np.repeat(column, 2) for name, column in splats().items()}
     base = wrap_model(folder(tmp_path / "model", columns=twins), cameras=tiny.cameras(), backend="reference")
-    assert len(base.adapt(1 / 4, viewer="playcanvas", steps=0, merge_to=0.5).model) == len(base.model) / 2
+    left = len(base.adapt(1 / 4, viewer="playcanvas", steps=0, merge_to=0.5).model)
+    assert 0.5 <= left / len(base.model) < 0.6  # some are hardly shown, and are not merged
     with pytest.raises(SettingsError, match="none are merged"):
         base.adapt(1 / 4, steps=0, merge_to=0.5)
 
