@@ -8,6 +8,7 @@ import torch
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.start import candidates as start
+from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
@@ -130,6 +131,20 @@ def test_splats_that_no_view_shows_are_not_merged_and_the_report_tells_of_them()
     assert COUNT < len(result.model) < 2 * COUNT
     assert torch.equal(result.model.parameters()["means"][-COUNT:], base.parameters()["means"][-COUNT:])
     assert len(result.report.notes) == 1
+
+
+@pytest.mark.parametrize(("viewer", "most"), [(None, 0.015), ("antialiased", 0.035)])
+def test_a_zoom_in_starts_with_the_blend_weights_of_the_base(viewer, most):
+    """Of splats that hide each other opacities are raised by less than the area that a smaller filter takes from each: that is off twice as far."""
+    views = tiny.cameras(8, width=64, height=48)
+    base = wrap_model(tiny.model(5 * COUNT, spread=0.2), cameras=views)
+    adapted = base.adapt(2, viewer=viewer, steps=0, views="given", returns="last", conversion_steps=0)
+
+    def weights(model, shown, scale):
+        return blend_weights(model.gaussians(views[0]).detach(), [view.zoomed(scale) for view in views], adapted.backend, shown) / scale**2
+
+    wanted, found = weights(base.model, base.effects(), 1), weights(adapted.model, adapted.effects, 2)
+    assert (found - wanted).abs().sum() < most * wanted.sum()
 
 
 def test_few_hidden_splats_are_not_worth_a_word(recwarn):

@@ -81,6 +81,7 @@ class Session:
         self.finer, self.inputs = request.finer, dict(request.inputs)
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.base.parameters()["means"].device)
         self.base_views, validation, self.views_note = self._choose_views(cameras)
+        self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
         self.views = over_band(self.base_views, config)
         self.views_note += f", {real.note(self.base_views)}" if real else ""
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
@@ -128,13 +129,11 @@ class Session:
             warnings.warn(remark, stacklevel=2)
         began = time.perf_counter()
         with self.phase("compilation"):
-            effects = (self.base_effects, *self.targets.values())
+            splats, effects = self.base.gaussians(self.views[0]), (self.base_effects, *self.targets.values())
             merging = self.config.merge_to < 1 and self._has_blend_weights
-            plain = self.base.traits.plain
-            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self._takes_steps, merging=merging, by_rows=plain)
-        as_it_is = self._for_target(self._base_in_viewer, shared=True)
+            warm_up(self.backend, splats, effects, gradients=self._takes_steps, merging=merging, by_rows=self.base.traits.plain)
         initial, start = StartSearch(self._start_problem()).best()
-        states = {AS_IT_IS: as_it_is, f"the start, {start}": initial}
+        states = {AS_IT_IS: self._for_target(self._base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked_steps, self.config.model_copy(update={"steps": 0}))
         pool.release_to_system()
@@ -146,11 +145,12 @@ class Session:
 
     def _start_problem(self) -> StartProblem:
         from_base = StartProblem(
-            lambda: self._for_target(self.base, shared=True), self.base_views, self.scale, self.base_effects, self.start_target, self.config,
-            self.backend, self._has_blend_weights, self.quality, self.phase,
+            lambda: self._for_target(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.base_effects,
+            self.start_target, self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
         )  # fmt: skip
-        finer = self.finer
-        return from_base if finer is None else from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
+        if (finer := self.finer) is None:
+            return from_base
+        return from_base.from_level(finer, lambda: self._for_target(finer.model, shared=True))
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""

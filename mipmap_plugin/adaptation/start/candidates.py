@@ -28,7 +28,7 @@ from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_see
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import INTEGRATED, SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import Rebuilt, SplatModel
 
@@ -65,6 +65,7 @@ class StartProblem:
 
     base: Callable[[], SplatModel]  # makes a copy of the base that is rendered with the target's screen filter; it may share the base's tensors
     views: Sequence[Camera]  # at the base scale
+    closest_of: Sequence[Camera]  # of the base scale: those among which the closest view of a splat is looked for
     scale: float
     base_effects: Effects  # how the base is rendered
     target: Effects  # how the adapted file is rendered
@@ -84,10 +85,10 @@ class StartProblem:
         """
         counts = [len(splats.parameters()["means"]) for splats in (self.base(), finer.model)]
         config = self.config.model_copy(update={"merge_to": min(1.0, self.config.merge_to * counts[0] / counts[1])})
-        views = [view.zoomed(finer.scale) for view in self.views]
+        views, closest_of = ([view.zoomed(finer.scale) for view in each] for each in (self.views, self.closest_of))
         return replace(
-            self, base=model, views=views, scale=self.scale / finer.scale, base_effects=self.target, config=config, name=finer.name,
-            may_lose=config.merging_costs, coarse_base=self.base,
+            self, base=model, views=views, closest_of=closest_of, scale=self.scale / finer.scale, base_effects=self.target, config=config,
+            name=finer.name, may_lose=config.merging_costs, coarse_base=self.base,
         )  # fmt: skip
 
 
@@ -120,7 +121,8 @@ class StartSearch:
         self._notes: list[str] = []  # on what the views show of the base
         self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
         unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
-        self._matches_weights = problem.has_blend_weights and problem.scale <= 1 and not unchanged
+        spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
+        self._matches_weights = problem.has_blend_weights and not unchanged and (problem.scale <= 1 or not spreads)
 
     @torch.no_grad()
     def best(self) -> tuple[SplatModel, str]:
@@ -225,10 +227,13 @@ class StartSearch:
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities
-        views = [view.zoomed(problem.scale) for view in evenly(problem.views, self._count)]
+        size = min(1.0, problem.scale)  # a zoom-in is weighed in images of the base's size: sums over pixels need no finer ones
+        finer = problem.scale / size
+        target = replace(problem.target, eps2d=problem.target.eps2d / finer**2, settings=problem.target.settings.finer(1 / finer))
+        views = [view.zoomed(size) for view in evenly(problem.views, self._count)]
 
         def weights_of(opacities: Tensor) -> Tensor:
-            return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, problem.target)
+            return blend_weights(replace(gaussians, scales=scales, opacities=opacities), views, problem.backend, target) * finer**2
 
         return scales, matched_opacities(opacities, weights, self._whole_weights(gaussians, pixel), weights_of, rounds)
 
@@ -240,7 +245,7 @@ class StartSearch:
         """`pixel_size`; that of the base, which is asked for first, serves all candidates."""
         if self._of_base is not None and torch.equal(self._of_base[0], means):
             return self._of_base[1]
-        pixels = pixel_size(means, self._problem.views, self._count)
+        pixels = pixel_size(means, self._problem.closest_of, self._count)
         self._of_base = self._of_base or (means, pixels)
         return pixels
 
