@@ -36,6 +36,12 @@ LOOKED_AT, TOO_MANY = 16, 0.05
 # it, unless the near plane keeps it away from a scene in small units; then pictures are of another zoom than a user looks from.
 LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
+# What is said where there are no cameras: with those of an object all is well, but a capture was never seen from there, and loses 10 dB and more.
+NO_CAMERAS = (
+    "no cameras are known: views of a generated orbit are adapted to, and all dB are of such; that suits an object, and no capture; "
+    "give the scene's cameras (--cameras)"
+)
+
 # Ratio of focal lengths, px, of which views want files as different as scales at such a ratio: two lenses at 5 times cost a capture 10 of 12 dB.
 UNLIKE = 3.0
 

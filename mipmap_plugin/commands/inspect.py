@@ -70,7 +70,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
         lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
     return {
-        "verdict": _verdict(checkpoint, [*health.sentences(), *lost], bool(lost) or health.spoilt(), model.notes),
+        "verdict": _verdict(wrapped, checkpoint, [*health.sentences(), *lost], bool(lost) or health.spoilt()),
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
@@ -86,13 +86,19 @@ def _differences(wrapped: Wrapped) -> str:
     return viewer_differences(wrapped)
 
 
-def _verdict(checkpoint: Path, health: Sequence[str], spoilt: bool, notes: Sequence[str]) -> str:
-    """Whether the checkpoint is sound, and what to do with it. `health`: remarks; `spoilt`: one says that it is not; `notes`: on loading it."""
+def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: bool) -> str:
+    """Whether the checkpoint is sound, and what to do with it. `health`: remarks; `spoilt`: one says that it is not."""
+    from mipmap_plugin.models.adapted_scale import adapted_scale
     from mipmap_plugin.models.health import DROPPED
+
+    notes, seen, scale = wrapped.model.notes, bool(wrapped.cameras), adapted_scale(wrapped.model.source)
 
     if lost := next((note for note in notes if DROPPED in note), None):
         return f"doubtful: {lost}; train or export it again, or adapt what is left"
-    advice = f"mipmap-plugin adapt {shlex.quote(str(checkpoint))} --scale 1/4"
+    place = shlex.quote(str(checkpoint))
+    advice = f"mipmap-plugin adapt {place} --scale 1/4" + ("" if seen else " --cameras SCENE")
+    if scale not in (None, 1.0):
+        advice = f"mipmap-plugin render {place}, at x{scale:g}, which it was adapted to and looks right at"
     remarks = len(health)
     noted = f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""
     if spoilt:

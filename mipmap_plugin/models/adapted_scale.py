@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
@@ -21,3 +22,9 @@ def adapted_scale(source: Path | None) -> float | None:
         record = read_json(report)
     scale = record.get("scale") if isinstance(record, dict) else None
     return float(scale) if isinstance(scale, (int, float)) else None
+
+
+def refuse_adapted(source: Path | None) -> None:
+    """Raise SettingsError for a file that was adapted to another scale: its pictures at x1, which it would be adapted to, are wrong."""
+    if (scale := adapted_scale(source)) not in (None, 1.0):
+        raise SettingsError(f"{source} was adapted to x{scale:g}, at which alone it looks right; adapt the checkpoint that it was made from")

@@ -28,7 +28,7 @@ from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_see
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import INTEGRATED, SURFEL, Effects
+from mipmap_plugin.effects import INTEGRATED, MIN_ALPHA, SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import Rebuilt, SplatModel
 
@@ -264,7 +264,8 @@ class StartSearch:
                 weights, _ = over(self._count)
         weights = weights * problem.scale**2
         whole = self._whole_weights(gaussians, self._pixel_size(gaussians.means))
-        if (hidden := float((weights <= UNSEEN * whole).float().mean())) > HIDDEN:
+        drawn = gaussians.opacities >= MIN_ALPHA
+        if (hidden := float((weights <= UNSEEN * whole)[drawn].float().mean())) > HIDDEN:
             advice = "give cameras that show all of the scene, or look at it from where these do"
             self._notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
         return weights

@@ -2,8 +2,8 @@
 
 A dilated splat covers a larger area, and the closed form lowers its opacity by the same factor; at zoom-in it raises it. But the coverage
 of overlapping splats is not the sum of their areas, and splats behind them shine through more. Both are corrected by measuring the blend
-weight of each splat in the target's images, and multiplying its opacity by the ratio of the wanted to the measured weight: iterative proportional fitting
-(Deming and Stephan 1940).
+weight of each splat in the target's images, and multiplying its opacity by the ratio of the wanted to the measured weight: iterative
+proportional fitting (Deming and Stephan 1940).
 """
 
 from __future__ import annotations
