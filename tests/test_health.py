@@ -55,6 +55,14 @@ def test_oddities_are_counted_and_kept(name, value, sentence):
     assert not health.invalid.any()
 
 
+def test_surfels_have_no_third_axis_and_are_no_sheets_for_it():
+    surfels = healthy()
+    surfels.parameters()["scales"][:, 2] = -30.0
+    assert examine(surfels).tiny == 0
+    surfels.parameters()["scales"][3, 0] = -30.0
+    assert examine(surfels).tiny == 1
+
+
 @pytest.mark.parametrize("logit", [math.log(1 / 254) - 1e-4, math.log(1 / 254) + 1e-4])
 def test_invisible_is_below_one_eight_bit_step(logit):
     assert examine(spoiled("opacities", 0, logit)).invisible == (logit < math.log(1 / 254))

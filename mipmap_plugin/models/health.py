@@ -145,6 +145,9 @@ def examine(model: SplatModel) -> Health:
     scales, opacities = raw["scales"].exp(), raw["opacities"].sigmoid()
     extent = _extent(raw["means"])
     steps = _coarse_steps(raw["means"], scales, extent)
+    thin = scales < TINY_SHARE * extent
+    if thin.all(0).sum() == 1:  # surfels, which have no third axis
+        thin = thin[:, ~thin.all(0)]
     return Health(
         splats=len(scales),
         nan={name: _rows_where(torch.isnan, tensor) for name, tensor in raw.items()},
@@ -152,7 +155,7 @@ def examine(model: SplatModel) -> Health:
         zero_quaternions=int((raw["quats"] == 0).all(1).sum()),
         extent=extent,
         huge=_rows(scales > extent) if extent > 0 else 0,
-        tiny=_rows(scales < TINY_SHARE * extent),
+        tiny=_rows(thin),
         invisible=_rows(opacities < MIN_VISIBLE),
         rounded=len(steps),
         step=float(steps.median()) if len(steps) else 0.0,
