@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -26,7 +25,7 @@ from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.photographs import placed as placed
 from mipmap_plugin.adaptation.target.portable import settings_for_several
-from mipmap_plugin.adaptation.views import NO_CAMERAS, choose_views
+from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import Camera, checked, digest_of
@@ -36,7 +35,6 @@ from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, check_kinds, check_scale
-from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
@@ -186,7 +184,6 @@ class Wrapped:
         While it runs, torch's default dtype is float32, and torch may have one thread, in the whole process: torch has one of each.
         Raises SettingsError and BackendUnavailable.
         """
-        refuse_adapted(self.model.source)
         scale, cameras = check_scale(scale), None if cameras is None else checked(cameras, some=True)
         check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
@@ -202,8 +199,6 @@ class Wrapped:
         photographs = None if images is None else Photographs(self.place(images), self.cameras, self.background)
         if cameras is None:
             cameras = photographs.cameras if photographs else self.cameras
-        if not cameras and config.views != "orbit":
-            warnings.warn(NO_CAMERAS, stacklevel=1)  # shown wherever the call came from
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)
         if config.steps:

@@ -152,7 +152,7 @@ def _folder(path: Path) -> Path:
 def _ply(form: str, lists: bool = False) -> Callable[[Path], Path]:
     def make(path: Path) -> Path:
         path.mkdir()
-        file = ply_files.write_splats(path / "a.ply", 12, 3, form=form, comments=("SplatRenderMode: default", 'mipmap_plugin {"scale": 0.5}'))
+        file = ply_files.write_splats(path / "a.ply", 12, 3, form=form, comments=("SplatRenderMode: default", 'mipmap_plugin {"scale": 1.0}'))
         if lists:
             header, body = file.read_bytes().split(b"element vertex")
             face = b"element face 2\nproperty list uchar int vertex_indices\nproperty list uint float more\n"

@@ -590,6 +590,22 @@ def test_a_scene_of_which_most_is_before_the_near_plane_is_told_of():
         base.adapt(1 / 2, recipe="instant")
 
 
+def test_without_cameras_the_orbit_is_told_of(recwarn):
+    wrap_model(tiny.model(), backend="reference").adapt(1 / 2, steps=0, extra_views=2, merge_to=1.0)
+    assert [each for each in recwarn if str(each.message).startswith("no cameras are known: views of a generated orbit")]
+    recwarn.clear()
+    wrap_model(tiny.model(), backend="reference").adapt(1 / 2, steps=0, extra_views=2, merge_to=1.0, views="orbit")
+    assert not recwarn
+
+
+def test_what_was_adapted_to_another_scale_is_not_adapted_again(tmp_path):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    files = [base.adapt(scale, steps=0, viewer="antialiased").save(tmp_path / f"{scale}.ply") for scale in (0.5, 1.0)]
+    with pytest.raises(SettingsError, match=r"0\.5\.ply was adapted to x0\.5, at which alone it looks right; adapt the checkpoint that"):
+        wrap_model(files[0], cameras=tiny.cameras(), backend="reference").adapt(0.5, steps=0)
+    wrap_model(files[1], cameras=tiny.cameras(), backend="reference").adapt(0.5, steps=0)
+
+
 @pytest.mark.parametrize("times", [2, 4])
 def test_lenses_that_differ_too_much_are_told_of(times, recwarn):
     wide, *others = tiny.cameras()

@@ -81,7 +81,7 @@ def test_what_a_backend_draws_wrong_is_told_by_its_name(render, said):
 )
 def test_wrong_gradients_of_a_backend_are_told_by_its_name(render, said):
     base = backend(render)
-    base.adapt(2, recipe="instant")
+    base.adapt(2, recipe="instant", closed_form=False)  # which has no gradients
     with pytest.raises(PluginError, match=said):
         base.adapt(0.5, **BRIEF)
 

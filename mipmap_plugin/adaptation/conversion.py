@@ -7,6 +7,7 @@ without and 32 with it.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -21,9 +22,11 @@ from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
+from mipmap_plugin.adaptation.views import ORBITED
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.contract import refuse_broken
 from mipmap_plugin.models.places import conversion_state
 from mipmap_plugin.recipes import recipe as make_config
@@ -61,6 +64,9 @@ class Stages:
 
     def adapt(self, scale: float, config: AdaptConfig, first: AdaptConfig | None) -> Adapted:
         """Adapt to `scale`; `first`: the settings of a conversion before. Raises as `Session.run` does."""
+        refuse_adapted(self.request.images.model.source)
+        if not self.cameras and config.views != "orbit":
+            warnings.warn(ORBITED, stacklevel=1)  # shown from wherever it was called
         refuse_broken(self.request.images.model, next(iter(self.cameras), NO_CAMERA), steps=config.steps > 0)
         if first is None:
             return Session(self.request, scale, config, self.cameras, self.photographs).run(self.resume, self.observe)

@@ -37,7 +37,7 @@ LOOKED_AT, TOO_MANY = 16, 0.05
 LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
 # What is said where there are no cameras: with those of an object all is well, but a capture was never seen from there, and loses 10 dB and more.
-NO_CAMERAS = (
+ORBITED = (
     "no cameras are known: views of a generated orbit are adapted to, and all dB are of such; that suits an object, and no capture; "
     "give the scene's cameras (--cameras)"
 )

@@ -20,6 +20,8 @@ what a zoom takes off them (`FormSettings.crispness`).
 A file that is rendered with the base's own filter needs no change if that filter compensates, since it models the pixel in each view.
 Wider splats would cost a base of Mip-Splatting 10 dB against the truth at x4.
 
+Opacities from areas are exact for splats that hide nothing; where blend weights are known they are matched afterwards (`matching`).
+
 The distance is that of the closest view, which saw the finest detail that training could resolve (as for the 3D filter of
 Mip-Splatting); the mean distance costs 0.3 to 0.7 dB at zoom-in on lego and the demo scene.
 """
