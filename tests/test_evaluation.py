@@ -20,7 +20,7 @@ from mipmap_plugin.evaluation.published import PUBLISHED, published
 from mipmap_plugin.evaluation.report import markdown, published_table, records, table
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes import Scene, load_scene
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 BRIEF = dict(steps=2, extra_views=1, check_every=1)
@@ -84,6 +84,24 @@ def test_p1_truncates_the_mean_of_blocks():
     view = protocols.TestView(tiny.cameras(1)[0], photograph, Path("photograph.png"))
     means = photograph.view(6, 4, 8, 4, 3).mean(dim=(1, 3)) * 255
     torch.testing.assert_close(view.truth(1 / 4, PROTOCOLS["P1"]) * 255, means.floor(), atol=1e-3, rtol=0)
+
+
+def test_p1_averages_colors_and_alpha_by_themselves_and_composites_afterwards(tmp_path):
+    """A red pixel, a transparent one that is stored blue, and two of half alpha; by hand, with both truncations.
+
+    Means: red 255 / 4 = 63.75 and blue 255 / 4, each 63; alpha (255 + 2 * 128) / 4 = 127.75, so 127, or 0.498. On white
+    63 * 0.498 + 255 * 0.502 = 159.37 and 128. Composited first it would be (255 + 255 + 2 * 127) / 4 = 191 and 127.
+    """
+    block = np.array([[[255, 0, 0, 255], [0, 0, 255, 0]], [[0, 0, 0, 128], [0, 0, 0, 128]]], np.uint8)
+    Image.fromarray(np.tile(block, (24, 32, 1))).save(tmp_path / "photograph.png")
+    cameras = [replace(camera, split="test") for camera in tiny.cameras(1)]
+    [view] = protocols.test_views(Scene(tuple(cameras), {cameras[0]: tmp_path / "photograph.png"}, tmp_path), tiny.cameras(1), (1.0, 1.0, 1.0))
+    for scale in (1, 1 / 2, 1 / 4):  # of a photograph of twice the base's size
+        truth = (view.truth(scale, PROTOCOLS["P1"]) * 255).round().byte()
+        assert truth.shape == (24 * scale, 32 * scale, 3) and truth.unique(dim=0).unique(dim=1).tolist() == [[[159, 128, 159]]]
+    opaque = protocols.TestView(view.camera, view.photograph, view.file, view.background, distorted=True, transparent=True)
+    assert torch.equal(opaque.truth(1, PROTOCOLS["P1"]), PROTOCOLS["P1"].shrunk(view.photograph, (24, 32)))
+    assert torch.equal(view.truth(1 / 2, PROTOCOLS["P3"]), PROTOCOLS["P3"].shrunk(view.photograph, (12, 16)))
 
 
 def test_p1_of_a_photograph_without_whole_blocks_says_what_to_do():

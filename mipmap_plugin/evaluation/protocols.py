@@ -1,6 +1,8 @@
 """Protocols: how a photograph becomes the truth at another scale. Two good filters differ by 40 dB, so every table names its protocol.
 
-P1, of Mip-Splatting on NeRF-Synthetic: 2 x 2 means in float, truncated to 8 bits. P3, of Mipmap-GS, and of Mip-Splatting on mip-NeRF 360:
+P1, of Mip-Splatting on NeRF-Synthetic: 2 x 2 means in float, truncated to 8 bits. Where the photograph has transparency, these are means of its
+colors as stored and of alpha, each by itself; the result is composited on the background afterwards, and truncated again
+(convert_blender_data.py, then readMultiScale of scene/dataset_readers.py). P3, of Mipmap-GS, and of Mip-Splatting on mip-NeRF 360:
 composited on the background and truncated to 8 bits as INRIA's reader does, then Pillow's bicubic on those bytes. P4: the files of
 images_2, images_4, ... There is no P2: Mip-Splatting's protocol on mip-NeRF 360 makes the same truth of a JPEG as P3, byte for byte.
 
@@ -23,7 +25,7 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.photographs import Photographs
-from mipmap_plugin.formats.images import image_size, pillow_bicubic, read_image
+from mipmap_plugin.formats.images import averaged_straight, has_alpha, image_size, pillow_bicubic, read_image, read_straight
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.scenes import Scene
 
@@ -40,8 +42,9 @@ class Protocol:
     """One way to make the truth and to compare with it, as in the papers."""
 
     name: str
-    resize: str | None  # filter for the photograph, already composited on the background; None: files of the required size are read
+    resize: str | None  # filter for the photograph, composited on the background before unless `straight`; None: files of the required size are read
     truncate: bool = False  # P1 truncates its levels to 8 bits, the others round
+    straight: bool = False  # transparent photographs are composited after they are resized, not before
     eight_bit: bool = True  # evaluated images are rounded as in PNG files
 
     @property
@@ -66,7 +69,7 @@ class Protocol:
 
 
 PROTOCOLS: dict[str, Protocol] = {
-    "P1": Protocol("P1", "box", truncate=True),
+    "P1": Protocol("P1", "box", truncate=True, straight=True),
     "P3": Protocol("P3", "pil-bicubic"),
     "P4": Protocol("P4", None),
 }
@@ -90,6 +93,7 @@ class TestView:
     file: Path
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     distorted: bool = False  # the file had to be undistorted
+    transparent: bool = False  # the file has an alpha channel
 
     @property
     def photograph(self) -> Tensor:
@@ -110,6 +114,8 @@ class TestView:
         if protocol.resize == "box" and any(pixels % new for pixels, new in zip(photograph.shape, size, strict=False)):
             blocks = f"{photograph.shape[1]} x {photograph.shape[0]} px is not a whole multiple of {size[1]} x {size[0]} px"
             raise SettingsError(f"{protocol.name} takes means of whole blocks of pixels, and {blocks}; evaluate by P3, or another scale")
+        if protocol.straight and self.transparent and not self.distorted and (rgba := read_straight(self.file)) is not None:
+            return averaged_straight(rgba, size, self.background)
         return protocol.shrunk(photograph, size)
 
 
@@ -141,7 +147,7 @@ def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, fl
 
     def view(original: Camera, camera: Camera) -> TestView:
         file = scene.images[original]
-        return TestView(camera, photographs.of(original), file, background, file in scene.lenses)
+        return TestView(camera, photographs.of(original), file, background, file in scene.lenses, has_alpha(file))
 
     return [*map(view, cameras, at_density_of(cameras, base))]
 

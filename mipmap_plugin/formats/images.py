@@ -42,18 +42,37 @@ def read_image(path: str | Path, background: Sequence[float]) -> Tensor:
     EXIF rotation is not applied: cameras are calibrated on the pixels as they are stored. Raises SceneError, also for more pixels
     than the memory holds, or than a file of that size can have.
     """
+    pixels = _pixels(path)
+    if pixels.dtype != np.uint8:
+        return torch.from_numpy(pixels)
+    if pixels.shape[2] == 4:
+        pixels = composite(pixels, background)
+    return torch.from_numpy(pixels.astype(np.float32)).div_(255)
+
+
+def read_straight(path: str | Path) -> np.ndarray | None:
+    """The 8-bit RGBA [H, W, 4] of a file, whose colors are not multiplied by alpha; None for a file without transparency. Raises SceneError."""
+    pixels = _pixels(path)
+    return pixels if pixels.shape[2] == 4 else None
+
+
+def has_alpha(path: str | Path) -> bool:
+    """Whether an image file has transparency, from its header alone. Raises SceneError."""
+    with _opened(path) as image:
+        return image.mode not in GRAY_16_BIT and image.has_transparency_data
+
+
+def _pixels(path: str | Path) -> np.ndarray:
+    """A file's RGB or straight-alpha RGBA in 8 bits, [H, W, 3 or 4]; of 16 bits gray in 0..1, float32 [H, W, 3]. Raises SceneError."""
     with _opened(path) as image:
         _refuse_bomb(Path(path), *image.size)
         try:
             if image.mode in GRAY_16_BIT:
-                gray = torch.from_numpy(np.asarray(image).astype(np.float32)) / 65535
-                return gray[..., None].expand(-1, -1, 3).contiguous()
-            pixels = np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+                gray = np.asarray(image).astype(np.float32) / np.float32(65535)
+                return np.repeat(gray[..., None], 3, axis=2)
+            return np.asarray(image.convert("RGBA" if image.has_transparency_data else "RGB"))
         except Exception as error:  # a damaged file fails in as many ways as Pillow has decoders
             raise SceneError(f"{path}: the image is damaged ({str(error) or type(error).__name__}); download or export it again") from error
-    if pixels.shape[2] == 4:
-        pixels = composite(pixels, background)
-    return torch.from_numpy(pixels.astype(np.float32)).div_(255)
 
 
 def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
@@ -71,6 +90,21 @@ def composite(rgba: np.ndarray, background: Sequence[float]) -> np.ndarray:
         blended = color * alpha + np.asarray(background, dtype=np.float64) * (1 - alpha)
         rgb[top : top + rows] = (blended * 255.0).astype(np.uint8)
     return rgb
+
+
+def averaged_straight(rgba: np.ndarray, size: tuple[int, int], background: Sequence[float]) -> Tensor:
+    """An 8-bit RGBA [H, W, 4], whose size is a whole multiple, as P1 makes it smaller: [*size, 3] in 0..1.
+
+    Colors and alpha are averaged by themselves, truncated to 8 bits, and only then composited. Mip-Splatting halves again and again in
+    float32, so this does, too: a mean that is a whole level may come out one lower.
+    """
+    pixels = rgba.astype(np.float32) / np.float32(255)
+    while (down := pixels.shape[0] // size[0]) * (across := pixels.shape[1] // size[1]) > 1:
+        if down % 2 == across % 2 == 0:
+            down = across = 2
+        pixels = pixels.reshape(pixels.shape[0] // down, down, pixels.shape[1] // across, across, 4).mean(axis=(1, 3))
+    small = composite((pixels * np.float32(255)).astype(np.uint8), background)
+    return torch.from_numpy(small.astype(np.float32)).div_(255)
 
 
 def pillow_bicubic(image: Tensor, size: tuple[int, int]) -> Tensor:
