@@ -57,6 +57,7 @@ class RenderOptions(TypedDict, total=False):
     viewer: str | None  # render as this viewer does, instead of with a screen filter; without a filter_3D if it does not read it
     filter_3d: bool  # first smooth every splat to the finest detail that the cameras could resolve (Mip-Splatting's 3D filter)
     outputs: Sequence[str]  # "depth" and "normals", besides the image (`Rendered`)
+    clamped: bool  # clamp the samples of a pixel to 0..1 before they are averaged, as evaluations do
     exposure: bool  # apply the exposure of the photograph that the camera is named after, if exposure.json has it
 
 
@@ -145,7 +146,7 @@ class Wrapped:
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
         with threads.limited(self.threads, shared=False) if self.threads is not None else nullcontext():
-            return render_model(self.read_by(viewer), backend, camera, effects, form)
+            return render_model(self.read_by(viewer), backend, camera, effects, form, options.get("clamped", False))
 
     def _smoothed(self, gaussians: Gaussians) -> Gaussians:
         """Apply Mip-Splatting's 3D filter. Raises SettingsError without cameras, and for splats that it cannot be applied to."""

@@ -23,10 +23,14 @@ from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import read_scale
 from mipmap_plugin.evaluation import backends as backends_module
 from mipmap_plugin.evaluation import viewer_differences
+from mipmap_plugin.evaluation.measure import baselines
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
+from mipmap_plugin.wrap import wrap_model
 
 QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
 NO_STEP = ["--backend", "reference", "--steps", "0"]
@@ -273,6 +277,20 @@ def test_render_of_one_view_is_the_view(run, model_folder, tmp_path):
     assert code == 0 and out.startswith("1 picture in")
     [picture] = (tmp_path / "out").iterdir()
     assert picture.name == "train_view_1.png" and Image.open(picture).getpixel((0, 0)) == (255, 255, 255)
+
+
+def test_render_writes_the_row_of_supersampling_that_evaluate_judges(run, tmp_path):
+    splats = tiny.gaussians()
+    VanillaModel.from_gaussians(replace(splats, sh=3 * splats.sh), TrainedScale()).save(tmp_path / "bright", provenance={})  # beyond a screen's white
+    write_cameras(tmp_path / "bright" / "cameras.json", tiny.cameras(2))
+    words = ["--scale", "1/4", "--view", "view_1", "--screen-filter", "scaled", "--supersampling", "4", "--backend", "reference"]
+    assert run("render", tmp_path / "bright", "--output", tmp_path / "out", *words)[0] == 0
+    base = wrap_model(tmp_path / "bright", backend="reference")
+    [row] = [each for each in baselines(base, 1 / 4, "area") if each.name == "supersampling, 4 x 4"]
+    [view] = [view for view in base.cameras if view.name == "view_1"]
+    shown = np.asarray(Image.open(tmp_path / "out" / "train_view_1.png")).astype(int)
+    assert abs(shown - (row.render(view) * 255).round().numpy()).max() <= 1
+    assert abs(shown - (base.render(view.zoomed(1 / 4), 1 / 4, "scaled", 4).image.clamp(0, 1) * 255).round().numpy()).max() > 1
 
 
 def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, model_folder, tmp_path):

@@ -98,15 +98,18 @@ class Adapted:
 
 @torch.no_grad()
 def render_model(
-    model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None
+    model: SplatModel, backend: Backend, camera: Camera, effects: Effects, form: Callable[[Gaussians], Gaussians] | None = None, clamped: bool = False
 ) -> Rendered:
-    """Render a model, its splats first changed by `form`, and report the effects that were simulated. Raises SettingsError."""
+    """Render a model, its splats first changed by `form`, and report the effects that were simulated. Raises SettingsError.
+
+    `clamped`: of several samples of a pixel.
+    """
     matrix = model.traits.exposures.of(camera) if effects.exposure else None
     family = f"family {model.family!r}"
     with naming_any({family: model}), unchanged(family, model.parameters()):
         gaussians = checked_splats(model, camera)
     gaussians = gaussians if form is None else form(gaussians)
-    rendered = supersample.render(backend, gaussians, camera, effects)
+    rendered = supersample.render(backend, gaussians, camera, effects, clamped=clamped)
     if effects.outputs:
         from mipmap_plugin.backends import geometry  # an effect that is off is not imported
 

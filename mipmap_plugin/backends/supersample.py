@@ -10,10 +10,11 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 
 
-def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
+def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effects, *, clamped: bool = False) -> Rendered:
     """The view of `camera`, averaged over `effects.supersampling`² samples per pixel.
 
     The screen filter keeps its size in output pixels. With eps2d = 0.3·s² and N = 1/s this is the box-filtered render of the base.
+    `clamped`: samples are clamped to 0..1 before they are averaged, as a screen would show them.
     """
     n = effects.supersampling
     if n == 1:
@@ -21,5 +22,6 @@ def render(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Effe
     fine = camera.resized(camera.width * n, camera.height * n)
     finer = replace(effects, supersampling=1, eps2d=effects.eps2d * n**2, settings=effects.settings.finer(n))
     rendered = backend.render(gaussians, fine, finer)
-    blocks = rendered.image.unflatten(1, (-1, n)).unflatten(0, (-1, n))
+    image = rendered.image.clamp(0, 1) if clamped else rendered.image
+    blocks = image.unflatten(1, (-1, n)).unflatten(0, (-1, n))
     return Rendered(blocks.mean(dim=(1, 3)), rendered.alpha.unflatten(1, (-1, n)).unflatten(0, (-1, n)).mean(dim=(1, 3)))

@@ -70,7 +70,8 @@ def render(
     if exposure:
         for camera in views:
             wrapped.model.traits.exposures.of(camera)  # raises before anything is written
-    options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure}
+    # Samples are clamped as `evaluate` clamps them, except those that an exposure may still bring into the range of a picture.
+    options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure, "clamped": not exposure}
     for camera, picture in counted(zip(views, pictures, strict=True), len(views), "rendering", "view"):
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
     count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
