@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -11,6 +13,7 @@ import torch
 
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.warn import silent, warn
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.evaluation import protocols
 from mipmap_plugin.evaluation.evaluate import Evaluator, training_free_rows
@@ -30,6 +33,16 @@ def wrapped(**options):
 
 
 # Rivals
+
+
+def test_clamped_samples_give_the_row_of_supersampling_whose_samples_a_screen_clamps():
+    bright = tiny.gaussians(60)
+    model = wrap_model(VanillaModel.from_gaussians(replace(bright, sh=3 * bright.sh), TrainedScale()), cameras=tiny.cameras(1), backend="reference")
+    [row] = [each for each in baselines(model, 1 / 4, "area") if each.name == "supersampling, 4 x 4"]
+    [view] = tiny.cameras(1)
+    clamped, plain = (model.render(view.zoomed(1 / 4), 1 / 4, "scaled", 4, clamped=on).image for on in (True, False))
+    torch.testing.assert_close(clamped, row.render(view), atol=1e-5, rtol=0)
+    assert (clamped - plain.clamp(0, 1)).abs().max() > 1 / 255
 
 
 @pytest.mark.parametrize(
@@ -159,6 +172,30 @@ def shifted(camera, by):
     viewmat = camera.viewmat.clone()
     viewmat[0, 3] += by
     return replace(camera, viewmat=viewmat)
+
+
+def test_a_warm_up_warns_of_nothing_and_leaves_pythons_filters_alone(monkeypatch):
+    said = lambda *_, **__: warn("no view shows these")  # noqa: E731
+    model = wrapped()
+    monkeypatch.setattr(model, "adapt", said)
+    before = list(warnings.filters)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warm_up(model, 1 / 4, tiny.cameras(2))
+        assert not caught
+        with ThreadPoolExecutor(1) as pool, silent():
+            pool.submit(said).result()  # another thread's adaptation
+        said()
+    assert [str(each.message) for each in caught] == 2 * ["no view shows these"] and warnings.filters == before
+
+
+def test_a_warm_up_on_one_view_of_many_does_not_say_what_that_view_leaves_out():
+    model = wrap_model(tiny.model(30), cameras=[turned(tiny.cameras(1)[0], 45), *tiny.cameras(3)], backend="reference")
+    with pytest.warns(UserWarning, match="no view shows"):
+        model.adapt(1 / 4, cameras=model.cameras[:1], views="given", steps=1, validation_views=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warm_up(model, 1 / 4, model.cameras)
 
 
 def test_a_view_is_known_again_by_its_pose_whatever_its_name_lens_and_digits():

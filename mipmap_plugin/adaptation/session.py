@@ -6,7 +6,6 @@ import hashlib
 import json
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -36,6 +35,7 @@ from mipmap_plugin.adaptation.target.portable import extreme_targets, median_tar
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, with_times
+from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
@@ -126,7 +126,7 @@ class Session:
             copy, reason = self.copy_of_base(), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         for remark in remarks(self.base_views, self.base, near, orbit=self._orbits):
-            warnings.warn(remark, stacklevel=2)
+            warn(remark)
         began = time.perf_counter()
         with self.phase("compilation"):
             splats, effects = self.base.gaussians(self.views[0]), (self.base_effects, *self.targets.values())
@@ -271,7 +271,7 @@ class Session:
         known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]
         notes = [note for note in student.notes if note not in known]
         for note in notes:
-            warnings.warn(note, stacklevel=2)
+            warn(note)
         return Report(
             scale=self.scale,
             base=self.base.digest or digest_of_parameters(self.base),

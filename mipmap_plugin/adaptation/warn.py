@@ -1,0 +1,27 @@
+"""Warnings of an adaptation. A warm-up says none: it has one view, of which they are true, and the run that follows has others."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+# Not a filter of Python's warnings, which all threads have in common.
+_silent: ContextVar[bool] = ContextVar("_silent", default=False)
+
+
+def warn(text: str) -> None:
+    """Warn whoever called the function that calls this one, unless it is inside `silent`."""
+    if not _silent.get():
+        warnings.warn(text, stacklevel=3)
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Adaptations of this thread warn of nothing inside."""
+    token = _silent.set(True)
+    try:
+        yield
+    finally:
+        _silent.reset(token)
