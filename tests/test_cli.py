@@ -317,11 +317,11 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
     words = ["evaluate", model_folder, "--images", scene, "--output", tmp_path / "rows.json", *wanted]
     code, out, _ = run(*words)
     assert code == 0
-    assert "truth: P1" in out and "| x1 " in out and "| x0.25 " in out and "base, resized" in out
+    assert "truth: P1" in out and "real dB over 2 views\n" in out and "| x1 " in out and "| x0.25 " in out and "base, resized" in out
     assert "instant, 1 of 2 judged views adapted to" in out  # the folder has no cfg_args, and one of its cameras is judged
     written = json.loads((tmp_path / "rows.json").read_text())
     rows = written["rows"]
-    assert written["notes"] == []
+    assert written["notes"] == [] and written["judged_views"] == [2]
     assert [row["name"] for row in rows][:2] == ["base", "base"] and rows[0]["psnr_db"] > 50
     refused(run(*words), "rows.json exists already; pass --overwrite")
 
@@ -342,6 +342,20 @@ def test_evaluate_says_which_rows_are_missing_and_that_no_row_is_exposed(run, mo
     assert code == 0 and out.splitlines()[-3:-1] == [missing, exposed] and "| window" not in out
     code, out, _ = run(*words, "--scale", "1", "--json")
     assert code == 0 and json.loads(out)["notes"] == [exposed]
+
+
+def test_evaluate_and_tradeoff_tell_of_photographs_that_are_absent(run, model_folder, tmp_path):
+    scene = tiny.scene(tmp_path / "scene")
+    (scene / "test" / "view_1.png").unlink()
+    note = "transforms_test.json: 1 listed images are absent; 1 of their cameras are left out because the file has no w and h"
+    words = [model_folder, "--images", scene, "--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--json"]
+    code, out, err = run("evaluate", *words, "--output", tmp_path / "rows.json")
+    assert code == 0 and f"mipmap-plugin: {scene}: {note}\n" in err
+    assert json.loads(out)["judged_views"] == [1] and json.loads(out)["notes"] == [note]
+    page = (tmp_path / "rows.html").read_text()
+    assert note in page and "photographs, protocol P1, 1 view" not in page and "photographs, protocol P3, 1 view" in page
+    code, out, err = run("tradeoff", *words, "--output", tmp_path / "out", "--no-picture", "--no-renderers", "--repeats", "1")
+    assert code == 0 and f"mipmap-plugin: {scene}: {note}\n" in err and json.loads(out)["scales"][0]["notes"] == [note]
 
 
 def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, model_folder, tmp_path):

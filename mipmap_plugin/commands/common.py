@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import warnings
 from collections.abc import Sequence
 from contextvars import ContextVar
 from pathlib import Path
@@ -43,10 +44,13 @@ def wrap(
 
 
 def scene(path: Path) -> Scene:
-    """The scene at `path`. Raises SceneError."""
+    """The scene at `path`, whose photographs judge; a warning tells of absent ones. Raises SceneError."""
     from mipmap_plugin.scenes import load_scene
 
-    return load_scene(path)
+    read = load_scene(path)
+    for note in read.absent():
+        warnings.warn(f"{path}: {note}", stacklevel=2)
+    return read
 
 
 def without_none(**options: Any) -> dict[str, Any]:

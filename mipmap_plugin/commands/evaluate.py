@@ -5,12 +5,13 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from mipmap_plugin.commands.common import print_facts, without_none, wrap
+from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.resuming import resumable, resume_path
 from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, unique_scales
@@ -78,10 +79,10 @@ def evaluate(
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with results.resumable():
         for path, folder in zip(checkpoint, images, strict=True):
-            wrapped, scene = wrap(path, None, background, backend, screen_filter, threads), _scene(folder, appearance)
-            results.measure(wrapped, scene, appearance, recipe, settings)
+            wrapped, photographs = wrap(path, None, background, backend, screen_filter, threads), _scene(folder, appearance)
+            results.measure(wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, output, overwrite)
-    print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol), published)
+    print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
 
 
 class _Results:
@@ -92,6 +93,7 @@ class _Results:
         written = output or page
         self._kept = resume_path(written) if written else None
         self._rows, self._notes, self._galleries = list[Any](), dict[str, None](), list[Any]()  # notes each once, in their order
+        self.judged = list[int]()  # the number of judged views of each checkpoint
 
     def resumable(self) -> AbstractContextManager[None]:
         """Inside, Ctrl-C says how to go on, and what an earlier command finished is told."""
@@ -102,14 +104,16 @@ class _Results:
         from mipmap_plugin.evaluation import evaluate as evaluation
         from mipmap_plugin.evaluation.cells import Cells
 
-        gallery = evaluation_gallery(wrapped, self._protocol) if self._page else None
         lpips = self._perceptual and self._perceptual.label
         asked = {"protocol": self._protocol, "lpips": lpips, "appearance": appearance, "settings": settings, "page": self._page is not None}
         made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "trained": str(wrapped.trained), "scene": scene.digest()}
         cells = Cells(self._kept, asked | made_from | {"backend": wrapped.backend()[0].name, "threads": wrapped.threads})
-        judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, gallery, cells)
+        judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, cells=cells)
+        gallery = evaluation_gallery(wrapped, self._protocol, len(judge.views)) if self._page else None
+        judge = replace(judge, watcher=gallery)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
-        self._notes |= dict.fromkeys(evaluation.notes(wrapped, self._scales, appearance))
+        self._notes |= dict.fromkeys([*judge.notes, *evaluation.notes(wrapped, self._scales, appearance)])
+        self.judged.append(len(judge.views))
         self._galleries.append(gallery)
 
     def write(self, checkpoints: Sequence[Path], output: Path | None, overwrite: bool) -> dict[str, Any]:
@@ -118,7 +122,7 @@ class _Results:
         from mipmap_plugin.evaluation.report import records
 
         self._rows += means(self._rows) if len(checkpoints) > 1 else []
-        facts = {"rows": records(self._rows), "notes": [*self._notes], "report": self._page and str(self._page)}
+        facts = {"rows": records(self._rows), "judged_views": self.judged, "notes": [*self._notes], "report": self._page and str(self._page)}
         if self._page:
             write_evaluation_page(self._page, checkpoints, self._galleries, self._rows, [*self._notes], overwrite)
         if output:
@@ -147,10 +151,8 @@ def _perceptual(network: Literal["alex", "vgg", "vgg-01"] | None, weights: Path 
 
 
 def _scene(folder: Path, appearance: str) -> Scene:
-    from mipmap_plugin.scenes import load_scene
-
-    scene = load_scene(folder)
-    return scene.numbered_as_upstream() if appearance == "upstream" else scene
+    read = scene(folder)
+    return read.numbered_as_upstream() if appearance == "upstream" else read
 
 
 def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
@@ -164,8 +166,10 @@ def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], outputs: Sequenc
         refuse_unwritable(output)
 
 
-def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str) -> str:
-    return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over the test views"
+def _title(checkpoint: Sequence[Path], images: Sequence[Path], protocol: str, judged: Sequence[int]) -> str:
+    """`judged`: the number of judged views of each checkpoint."""
+    views = f"{_listed(judged)} view{'' if [*judged] == [1] else 's'}"
+    return f"{_listed(checkpoint)}; truth: {protocol} from {_listed(images)}, real dB over {views}"
 
 
 def _parts(checkpoint: Path) -> list[Path]:
@@ -174,5 +178,5 @@ def _parts(checkpoint: Path) -> list[Path]:
     return parts_of(None, checkpoint) if checkpoint.is_dir() else [checkpoint]
 
 
-def _listed(paths: Sequence[Path]) -> str:
-    return ", ".join(map(str, paths))
+def _listed(values: Sequence[Any]) -> str:
+    return ", ".join(map(str, values))

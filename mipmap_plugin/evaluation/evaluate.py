@@ -70,6 +70,7 @@ class Evaluator:
     scene: str = ""
     watcher: Watcher | None = None  # is shown the first view of each row
     cells: Cells = field(default_factory=Cells)  # rows that an earlier command finished
+    notes: Sequence[str] = ()  # of the scene
 
     def cell(self, key: dict[str, Any], measure: Callable[[Evaluator], Row]) -> Row:
         """The row `key`: measured by an evaluator like this one, or kept from before an interruption."""
@@ -175,7 +176,7 @@ def evaluator_of(
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
     views = test_views(scene, model.cameras, model.background)
-    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, watcher, cells or Cells())
+    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, watcher, cells or Cells(), scene.notes)
 
 
 def evaluate(

@@ -16,6 +16,9 @@ from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.formats.images import image_size, is_file, read_image
 from mipmap_plugin.scenes.lenses import Lens
 
+# The word of notes on photographs that are not there.
+ABSENT = "absent"
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -45,6 +48,10 @@ class Scene:
         """A hash of the cameras and of the photographs: of their names and sizes in bytes, not of what they show."""
         sizes = [(path.name, path.stat().st_size) for path in self.images.values()]
         return hashlib.sha256(f"{digest_of(self.cameras)} {sizes}".encode()).hexdigest()[:DIGITS]
+
+    def absent(self) -> list[str]:
+        """The notes on photographs that are listed and not there: fewer views are judged than the files list."""
+        return [note for note in self.notes if f" {ABSENT}" in note]
 
     def split(self, name: str) -> list[Camera]:
         """The cameras of "train" or "test", in file order. Raises SettingsError for another name."""

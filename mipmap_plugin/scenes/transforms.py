@@ -14,7 +14,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
-from mipmap_plugin.scenes.base import Scene
+from mipmap_plugin.scenes.base import ABSENT, Scene
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -55,7 +55,7 @@ def read_transforms(path: str | Path) -> Scene:
         distorted += [lens for _, _, lens in views if lens]
         if absent:
             unsized = absent - sum(image is None for _, image, _ in views)
-            notes.append(f"{file.name}: {absent} listed images are absent; {unsized} of their cameras are left out because the file has no w and h")
+            notes.append(f"{file.name}: {absent} listed images are {ABSENT}; {unsized} of their cameras are left out because the file has no w and h")
     if not cameras:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
     first = transforms_files(path)[0][0]
