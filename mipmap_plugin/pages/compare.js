@@ -158,6 +158,6 @@ function viewerSection(zoom) {
         make("span", {}, word, " ", make("strong", {}, picture.view.psnr_db == null ? "" : decibel(picture.view.psnr_db)))))),
     make("figcaption", {}, viewer.title, viewer.made_for ? make("em", {}, " the file was made for it") : null)));
   return [section("in-viewers", "What viewers will show",
-    make("p", { class: "note" }, "Drawn with each viewer's own conventions, at this zoom; dB of this view. Viewers draw one file differently: "
+    make("p", { class: "note" }, zoom.in_viewers && `Adapted: ${zoom.in_viewers}. `, "Drawn with each viewer's own conventions, at this zoom; dB of this view. Viewers draw one file differently: "
       + "a file looks right in the viewer that it was made for (adapt --viewer NAME)."), make("div", { class: "viewers" }, ...rows))];
 }

@@ -21,14 +21,14 @@ IN_VIEWER = f"{BASE} in "
 
 
 class Gallery:
-    """The first view of each row of one scene, by scale, and what viewers show of the first adapted file of each scale."""
+    """The first view of each row of one scene, by scale, and what viewers show of one adapted file of each scale."""
 
     def __init__(self, base: Wrapped, truth: str) -> None:
         """`truth`: what the images are compared with, in a few words."""
         self._base, self._truth = base, truth
         self._shots: dict[float, list[Shot]] = {}
         self._adapted: set[tuple[str, float]] = set()
-        self._viewers: dict[float, list[ViewerPictures]] = {}
+        self._viewers: dict[float, tuple[str, list[ViewerPictures]]] = {}  # with the row of the adapted file
         self._last: Adapted | None = None
         self.adaptations: list[dict[str, Any]] = []
 
@@ -37,16 +37,17 @@ class Gallery:
         self._shots.setdefault(shot.scale, []).append(shot)
 
     def adapted(self, row: str, adapted: Adapted) -> None:
-        """Keep an adaptation's report, and draw the first of each scale as viewers do."""
+        """Keep an adaptation's report, and draw the first of each scale as viewers do, or the first of the default recipe."""
         scale = adapted.report.scale
         self._adapted.add((row, scale))
         if adapted is self._last:  # the same file in another viewer
             return
         self._last = adapted
         self.adaptations.append({"title": f"{zoom_name(scale)}, {row}", **adapted.report.model_dump()})
-        if scale not in self._viewers and scale in self._shots and not why_not(self._base):
+        known, _ = self._viewers.get(scale, ("", ()))
+        if (not known or (is_default(row) and not is_default(known))) and scale in self._shots and not why_not(self._base):
             seen = self._shots[scale][0]
-            self._viewers[scale] = viewer_pictures(self._base, adapted, seen.camera.zoomed(scale), seen.truth)
+            self._viewers[scale] = row, viewer_pictures(self._base, adapted, seen.camera.zoomed(scale), seen.truth)
 
     def restored(self, row: str, report: dict[str, Any]) -> None:
         """Keep the report of an adaptation from before an interruption; its file is no longer there to be drawn as viewers do."""
@@ -70,9 +71,9 @@ class Gallery:
         reason = "Nothing was adapted: give --recipe default."
         if any(each == scale for _, each in self._adapted):
             reason = why_not(self._base) or "It was adapted before an interruption, after which viewers' pictures are not drawn again."
+        row, viewers = self._viewers.get(scale, ("", ()))
         return Zoom(
-            label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", self._viewers.get(scale, ()),
-            "" if scale in self._viewers else reason,
+            label, scale, in_order(pictures), shots[0].camera.name, self._truth, "all judged views", viewers, "" if viewers else reason, row
         )  # fmt: skip
 
     def _role(self, shot: Shot, in_viewer: bool) -> Role:
@@ -94,7 +95,20 @@ def effects_of_base(base: Wrapped) -> list[dict[str, Any]]:
     return [asdict(effect) for effect in explain(base.effects(), gaussians, effects_of(base.model))]
 
 
+def recipe_of(row: str) -> str:
+    """The recipe in the name of an adapted row of `evaluate`, such as "default, held out"; "" in that of another."""
+    recipe, comma, _ = row.partition(",")
+    return recipe if comma else ""
+
+
+def is_default(row: str) -> bool:
+    """Whether an adapted row is that of the default recipe, which a page tells of first, in whatever order recipes were asked for."""
+    return recipe_of(row) == "default"
+
+
 def in_order(pictures: Sequence[Picture]) -> list[Picture]:
-    """Base, adapted, supersampled and truth first, then the rest; of several in one role, such as one for each viewer, those of a row first."""
+    """Base, adapted, supersampled and truth first, then the rest; of several in one role, such as one for each viewer, those of a row first,
+    and of several recipes the default one.
+    """
     order: tuple[Role, ...] = ("base", "adapted", "supersampled", "truth", "other")
-    return sorted(pictures, key=lambda picture: (order.index(picture.role), not picture.mean))
+    return sorted(pictures, key=lambda picture: (order.index(picture.role), not picture.mean, not is_default(picture.name)))

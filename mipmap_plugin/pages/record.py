@@ -59,6 +59,7 @@ class Zoom:
     mean_of: str = ""  # what `Picture.mean` is the mean of
     viewers: Sequence[ViewerPictures] = ()
     no_viewers: str = ""  # why there are no pictures of viewers
+    in_viewers: str = ""  # what the adapted file in `viewers` is called: its row or its recipe
 
     def facts(self, side: int) -> dict[str, Any]:
         """As JSON, with the middle of each image, at most `side` px wide and high."""
@@ -70,7 +71,7 @@ class Zoom:
         return {
             "label": self.label, "scale": self.scale, "view": self.view, "truth": self.truth, "mean_of": self.mean_of, "size": [width, height],
             "shown": [min(width, side), min(height, side)], "pictures": [picture.facts(side) for picture in self.pictures], "viewers": viewers,
-            "no_viewers": self.no_viewers,
+            "no_viewers": self.no_viewers, "in_viewers": self.in_viewers,
         }  # fmt: skip
 
 

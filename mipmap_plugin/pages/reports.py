@@ -13,7 +13,7 @@ from mipmap_plugin.evaluation.evaluate import Row, shown_as
 from mipmap_plugin.evaluation.measure import BASE, RESIZED, baselines
 from mipmap_plugin.evaluation.report import records
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, unseen
-from mipmap_plugin.pages.gallery import Gallery, effects_of_base, in_order
+from mipmap_plugin.pages.gallery import Gallery, effects_of_base, in_order, recipe_of
 from mipmap_plugin.pages.in_viewers import viewer_pictures, why_not
 from mipmap_plugin.pages.record import Page, Picture, Quality, Role, Zoom, zoom_name
 from mipmap_plugin.wrap import Wrapped
@@ -64,7 +64,8 @@ def adaptation_zoom(base: Wrapped, adapted: Adapted) -> Zoom:
     shown = () if reason else viewer_pictures(base, adapted, view.zoomed(scale), images.get(RESIZED) if scale < 1 else None)
     label = f"{zoom_name(scale)}{f' for {report.viewer}' if report.viewer else ''}"
     against = "the base's own image" + (", made smaller" if scale < 1 else ", with which the image is compared after shrinking" if scale > 1 else "")
-    return Zoom(label, scale, in_order(pictures), view.name, f"{against} (no photographs)", "the validation views", shown, reason)
+    truths, judged_on = f"{against} (no photographs)", "the validation views"
+    return Zoom(label, scale, in_order(pictures), view.name, truths, judged_on, shown, reason, report.settings.recipe)
 
 
 def _psnr(psnr_db: float | None) -> Quality:
@@ -77,7 +78,10 @@ def _lead(zoom: Zoom, rows: Sequence[Row]) -> str:
     means = {role: picture.mean["psnr_db"] for role, picture in judged.items()}
     if "base" not in means:
         return ""
-    adapted = f", {means['adapted']:.1f} dB adapted{_in_seconds(judged['adapted'], zoom.scale, rows)}" if "adapted" in means else ""
+    adapted = ""
+    if "adapted" in means:
+        by = f" by {recipe}" if (recipe := recipe_of(judged["adapted"].name)) else ""
+        adapted = f", {means['adapted']:.1f} dB adapted{by}{_in_seconds(judged['adapted'], zoom.scale, rows)}"
     sampled = f", {means['supersampled']:.1f} dB supersampled" if "supersampled" in means else ""
     base = judged["base"]
     where = f" in the {base.note} viewers" if base.note else base.name.removeprefix(BASE)
