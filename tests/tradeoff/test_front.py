@@ -1,5 +1,7 @@
 """The Pareto front, its knee, and the sentences that say them."""
 
+from dataclasses import replace
+
 import pytest
 
 from mipmap_plugin.evaluation.tradeoff.front import Tradeoff, files, frames, front, knee, milliseconds, seconds
@@ -47,6 +49,12 @@ def test_what_adapting_buys_is_said():
     assert Tradeoff(1 / 8, "dB", RUN).sentences()[0] == "the first 2 s buy 11.3 dB (default); each doubling after that 0.5 dB"
     assert "more were not spent" in Tradeoff(1 / 8, "dB", RUN[:2]).sentences()[0]
     assert "adapting buys nothing here" in Tradeoff(1 / 8, "dB", [BASE, point(9, 3)]).sentences()[0]
+
+
+def test_figures_above_99_are_plain_numbers():
+    slow = [replace(each, adapt_seconds=Spread.of([100 * each.adapt_seconds.median]), ms_per_frame=Spread.of([253.4])) for each in RUN]
+    assert Tradeoff(1 / 8, "dB", slow).sentences()[0].startswith("the first 200 s buy")
+    assert Tradeoff(1 / 8, "dB", slow).sentences()[1].startswith("the quickest frame, 253 ms, has")
 
 
 def test_what_a_slower_frame_buys_is_said():

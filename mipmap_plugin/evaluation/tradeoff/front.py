@@ -86,15 +86,20 @@ def seconds_sentence(points: Sequence[Point]) -> str:
     if found is None:
         return "adapting buys nothing here: no file is better than the base as it is"
     rest = "more were not spent" if found.per_doubling_db is None else f"each doubling after that {found.per_doubling_db:.1f} dB"
-    return f"the first {found.cost:.2g} s buy {found.gain_db:.1f} dB ({found.point.name}); {rest}"
+    return f"the first {_plain(found.cost)} s buy {found.gain_db:.1f} dB ({found.point.name}); {rest}"
 
 
 def frames_sentence(points: Sequence[Point]) -> str:
     """The gain of slower frames, in a sentence."""
     best = front(frames(points), milliseconds)
     found = knee(best, milliseconds)
-    quickest = f"the quickest frame, {milliseconds(best[0]):.2g} ms, has {best[0].psnr_db.median:.1f} dB ({best[0].name})"
+    quickest = f"the quickest frame, {_plain(milliseconds(best[0]))} ms, has {best[0].psnr_db.median:.1f} dB ({best[0].name})"
     if found is None:
         return f"{quickest}, and no slower one is better"
     rest = "" if found.per_doubling_db is None else f"; each doubling after that {found.per_doubling_db:.1f} dB"
-    return f"{quickest}; {found.cost:.2g} ms buy {found.gain_db:.1f} dB more ({found.point.name}){rest}"
+    return f"{quickest}; {_plain(found.cost)} ms buy {found.gain_db:.1f} dB more ({found.point.name}){rest}"
+
+
+def _plain(value: float) -> str:
+    """Two digits, or all those before the point: 0.012, 1.3, 253."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
