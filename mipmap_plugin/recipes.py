@@ -127,6 +127,11 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     return config
 
 
+def most_steps(name: str, scale: float, steps: int | None) -> int | None:
+    """A maximum of steps of several recipes that are compared, as the setting of one: None where it has no steps, for a maximum adds none."""
+    return None if steps is None or recipe(name, scale).steps == 0 else steps
+
+
 def _told(error: Any) -> str:
     """One error of pydantic's, in a sentence."""
     name = ".".join(map(str, error["loc"]))

@@ -236,6 +236,11 @@ def test_rows_for_every_scale_and_recipe(model, scene):
     assert table(rows).splitlines()[0].endswith("| ended by |") and "ended by" not in table([zoomed["base"]])
 
 
+def test_a_maximum_of_steps_gives_none_to_a_recipe_without(model, scene):
+    rows = {row.name: row.ended_by for row in evaluate(model, scene, [1 / 2], ["default", "instant"], "P3", **BRIEF)}
+    assert (rows["default, held out"], rows["instant, held out"], rows["instant, scored"]) == ("2 steps", "0 steps", "0 steps")
+
+
 def test_what_is_scored_is_the_last_state_and_what_is_held_out_the_best(model, scene, monkeypatch):
     returned, adapt = [], model.adapt
     monkeypatch.setattr(model, "adapt", lambda scale, **settings: returned.append(made := adapt(scale, **settings)) or made)

@@ -60,7 +60,7 @@ def evaluate(
         lpips: Also measure LPIPS, with AlexNet or VGG; vgg-01 takes images in 0..1, as papers of this field do, though LPIPS is defined on -1..1.
         lpips_weights: File of the backbone's weights, as torchvision saves them; by default they are downloaded once.
         published: Also print the results that papers published for this data set.
-        steps: Maximum number of optimizer steps, instead of the recipe's.
+        steps: Maximum number of optimizer steps, instead of the recipe's; a recipe without steps takes none.
         upsampler: What makes base images larger: a registered name, or the file of a network.
         appearance: Appearance of test views, if training views have their own: mean of these, or upstream (of the view with the same number).
         background: Of the scene; by default that of the checkpoint, or else black.

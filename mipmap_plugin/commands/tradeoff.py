@@ -55,7 +55,7 @@ def tradeoff(
         images: Folder of the scene with real images (protocol P3). Without it the base itself is the truth; every axis and table says which.
         recipe: default, thorough (more steps and views), instant (closed form only), paper (published method), or others; default: default, paper.
         viewer: The viewer that files are adapted for, and that they and the base are rendered as: spark, playcanvas (or supersplat), ...
-        steps: Maximum number of optimizer steps. May be given several times, for a run each; by default that of the recipe.
+        steps: Maximum number of optimizer steps, of recipes that take any. May be given several times, for a run each; by default that of the recipe.
         backend: Backend to adapt and render with. May be given several times; by default auto.
         supersampling: N for N x N samples per pixel; more than the base's own pixels are skipped. May be given several times; by default 2, 4, 8.
         renderers: Also render the first adapted model with other thresholds, tiles and float types, by the reference backend.

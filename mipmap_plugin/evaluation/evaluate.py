@@ -32,6 +32,7 @@ from mipmap_plugin.evaluation.perceptual import Perceptual
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_exposed, test_views
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.models.base import SplatModel, effects_of
+from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.viewers import viewers_for
@@ -197,7 +198,8 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
 
     First adapted to the checkpoint's training poses (and around them, if the recipe says so). This row shows what a user gets, who looks at other
     views. It is called "held out" only if none of the evaluated poses was adapted to; otherwise it says how many were. Then "scored": adapted
-    to the evaluated views themselves, as the paper does. `settings` are those of `Wrapped.adapt`; a `viewer` adds a row of the base in it.
+    to the evaluated views themselves, as the paper does. `settings` are those of `Wrapped.adapt`; a `viewer` adds a row of the base in it, and
+    `steps` are a maximum, which a recipe without steps keeps.
     """
     viewer, rows = settings.get("viewer"), []
     model.targets(viewer)  # raise errors of the viewer, the recipes and the settings before any work
@@ -219,7 +221,10 @@ def _adapted_rows(model: Wrapped, judge: Evaluator, scale: float, recipes: Seque
         if not warm:
             warm_up(model, scale, model.cameras)
             warm = True
-        adapted = adapt_alone(model, scale, recipe=name, **(settings | _views(make_config(name, scale), on, judge.views)))
+        own = settings | _views(make_config(name, scale), on, judge.views)
+        if most_steps(name, scale, own.get("steps")) is None:
+            own.pop("steps", None)
+        adapted = adapt_alone(model, scale, recipe=name, **own)
         return adapted_row(f"{name}, {'scored' if on == 'scored' else _unseen(judge.views, adapted)}", adapted, judge)
 
     each = product(recipes, ("train", "scored"))

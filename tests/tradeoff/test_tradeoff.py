@@ -47,6 +47,14 @@ def test_photographs_are_the_truth_where_there_are_any(tmp_path):
     assert yardstick.psnr(yardstick.views[0], good) > 30 > yardstick.psnr(yardstick.views[0], bad)
 
 
+def test_a_maximum_of_steps_is_one_run_of_a_recipe_without_steps():
+    plan = replace(PLAN, recipes=("instant", "default"), steps=(1, 2), repeats=1)
+    points = list(measure(wrapped(), base_itself(wrapped(), 1 / 2, 1), 1 / 2, plan))
+    assert [(point.name, point.ended_by) for point in points if point.kind == "adapted" and point.ended_by] == [
+        ("instant", "0 steps"), ("default, 1 steps at most", "1 steps"), ("default, 2 steps at most", "2 steps")
+    ]  # fmt: skip
+
+
 def test_photographs_need_the_cameras_of_the_checkpoint(tmp_path):
     with pytest.raises(SettingsError, match="give its model folder"):
         photographs(wrapped([]), load_scene(tiny.scene(tmp_path / "scene")), 1 / 4, None)

@@ -7,6 +7,7 @@ import statistics
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import torch
@@ -36,6 +37,7 @@ from mipmap_plugin.evaluation.measure import (
 from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.progress import ticking
+from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.splatting.filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Wrapped
 
@@ -107,7 +109,8 @@ class Plan:
 def measure(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan, cells: Cells | None = None) -> Iterator[Point]:
     """Yield each point as soon as it is measured, or found in `cells`. Raises SettingsError and BackendUnavailable."""
     cells = cells or Cells()
-    runs = [(name, steps, backend) for backend in plan.backends for name in plan.recipes for steps in plan.steps or (None,)]
+    asked = product(plan.backends, plan.recipes, plan.steps or (None,))
+    runs = list(dict.fromkeys((name, most_steps(name, scale, steps), backend) for backend, name, steps in asked))
     free = [baseline for backend in plan.backends for baseline in _baselines(on_backend(model, backend), truth, scale, plan)]
     count = len(model.model.gaussians(model.any_camera()))
     bar = tqdm(total=len(free) + len(runs) * plan.repeats + len(RENDERERS) * plan.renderers, disable=None, desc=f"tradeoff x{scale:g}")
