@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+import warnings
 import zlib
 
 import numpy as np
@@ -125,6 +126,37 @@ def test_without_eval_every_camera_is_for_training(tmp_path):
 def test_with_eval_the_leading_cameras_are_for_testing(tmp_path):
     path = write_json(tmp_path / "cameras.json", [entry(img_name=name) for name in "abab"])
     assert [camera.split for camera in read_cameras(path, {"eval": True})] == ["test", "test", "train", "train"]
+
+
+@pytest.mark.parametrize(
+    ("names", "tests"),
+    [
+        ([f"{i:03}" for i in range(17)], ["000", "008", "016"]),  # sorted by name
+        (["000", "008", "016", *(f"{i:03}" for i in range(17) if i % 8)], ["000", "008", "016"]),  # as INRIA writes it
+        ([f"{split}_{i:03}" for split, n in (("test", 3), ("train", 14)) for i in range(n)], ["test_000", "test_001", "test_002"]),
+        ([f"{i:03}" for i in range(5)], ["000"]),
+    ],
+    ids=["sorted", "INRIA's", "named after their split", "few"],
+)
+def test_the_order_of_names_tells_which_cameras_are_for_testing(tmp_path, names, tests):
+    path = write_json(tmp_path / "cameras.json", [entry(img_name=name) for name in names])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cameras = read_cameras(path, {"eval": True})
+    assert [camera.name for camera in cameras if camera.split == "test"] == tests
+    assert [camera.index for camera in cameras if camera.split == "train"] == list(range(len(names) - len(tests)))
+
+
+def test_an_order_that_does_not_tell_the_test_cameras_is_told_of(tmp_path):
+    path = write_json(tmp_path / "cameras.json", [entry(img_name=str(i)) for i in range(17)])  # by number: 10 is before 2 where names are sorted
+    with pytest.warns(UserWarning, match="neither in the order that 3DGS writes nor sorted by name, so the first 3 of 17 are taken as the test"):
+        cameras = read_cameras(path, {"eval": True})
+    assert [camera.name for camera in cameras if camera.split == "test"] == ["0", "1", "2"]
+
+
+def test_a_capture_sorted_by_name_holds_out_what_its_photographs_do(shared_data):
+    cameras = read_cameras(shared_data / "checkpoints/captures/bird_272/cameras.json", {"eval": True})
+    assert [camera.name for camera in cameras if camera.split == "test"][:3] == ["001", "009", "017"]
 
 
 @pytest.mark.parametrize(

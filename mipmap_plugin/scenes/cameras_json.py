@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +43,12 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
         lacks = "lists no cameras" if entries == [] else "is not a list of cameras"
         raise SceneError(f"{path}: {lacks}; give the cameras.json that lies beside the checkpoint")
     names = [_name(entry, f"{path}, entry {index}") for index, entry in enumerate(entries)]
-    tests = count_test_cameras(names) if cfg.get("eval") else 0
+    tests, trained = _tests(names, path) if cfg.get("eval") else set(), count()
     cameras = []
     for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
-        camera = _camera(entry, name, "test" if index < tests else "train", f"{path}, entry {index} ({name})")
+        camera = _camera(entry, name, "test" if index in tests else "train", f"{path}, entry {index} ({name})")
         resized = camera.resized(*trained_size(camera.width, camera.height, cfg))
-        cameras.append(replace(resized, index=index - tests) if index >= tests else resized)
+        cameras.append(resized if index in tests else replace(resized, index=next(trained)))
     return cameras
 
 
@@ -66,8 +68,27 @@ def _entry(index: int, camera: Camera) -> dict[str, Any]:
     return {"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height, **where, "fy": camera.fy, "fx": camera.fx}
 
 
+def _tests(names: list[str], path: Path) -> set[int]:
+    """The places of the test cameras in a file with these names: the first ones, as INRIA writes it, or every eighth of a file sorted by name.
+
+    INRIA's readers hold out every eighth name of a COLMAP scene, and write these first, which no longer is the order of names. Warns of another
+    order of unique names, in which the test cameras may be others.
+    """
+    first = count_test_cameras(names)
+    leading, by_name = set(range(first)), sorted(names)
+    numberless = [re.sub(r"\d+", "", name) for name in names]
+    if len(set(names)) < len(names) or not {*numberless[:first]} & {*numberless[first:]}:  # Blender's, and names such as test_0 and train_0
+        return leading
+    if names == by_name:
+        return set(range(0, len(names), TEST_EVERY))
+    if {*names[:first]} != {*by_name[::TEST_EVERY]}:
+        order = "its cameras are neither in the order that 3DGS writes nor sorted by name"
+        warnings.warn(f"{path}: {order}, so the first {first} of {len(names)} are taken as the test views, which may be others", stacklevel=3)
+    return leading
+
+
 def count_test_cameras(names: list[str]) -> int:
-    """The number of test cameras; the file lists them first but does not state their number.
+    """The number of test cameras; INRIA lists them first but does not state their number.
 
     A Blender scene uses the same names for test and training views (r_0, r_1, ...), so the first repeated name
     starts the training views. In a COLMAP scene names are unique, and one view in eight is for testing.
