@@ -198,6 +198,12 @@ def test_a_warm_up_on_one_view_of_many_does_not_say_what_that_view_leaves_out():
         warm_up(model, 1 / 4, model.cameras)
 
 
+def test_a_warm_up_is_on_a_view_that_shows_something():
+    """As before a whole comparison, whose other views show the scene."""
+    model = wrap_model(tiny.model(30), cameras=[turned(tiny.cameras(1)[0], 180), *tiny.cameras(2)], backend="reference")
+    warm_up(model, 1 / 4, model.cameras)
+
+
 def test_a_view_is_known_again_by_its_pose_whatever_its_name_lens_and_digits():
     views = tiny.cameras(5)
     as_written = [replace(view.zoomed(3), viewmat=(view.viewmat * 1e4).round() / 1e4, name="other") for view in views]
