@@ -7,7 +7,6 @@ without and 32 with it.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Sessio
 from mipmap_plugin.adaptation.start.candidates import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.views import ORBITED
+from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
@@ -66,7 +66,7 @@ class Stages:
         """Adapt to `scale`; `first`: the settings of a conversion before. Raises as `Session.run` does."""
         refuse_adapted(self.request.images.model.source)
         if not self.cameras and config.views != "orbit":
-            warnings.warn(ORBITED, stacklevel=1)  # shown from wherever it was called
+            warn(ORBITED)
         refuse_broken(self.request.images.model, next(iter(self.cameras), NO_CAMERA), steps=config.steps > 0)
         if first is None:
             return Session(self.request, scale, config, self.cameras, self.photographs).run(self.resume, self.observe)
