@@ -598,6 +598,12 @@ def test_without_cameras_the_orbit_is_told_of(recwarn):
     assert not recwarn
 
 
+def test_a_base_that_is_gone_from_the_disk_is_adapted_all_the_same(tmp_path):
+    base = wrap_model(tiny.ply(tmp_path / "a.ply"), cameras=tiny.cameras(), backend="reference")
+    (tmp_path / "a.ply").unlink()
+    assert base.adapt(0.5, steps=0).report.ended_by == "0 steps"
+
+
 def test_what_was_adapted_to_another_scale_is_not_adapted_again(tmp_path):
     base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
     files = [base.adapt(scale, steps=0, viewer="antialiased").save(tmp_path / f"{scale}.ply") for scale in (0.5, 1.0)]

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tiny import cameras, model
 
-from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, whole_weights
+from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_weights, may_show, whole_weights
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
@@ -57,6 +57,17 @@ def test_the_whole_weight_of_a_sky_is_the_picture():
     camera = cameras(1)[0]
     sky = Gaussians(torch.zeros(1, 3), torch.ones(1, 4), torch.full((1, 3), 1e6), torch.ones(1), torch.zeros(1, 1, 3))
     assert whole_weights(sky, torch.ones(1), [camera], Effects(0), 1.0).item() == camera.width * camera.height
+
+
+def test_splats_of_views_that_were_not_looked_at_may_be_shown():
+    """A drive along a wall: what only other pictures hold is not known to be hidden; what none holds is."""
+    poses = torch.eye(4).repeat(6, 1, 1)
+    poses[:, 0, 3] = -torch.arange(6.0)
+    views = [Camera(8, 8, 8.0, 8.0, 4.0, 4.0, pose) for pose in poses]
+    means = torch.tensor([[0.0, 0.0, 1.0], [3.0, 0.0, 1.0], [5.0, 0.0, 1.0], [90.0, 0.0, 1.0]])
+    weights, whole = torch.tensor([0.5, 0.0, 0.0, 0.0]), torch.ones(4)
+    assert may_show(weights, whole, means, views, [views[0], views[5]]).tolist() == [True, True, False, False]
+    assert may_show(weights, whole, means, views, views).tolist() == [True, False, False, False]
 
 
 def test_what_lies_behind_the_camera_has_none():

@@ -196,6 +196,12 @@ def test_no_view_lies_between_two_parts_of_a_capture(far):
     assert not [place for place in places if 10 < place < 90]
 
 
+def test_stations_have_views_between_them_though_cameras_of_one_place_differ_by_rounding():
+    places = [x + 1e-9 * turn for x in (0.0, 1.0, 2.0) for turn in range(8)]
+    views = jittered(on_a_line(*places), 60, seeded(), amount=0.0)
+    assert [view for view in views if 0.2 < view.center[0] % 1 < 0.8]
+
+
 def test_rigs_have_views_between_them():
     """The cameras of a rig lie a hundredth apart."""
     views = jittered(on_a_line(0.0, 0.01, 0.02, 5.0, 5.01, 5.02), 60, seeded(), amount=0.0)

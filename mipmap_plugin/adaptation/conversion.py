@@ -79,7 +79,7 @@ class Stages:
             adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self._further(converted.report))
         settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if _stopped(converted.report) else {})
         its_own, given = (f"budget of {each.time_budget_s or 0:g} s" for each in (half, config))
-        ended_by = adapted.report.ended_by.replace(its_own, given)
+        ended_by = adapted.report.ended_by.replace(its_own, given).replace("which the start took", "which the conversion and the start took")
         report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings), "ended_by": ended_by})
         return replace(adapted, report=_joined(converted.report, report), states=[*converted.states, *adapted.states])
 
@@ -126,5 +126,6 @@ def _joined(first: Report, second: Report) -> Report:
     curve = [point.model_copy(update={"seconds": point.seconds + spent}) for point in second.curve]
     told = f"converted at x1 before, {first.gain()}, in {_steps(first)} steps{f', ended by {STOPPED}' if _stopped(first) else ''}"
     peaks = [peak for peak in (first.peak_memory_mib, second.peak_memory_mib) if peak is not None]
-    changes = {"seconds": seconds, "curve": curve, "notes": [*first.notes, *second.notes, told], "peak_memory_mib": max(peaks, default=None)}
+    notes = [*dict.fromkeys([*first.notes, *second.notes]), told]
+    changes = {"seconds": seconds, "curve": curve, "notes": notes, "peak_memory_mib": max(peaks, default=None)}
     return second.model_copy(update=changes)

@@ -6,7 +6,7 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -69,6 +69,7 @@ class AdaptationRequest:
 class Session:
     """One call of `adapt`: makes the parts, and runs them in order."""
 
+    notes: Sequence[str] = ()  # on what the views show of the base
     keeps_state = False  # whether the state of a run that has ended is kept too: because another one starts from what it returns
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
@@ -123,7 +124,7 @@ class Session:
         refuse_blind(self.base_views, self.base, near, self.truth)
         few = _rows(self.base) <= (self.config.most_splats or sys.maxsize)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
-            copy, reason = self.copy_of_base(), "scale 1, at which the base is right as it is"
+            copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         for remark in remarks(self.base_views, self.base, near, orbit=self._orbits):
             warn(remark)
@@ -132,7 +133,9 @@ class Session:
             splats, effects = self.base.gaussians(self.views[0]), (self.base_effects, *self.targets.values())
             merging = self.config.merge_to < 1 and self._has_blend_weights
             warm_up(self.backend, splats, effects, gradients=self._takes_steps, merging=merging, by_rows=self.base.traits.plain)
-        initial, start = StartSearch(self._start_problem()).best()
+        search = StartSearch(self._start_problem())
+        initial, start = search.best()
+        self.notes = search.notes
         states = {AS_IT_IS: self._for_target(self._base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked_steps, self.config.model_copy(update={"steps": 0}))
@@ -209,10 +212,6 @@ class Session:
         self.seconds["total"] = run.watch.seconds
         return run, run.ended_by + fewer_note(self.asked_steps, self.config) + growth_note(run)
 
-    def copy_of_base(self) -> SplatModel:
-        """A copy of the base that is rendered with the target's screen filter."""
-        return self._for_target(self.base)
-
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
         model = getattr(model, "shared", model.copy)() if shared else model.copy()
@@ -269,7 +268,7 @@ class Session:
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]
-        notes = [note for note in student.notes if note not in known]
+        notes = [*self.notes, *(note for note in student.notes if note not in known)]
         for note in notes:
             warn(note)
         return Report(

@@ -14,7 +14,7 @@ from mipmap_plugin.models.places import REPORT
 
 def adapted_scale(source: Path | None) -> float | None:
     """The scale that the file `source` was adapted to; None if it is a base. Raises CheckpointError for a damaged report beside it."""
-    if source is None:
+    if source is None or not source.is_file():  # made in memory, gone since, or a folder of another family
         return None
     report = source.with_name(source.name + REPORT)
     record = (provenance_of(read_header(source).comments) or {}) if kind_of(source) == "ply" else {}

@@ -77,7 +77,8 @@ def _tests(names: list[str], path: Path) -> set[int]:
     first = count_test_cameras(names)
     leading, by_name = set(range(first)), sorted(names)
     numberless = [re.sub(r"\d+", "", name) for name in names]
-    if len(set(names)) < len(names) or not {*numberless[:first]} & {*numberless[first:]}:  # Blender's, and names such as test_0 and train_0
+    alike = len(set(numberless)) <= len(names) / 2  # otherwise names say nothing by what they begin with
+    if len(set(names)) < len(names) or (alike and not {*numberless[:first]} & {*numberless[first:]}):  # Blender's, and test_0 and train_0
         return leading
     if names == by_name:
         return set(range(0, len(names), TEST_EVERY))

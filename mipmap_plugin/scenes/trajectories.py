@@ -32,6 +32,9 @@ BEYOND = 0.25
 # few, which may be those of a rig.
 GAP, RIG = 4.0, 4
 
+# Fraction of the distance to another place within which cameras are in one place but for rounding.
+SAME_PLACE = 1e-6
+
 # Candidates per generated view: keeping those that fill gaps gains 0.5 dB on lego's test views at x1/8.
 CANDIDATES = 16
 
@@ -148,7 +151,7 @@ def _on_arc(centers: Tensor, forwards: Tensor, along: Tensor) -> Tensor:
 def _neighbors(centers: Tensor, rotations: Tensor, index: Tensor, generator: torch.Generator) -> Tensor:
     """For each of `index` [V], a random one of the nearest cameras that look in a similar direction, [V]; itself if none does."""
     traces = rotations.flatten(1) @ rotations.flatten(1).T  # of the rotation from one to the other, 1 + 2 cos(angle)
-    distances = torch.cdist(centers, centers)
+    distances = torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")  # whose rounding tells cameras of one place apart
     distances[(traces - 1) / 2 < math.cos(SAME_DIRECTION)] = math.inf
     distances.fill_diagonal_(math.inf)
     reach = _reach(distances)
@@ -162,7 +165,7 @@ def _neighbors(centers: Tensor, rotations: Tensor, index: Tensor, generator: tor
 def _reach(distances: Tensor) -> Tensor:
     """How far each camera's own part of the capture reaches: its distance [C] before the first `GAP`, of `distances` [C, C]; infinity without one."""
     near = distances.topk(min(NEIGHBORS, len(distances)), largest=False).values
-    gaps = (near[:, 1:] > GAP * near[:, :-1]) & near[:, 1:].isfinite() & (near[:, :-1] > 0)
+    gaps = (near[:, 1:] > GAP * near[:, :-1]) & near[:, 1:].isfinite() & (near[:, :-1] > SAME_PLACE * near[:, 1:])
     gaps[:, : RIG - 1] = False
     before = torch.where(gaps, near[:, :-1], math.inf)
     reach: Tensor = torch.cat([before, torch.full_like(near[:, :1], math.inf)], 1).amin(1)

@@ -15,6 +15,7 @@ from mipmap_plugin.formats.atomic import new_file, refuse_output, refuse_unwrita
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.splatting.viewers import viewers_for
 from mipmap_plugin.tiles.folder import BASE, CUT, work_folder
@@ -31,6 +32,7 @@ def refuse(job: Job, tiles: int) -> None:
     """Raise SettingsError for what cannot be done in tiles, OutputExists and OutputError for a target that cannot be written."""
     base = find_splats(job.base.checkpoint)[0].path
     config = job.config()
+    refuse_adapted(base)
     if tiles < 2:
         raise SettingsError(f"tiles: give at least 2, got {tiles}; a scene that is not cut needs no tiles")
     if job.images is not None or job.scale > 1:

@@ -11,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin import pool
 from mipmap_plugin.adaptation.optimization.validation import mean_db
 from mipmap_plugin.adaptation.report import AS_IT_IS
-from mipmap_plugin.adaptation.start.blend_weights import whole_weights
+from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, enough_views, filter_suffices, pixel_size
 from mipmap_plugin.adaptation.start.matching import matched_opacities
@@ -91,7 +91,8 @@ class StartSearch:
 
         def merged(gaussians: Gaussians) -> Gaussians:
             pixel, whole = sizes(gaussians)
-            splats, found[0] = merge_seen(gaussians, pixel / scene.scale, weights[core], fraction, whole)
+            seen = may_show(weights[core], whole, gaussians.means, scene.views.adapted, self.views)
+            splats, found[0] = merge_seen(gaussians, pixel / scene.scale, weights[core], fraction, seen)
             return splats
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:

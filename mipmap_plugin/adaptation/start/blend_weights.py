@@ -63,6 +63,26 @@ def whole_weights(gaussians: Gaussians, pixel: Tensor, views: Sequence[Camera], 
     return gaussians.opacities * (2 * math.pi * ((a * b + b * c + c * a) / 3).sqrt()).clamp_max(picture) * scale**2
 
 
+def may_show(weights: Tensor, whole: Tensor, means: Tensor, views: Sequence[Camera], looked_at: Sequence[Camera]) -> Tensor:
+    """[N] bool: which splats views show, by their `weights` in those that were looked at, or may show: where only others have them in the picture.
+
+    `whole` [N]: `whole_weights`; `means` [N, 3].
+    """
+    seen = weights > UNSEEN * whole
+    if len(looked_at) < len(views):
+        rest = (~seen).nonzero()[:, 0]
+        seen[rest] = _pictured(means[rest], views) & ~_pictured(means[rest], looked_at)
+    return seen
+
+
+def _pictured(means: Tensor, views: Sequence[Camera]) -> Tensor:
+    """[N] bool: which means [N, 3] lie in the picture of a view."""
+    found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+    for view in views:
+        found |= view.in_picture(view.to_camera(means))
+    return found
+
+
 @torch.enable_grad()
 def _color_gradient(gray: Gaussians, view: Camera, backend: Backend, effects: Effects) -> Tensor:
     """The sum of each splat's blend weights over a view, [N], by the gradient of the colors of `gray` splats."""

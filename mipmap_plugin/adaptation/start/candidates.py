@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.start.blend_weights import UNSEEN, blend_weights, weighed, whole_weights
+from mipmap_plugin.adaptation.start.blend_weights import blend_weights, may_show, weighed, whole_weights
 from mipmap_plugin.adaptation.start.closed_form import (
     AREA_POWER,
     LEAST_VIEWS,
@@ -118,7 +118,7 @@ class StartSearch:
         self._problem, self._rounds = problem, Rounds()
         self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
-        self._notes: list[str] = []  # on what the views show of the base
+        self.notes: list[str] = []  # on what the views show of the base
         self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
         unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
@@ -186,7 +186,6 @@ class StartSearch:
     def _candidate(self, weights: Tensor | None, fraction: float, coarsely: bool = False) -> SplatModel:
         """The base in closed form, after merging its splats down to a fraction of them, or to the settings' `most_splats`."""
         problem, student = self._problem, self._problem.base()
-        student.notes.extend(self._notes)
         if fraction < 1 and weights is not None:
             with problem.phase("merging"):
                 weights = self._merge(student, weights, fraction, coarsely)
@@ -205,8 +204,8 @@ class StartSearch:
         def merged(gaussians: Gaussians) -> Gaussians:
             most = problem.config.most_splats or (math.ceil(fraction * len(gaussians)) if coarsely else None)
             if most is None:
-                whole = self._whole_weights(gaussians, self._pixel_size(gaussians.means))
-                splats, new_weights = merge_seen(gaussians, pixel_of(gaussians.means), weights, fraction, whole, self._rounds)
+                seen = self._may_show(gaussians, weights)
+                splats, new_weights = merge_seen(gaussians, pixel_of(gaussians.means), weights, fraction, seen, self._rounds)
             else:
                 splats, new_weights = merge_down(gaussians, pixel_of, weights, most)
             merged_weights.append(new_weights)
@@ -237,6 +236,11 @@ class StartSearch:
 
         return scales, matched_opacities(opacities, weights, self._whole_weights(gaussians, pixel), weights_of, rounds)
 
+    def _may_show(self, gaussians: Gaussians, weights: Tensor) -> Tensor:
+        """`may_show` of the base's splats."""
+        whole = self._whole_weights(gaussians, self._pixel_size(gaussians.means))
+        return may_show(weights, whole, gaussians.means, self._problem.views, evenly(self._problem.views, self._count))
+
     def _whole_weights(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
         problem = self._problem
         return whole_weights(gaussians, pixel, problem.views, problem.base_effects, problem.scale)
@@ -263,11 +267,10 @@ class StartSearch:
             with self._clock.timing("weights"):
                 weights, _ = over(self._count)
         weights = weights * problem.scale**2
-        whole = self._whole_weights(gaussians, self._pixel_size(gaussians.means))
         drawn = gaussians.opacities >= MIN_ALPHA
-        if (hidden := float((weights <= UNSEEN * whole)[drawn].float().mean())) > HIDDEN:
+        if (hidden := float((~self._may_show(gaussians, weights))[drawn].float().mean())) > HIDDEN:
             advice = "give cameras that show all of the scene, or look at it from where these do"
-            self._notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
+            self.notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
         return weights
 
 

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation.parallel import CHUNK, in_chunks
-from mipmap_plugin.adaptation.start.blend_weights import UNSEEN
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.eigen import eigh3
@@ -102,13 +101,9 @@ def merge(gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float,
 
 
 def merge_seen(
-    gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, whole: Tensor, rounds: Rounds | None = None
+    gaussians: Gaussians, pixel: Tensor, weights: Tensor, fraction: float, seen: Tensor, rounds: Rounds | None = None
 ) -> tuple[Gaussians, Tensor]:
-    """`merge` of the splats that views show; those that none shows, where no view would tell the harm, stay as they are, behind the others.
-
-    `whole` [N]: the weights of splats that nothing hides (`blend_weights.whole_weights`).
-    """
-    seen = weights > UNSEEN * whole
+    """`merge` of the splats that are `seen` [N]; those that no view shows, which would not tell the harm, stay as they are, behind the others."""
     if seen.all():
         return merge(gaussians, pixel, weights, fraction, rounds)
     merged, new_weights = merge(gaussians[seen], pixel[seen], weights[seen], fraction, rounds)
