@@ -84,8 +84,16 @@ def _our_warnings_only() -> Iterator[None]:
         if not sys.warnoptions:
             warnings.simplefilter("ignore")
             warnings.filterwarnings("default", module=r"mipmap_plugin(\.|$)")
-        warnings.showwarning = lambda message, *_: voice.complain(f"mipmap-plugin: {message}")  # without a place in the source
+        said: set[str] = set()
+        warnings.showwarning = lambda message, *_: _show(str(message), said)
         yield
+
+
+def _show(text: str, said: set[str]) -> None:
+    """Show a warning without its place in the source, and once: all levels of a ladder, and all scales of a checkpoint, warn of the same."""
+    if text not in said:
+        said.add(text)
+        voice.complain(f"mipmap-plugin: {text}")
 
 
 if __name__ == "__main__":

@@ -33,6 +33,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
+from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image, check_kinds, check_scale
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
@@ -240,6 +241,7 @@ class Wrapped:
         report, source = named(path).with_name(named(path).name + REPORT), self.model.source
         parts = parts_of(source, self.model.folder)
         model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
+        refuse_unread(path, viewer)
         model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
         refuse_output(report, overwrite, parts, is_file=True)
         refuse_output(state_path(path), True, parts, is_file=True)

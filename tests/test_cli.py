@@ -524,6 +524,15 @@ def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path,
     assert output.read_text() == "precious" and sorted(path.name for path in tmp_path.iterdir()) == ["base.ply", "new.ply"]
 
 
+def test_levels_without_cameras_are_told_of_once(run, tmp_path):
+    """Each of several levels is adapted to the orbit."""
+    base = tiny.ply(tmp_path / "base.ply")
+    words = ["--viewer", "playcanvas", "--coarsest", "1/8", "--steps", "0", "--backend", "cpu", "--threads", "1"]
+    code, _, err = run("levels", base, *words, "--output", tmp_path / "levels")
+    assert code == 0 and err.count("views of a generated orbit are adapted to") == 1
+    assert err.count("would change levels at the distances of a generated orbit") == 1
+
+
 def test_an_output_below_a_file_ends_in_one_sentence(run, tmp_path):
     base = tiny.ply(tmp_path / "base.ply")
     refused(run("adapt", base, "--scale", "4", "--output", base / "new.ply", *NO_STEP), "new.ply")

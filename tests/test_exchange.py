@@ -157,6 +157,14 @@ def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
+def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys):
+    (tmp_path / "phone.spz").write_bytes(SPZ)
+    words = ["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant", "--viewer", "gaussian-splats-3d"]
+    assert main(words) == 2
+    assert "reads .spz up to version 2, and splat-transform writes 3 at least; give a .ply by --output" in capsys.readouterr().err
+    assert main([*words, "--output", str(tmp_path / "phone.ply")]) == 0
+
+
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply"])
 def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tmp_path, tool, ending, capsys):
     """Normals that are not 0 too, which 3DGS does not have."""

@@ -34,7 +34,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, with_times
+from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike, with_times
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -126,7 +126,7 @@ class Session:
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
-        for remark in remarks(self.base_views, self.base, near, orbit=self._orbits):
+        for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), too_unlike(self.base_views)]):
             warn(remark)
         began = time.perf_counter()
         with self.phase("compilation"):

@@ -227,10 +227,10 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
 
 
 def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:
-    """What is wrong with views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
+    """What is wrong with a scene in views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
     least = LEAST_SHARE * min(views[0].size)
     least = least if orbit else min(LEAST_PIXELS, least)
-    found = too_near(views, model.parameters()["means"], near), too_small(views, model, near, least), too_unlike(views)
+    found = too_near(views, model.parameters()["means"], near), too_small(views, model, near, least)
     return [sentence for sentence in found if sentence]
 
 

@@ -57,7 +57,7 @@ def inspect(
 
 def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]:
     """What is known of a loaded model without a picture, by name; `whole`: with the effects that are off."""
-    from mipmap_plugin.adaptation.views import remarks
+    from mipmap_plugin.adaptation.views import remarks, too_unlike
     from mipmap_plugin.effects import explain
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
@@ -69,14 +69,15 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
         effects = explain(wrapped.effects(), gaussians, effects_of(model))
         lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
+        told = [*health.sentences(), *lost, *filter(None, [too_unlike(wrapped.views())])]
     return {
-        "verdict": _verdict(wrapped, checkpoint, [*health.sentences(), *lost], bool(lost) or health.spoilt()),
+        "verdict": _verdict(wrapped, checkpoint, told, bool(lost) or health.spoilt()),
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
         "cameras": summary(wrapped.cameras),
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
-        "health": [*health.sentences(), *lost] or ["nothing found"],
+        "health": told or ["nothing found"],
     }
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 # An orbit has pixels of its own size, so that a viewer would change levels at other distances: of lego_100 at an eleventh of them.
-NO_CAMERAS = "no cameras are beside the checkpoint: levels and their distances are made for views of a generated orbit; give the scene's --cameras"
+NO_CAMERAS = "no cameras are known: a viewer would change levels at the distances of a generated orbit; give the scene's cameras (--cameras)"
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,11 @@ READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRI
 # `table_options`.
 OLDEST: dict[str, tuple[int, ...]] = {".sog": (3, 0), ".json": (3, 0), ".spz": (2, 1)}
 
-# The last version of SPZ that Spark 2.2 and GaussianSplats3D read; splat-transform's own choice is 4.
+# The last version of SPZ that Spark 2.2 reads, and the first that splat-transform can write; its own choice is 4.
 SPZ_VERSION = "3"
+
+# Viewers that do not read it, by their source: for these a PLY has to be written.
+NO_SPZ = {"gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2"}
 
 # From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them
 # in the frame in which they are stored.
@@ -75,6 +78,12 @@ def refuse_exchange(path: Path) -> list[str]:
         newer = f"{TOOL} {_dotted(version)} is too old for it, and {_dotted(oldest)} or newer is needed{node}"
         raise SettingsError(f"{path}: {newer}; run: {INSTALL}@latest; or give{instead} a .ply")
     return tool
+
+
+def refuse_unread(path: Path, viewer: str | None) -> None:
+    """Raise SettingsError for an output that the viewer it is made for does not read."""
+    if viewer in NO_SPZ and _is_spz(path):
+        raise SettingsError(f"{path}: {NO_SPZ[viewer]}, and {TOOL} writes {SPZ_VERSION} at least; give a .ply by --output")
 
 
 def _version(tool: Sequence[str]) -> tuple[int, ...]:

@@ -151,7 +151,8 @@ def _on_arc(centers: Tensor, forwards: Tensor, along: Tensor) -> Tensor:
 def _neighbors(centers: Tensor, rotations: Tensor, index: Tensor, generator: torch.Generator) -> Tensor:
     """For each of `index` [V], a random one of the nearest cameras that look in a similar direction, [V]; itself if none does."""
     traces = rotations.flatten(1) @ rotations.flatten(1).T  # of the rotation from one to the other, 1 + 2 cos(angle)
-    distances = torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")  # whose rounding tells cameras of one place apart
+    # By differences: products of matrices round so much that cameras in one place would be apart.
+    distances = torch.cdist(centers, centers, compute_mode="donot_use_mm_for_euclid_dist")
     distances[(traces - 1) / 2 < math.cos(SAME_DIRECTION)] = math.inf
     distances.fill_diagonal_(math.inf)
     reach = _reach(distances)

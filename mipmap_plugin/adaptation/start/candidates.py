@@ -42,7 +42,6 @@ COARSE_POWERS, LEAST_DB = (1, 7 / 8, 3 / 4, 5 / 8, 1 / 2), 25.0
 # dB by which what is left may be worse than the base itself: steps regain 3 to 8 dB, of lego, of chair and of a capture. What fails is merged less.
 COARSE_COSTS = 3.0
 
-
 # The fraction of a time budget that the start may take: what it would not finish in it is left out, from the strongest merging on.
 START_SHARE = 0.5
 
@@ -118,6 +117,7 @@ class StartSearch:
         self._problem, self._rounds = problem, Rounds()
         self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
+        self._shown = torch.empty(0, dtype=torch.bool)  # of the base's splats (`may_show`), once blend weights are known
         self.notes: list[str] = []  # on what the views show of the base
         self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
         unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
@@ -204,8 +204,7 @@ class StartSearch:
         def merged(gaussians: Gaussians) -> Gaussians:
             most = problem.config.most_splats or (math.ceil(fraction * len(gaussians)) if coarsely else None)
             if most is None:
-                seen = self._may_show(gaussians, weights)
-                splats, new_weights = merge_seen(gaussians, pixel_of(gaussians.means), weights, fraction, seen, self._rounds)
+                splats, new_weights = merge_seen(gaussians, pixel_of(gaussians.means), weights, fraction, self._shown, self._rounds)
             else:
                 splats, new_weights = merge_down(gaussians, pixel_of, weights, most)
             merged_weights.append(new_weights)
@@ -236,11 +235,6 @@ class StartSearch:
 
         return scales, matched_opacities(opacities, weights, self._whole_weights(gaussians, pixel), weights_of, rounds)
 
-    def _may_show(self, gaussians: Gaussians, weights: Tensor) -> Tensor:
-        """`may_show` of the base's splats."""
-        whole = self._whole_weights(gaussians, self._pixel_size(gaussians.means))
-        return may_show(weights, whole, gaussians.means, self._problem.views, evenly(self._problem.views, self._count))
-
     def _whole_weights(self, gaussians: Gaussians, pixel: Tensor) -> Tensor:
         problem = self._problem
         return whole_weights(gaussians, pixel, problem.views, problem.base_effects, problem.scale)
@@ -267,8 +261,10 @@ class StartSearch:
             with self._clock.timing("weights"):
                 weights, _ = over(self._count)
         weights = weights * problem.scale**2
+        whole, looked_at = self._whole_weights(gaussians, self._pixel_size(gaussians.means)), evenly(problem.views, self._count)
+        self._shown = may_show(weights, whole, gaussians.means, problem.views, looked_at)
         drawn = gaussians.opacities >= MIN_ALPHA
-        if (hidden := float((~self._may_show(gaussians, weights))[drawn].float().mean())) > HIDDEN:
+        if (hidden := float((~self._shown)[drawn].float().mean())) > HIDDEN:
             advice = "give cameras that show all of the scene, or look at it from where these do"
             self.notes.append(f"no view shows {hidden:.0%} of the splats, of which the dB say nothing: {advice}")
         return weights
