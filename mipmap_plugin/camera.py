@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from operator import index
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -62,6 +64,11 @@ class Camera:
     index: int | None = None
 
     def __post_init__(self) -> None:
+        self._check_intrinsics()
+        object.__setattr__(self, "viewmat", self._pose())
+
+    def _check_intrinsics(self) -> None:
+        """Turn the intrinsics into numbers of Python. Raises SettingsError."""
         for name in ("width", "height"):
             object.__setattr__(self, name, self._number(name, index))
         for name in ("fx", "fy", "cx", "cy"):
@@ -70,7 +77,14 @@ class Camera:
         if min(self.width, self.height) < 1 or not valid:
             got = f"{self.width}x{self.height} px, fx {self.fx}, fy {self.fy}, cx {self.cx}, cy {self.cy}"
             raise SettingsError(f"camera {self.name!r}: image size and focal lengths must be positive and finite, got {got}")
-        object.__setattr__(self, "viewmat", self._pose())
+
+    def _with(self, **changes: Any) -> Camera:
+        """A copy with other intrinsics at the same pose, which was checked already: a run makes thousands of such copies."""
+        camera = copy.copy(self)
+        for name, value in changes.items():
+            object.__setattr__(camera, name, value)
+        camera._check_intrinsics()
+        return camera
 
     def _number(self, name: str, kind: Callable[[Any], Any]) -> Any:
         """One of the intrinsics as a number of Python, from one of NumPy or torch. Raises SettingsError."""
@@ -115,7 +129,7 @@ class Camera:
             pose[:3] /= scale
         return pose
 
-    @property
+    @cached_property
     def center(self) -> Tensor:
         """The camera's position in the world, [3] float64."""
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]
@@ -149,19 +163,22 @@ class Camera:
         view exactly. Raises SettingsError if `factor` is out of range.
         """
         factor = check_scale(factor)
-        resized = self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
-        return replace(resized, zoom=self.zoom * factor)
+        return self._sampled(max(1, round(self.width * factor)), max(1, round(self.height * factor)), self.zoom * factor)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same field of view at `width` x `height` px. `zoom`, and so the model's level of detail, does not change."""
+        return self._sampled(width, height, self.zoom)
+
+    def _sampled(self, width: int, height: int, zoom: float) -> Camera:
+        """`resized`, with another `zoom`."""
         x, y = width / self.width, height / self.height
-        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
+        return self._with(width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y, zoom=zoom)
 
     def window(self, width: int, height: int) -> Camera:
         """The view's central crop of at most `width` x `height` px."""
         width, height = min(width, self.width), min(height, self.height)
         left, top = (self.width - width) // 2, (self.height - height) // 2
-        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+        return self._with(width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def moved(self, similarity: Tensor) -> Camera:
         """The same view after the whole scene, this camera included, was transformed by `similarity` [4, 4] (rotation, scale, translation)."""
