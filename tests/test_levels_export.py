@@ -1,7 +1,9 @@
 """What viewers of levels read: distances of PlayCanvas's rule, geometric errors of 3D Tiles, and files through splat-transform."""
 
+import gzip
 import json
 import math
+import struct
 import sys
 from contextlib import contextmanager
 
@@ -15,11 +17,12 @@ from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.streamed import EXTENT, distances, nearer, progression, viewer_settings, write_streamed
-from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tiles
+from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tile, write_tiles
 
-# A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file of no bytes.
+# A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file of no bytes. Of an SPZ
+# it writes the header: 60 splats of degree 1.
 STAND_IN = """#!{python}
-import json, pathlib, sys
+import gzip, json, pathlib, struct, sys
 if sys.argv[1:] == ["--list-gpus"]:
     sys.exit(print({cards!r}))
 if sys.argv[1:] == ["--version"]:
@@ -28,6 +31,8 @@ if sys.argv[1:] == ["--version"]:
 print("splat-transform v3.7.0\\n    ▸ [1/2] 0_0\\n    ▸ [2/2] 1_0", file=sys.stderr)
 if any(word.endswith(".ply") and not pathlib.Path(word).stat().st_size for word in words):
     sys.exit("Invalid header")
+if target.endswith(".spz"):
+    sys.exit(pathlib.Path(target).write_bytes(gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 60, 1, 12, 0, 0))) and None)
 counts = lambda count: {{"0": {{"count": count}}, "2": {{"count": 1}}}}
 leaf = lambda x, count: {{"bound": {{"min": [x, 0, 0], "max": [x + 2, 1, 1]}}, "lods": counts(count)}}
 pathlib.Path(target).write_text(json.dumps({{"asked": words, "lodLevels": 3, "tree": {{"children": [leaf(0, 30), leaf(2, 10)]}}}}))
@@ -183,7 +188,28 @@ def test_a_terminal_shows_how_many_files_are_written(ladder, tool, monkeypatch):
 def test_tiles_are_written_with_their_files(ladder, tool):
     made = write_tiles(ladder)
     assert sorted(file.name for file in made.parent.iterdir()) == ["level_0.glb", "level_1.glb", "level_2.glb", "tileset.json"]
-    assert json.loads((made.parent / "level_1.glb").read_text())["asked"][-1] == str(ladder / "level_1.ply")
+
+
+def test_a_tile_is_a_glb_of_spz(ladder, tool, tmp_path):
+    """Its accessors have the count and the coefficients that the SPZ says, and no bytes; the only ones are the SPZ's."""
+    write_tile(ladder / "level_1.ply", tmp_path / "tile.glb")
+    content = (tmp_path / "tile.glb").read_bytes()
+    magic, version, length, text, kind = struct.unpack_from("<4sIII4s", content)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(content), b"JSON") and len(content) % 4 == text % 4 == 0
+    document, (size, kind) = json.loads(content[20 : 20 + text]), struct.unpack_from("<I4s", content, 20 + text)
+    assert kind == b"BIN\0" and gzip.decompress(content[28 + text :][: document["buffers"][0]["byteLength"]])[:4] == b"NGSP" and size % 4 == 0
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert len(primitive["attributes"]) == 4 + 3 and [each["count"] for each in document["accessors"]] == [60] * 7
+    assert not any("bufferView" in each for each in document["accessors"])
+    assert document["extensionsRequired"] == ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
+    assert not list(tmp_path.glob("*.spz"))
+
+
+def test_cesium_is_told_in_the_tileset_that_tiles_are_splats():
+    assert tileset(LADDER, [0.0] * 12)["extensions"]["3DTILES_content_gltf"]["extensionsRequired"] == [
+        "KHR_gaussian_splatting",
+        "KHR_gaussian_splatting_compression_spz_2",
+    ]
 
 
 def test_a_failed_conversion_leaves_nothing(ladder, tool):

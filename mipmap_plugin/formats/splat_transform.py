@@ -190,13 +190,6 @@ def table_options(card: str) -> list[str]:
     return ["--gpu", card] if card else ["--gpu", "cpu", "--sh-iterations", "1"]
 
 
-def convert(inputs: Sequence[str | Path], output: Path) -> None:
-    """Write `output`, in a format given by its name, from files and the options after each. Raises OutputError."""
-    tool = refuse_exchange(output)
-    if reason := _run(tool, inputs, output):
-        raise OutputError(f"{output}: {TOOL} does not write it ({reason})")
-
-
 def _run(tool: Sequence[str], inputs: Sequence[str | Path], target: Path) -> str:
     """Run splat-transform. Returns its error message, empty on success."""
     options = table_options(graphics_card(tool)) if target.suffix.lower() == ".sog" else ["--gpu", "cpu"]

@@ -2,10 +2,19 @@
 
 A tile is replaced when its geometric error, seen from the camera, has more than 16 px (Cesium's `maximumScreenSpaceError`). A level should
 be replaced at the zoom z of its switch, at which a base pixel of size p is 1 / z times as large as a pixel: its error is 16 · p / z.
+
+Cesium draws the splats of a glTF only if they are SPZ, by KHR_gaussian_splatting_compression_spz_2, and only if the tileset requires both
+extensions; it takes others for points, whose shader does not compile, and stops (1.145: GaussianSplat3DTileContent, GltfLoader). It also
+wants a matrix, and no rotation, in the node.
 """
 
 from __future__ import annotations
 
+import gzip
+import json
+import shutil
+import struct
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +22,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.formats.atomic import new_folder, write_json
-from mipmap_plugin.formats.splat_transform import convert
+from mipmap_plugin.formats.splat_transform import write_exchange
 from mipmap_plugin.levels.manifest import read_manifest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
@@ -24,9 +33,20 @@ TILES, TILESET = "tiles", "tileset.json"
 # px: Cesium's default.
 SCREEN_ERROR = 16
 
-# A point (x, y, z) of a PLY lies at (-x, -z, -y) of a tile: splat-transform turns PLYs by half a turn about z on their way to glTF, whose y is up,
-# and 3D Tiles, whose z is up, read a glTF's (x, y, z) as (x, -z, y).
+# A point (x, y, z) of a PLY lies at (-x, -z, -y) of a tile: the node turns it by half a turn about z, as glTF's y is up, and 3D Tiles, whose z is
+# up, read a glTF's (x, y, z) as (x, -z, y).
 AXES = (0, 2, 1)
+HALF_TURN = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+
+SPLATTING, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
+EXTENSIONS = {"extensionsUsed": [SPLATTING, COMPRESSION], "extensionsRequired": [SPLATTING, COMPRESSION]}
+
+# The header of an SPZ file, inside its gzip: magic number, version, count of splats, SH degree (github.com/nianticlabs/spz, 3).
+SPZ_HEADER = struct.Struct("<IIIB")
+
+# glTF 2.0: the codes of types of numbers, and the magic numbers of a GLB and its two chunks.
+BYTE, FLOAT = 5121, 5126
+GLB, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 
 # Standard deviations at which a splat ends, for bounding boxes.
 REACH = 3.0
@@ -46,16 +66,51 @@ def tileset(manifest: dict[str, Any], box: list[float]) -> dict[str, Any]:
         tile = {"boundingVolume": {"box": box}, "geometricError": error, "refine": "REPLACE", "content": content, **finer}
     # Beyond this error nothing would be shown; the coarsest level is shown from any distance.
     farthest = 1e9 * max(1.0, tile["geometricError"])
-    return {"asset": {"version": "1.1"}, "geometricError": farthest, "root": tile}
+    said = {"extensionsUsed": ["3DTILES_content_gltf"], "extensions": {"3DTILES_content_gltf": EXTENSIONS}}
+    return {"asset": {"version": "1.1"}, **said, "geometricError": farthest, "root": tile}
 
 
 def bounding_box(model: SplatModel) -> list[float]:
     """The box around all splats as 3D Tiles write it: its center, then half of each of its three axes."""
-    splats = model.gaussians(wrap_model(model).any_camera()).detach()
-    reach: Tensor = REACH * splats.scales.max(dim=1).values[:, None]
-    low, high = (splats.means - reach).amin(dim=0), (splats.means + reach).amax(dim=0)
+    low, high = _bounds(model, REACH)
     center, half = (each[list(AXES)] for each in ((low + high) / -2, (high - low) / 2))
     return [*center.tolist(), *torch.diag(half).flatten().tolist()]
+
+
+def _bounds(model: SplatModel, reach: float) -> tuple[Tensor, Tensor]:
+    """The least and the greatest coordinates of all splats, [3] each, `reach` standard deviations beyond their centers."""
+    splats = model.gaussians(wrap_model(model).any_camera()).detach()
+    beyond: Tensor = reach * splats.scales.max(dim=1).values[:, None]
+    return (splats.means - beyond).amin(dim=0), (splats.means + beyond).amax(dim=0)
+
+
+def write_tile(ply: Path, tile: Path) -> None:
+    """Write a GLB of the splats of a PLY. Raises SettingsError without splat-transform, OutputError."""
+    compressed = tile.with_suffix(".spz")
+    write_exchange(compressed, partial(shutil.copyfile, ply), overwrite=False)
+    low, high = _bounds(load_model(ply), 0.0)
+    tile.write_bytes(glb(compressed.read_bytes(), low.tolist(), high.tolist()))
+    compressed.unlink()
+
+
+def glb(spz: bytes, low: list[float], high: list[float]) -> bytes:
+    """A binary glTF of splats in SPZ, whose centers lie between `low` and `high`. Accessors have no bytes of their own: SPZ has them all."""
+    _, _, count, degree = SPZ_HEADER.unpack_from(gzip.decompress(spz))
+    types = {"POSITION": "VEC3", "COLOR_0": "VEC4", f"{SPLATTING}:ROTATION": "VEC4", f"{SPLATTING}:SCALE": "VEC3"}
+    types |= {f"{SPLATTING}:SH_DEGREE_{band}_COEF_{n}": "VEC3" for band in range(1, degree + 1) for n in range(2 * band + 1)}
+    more: dict[str, dict[str, Any]] = {"POSITION": {"min": low, "max": high}, "COLOR_0": {"componentType": BYTE, "normalized": True}}
+    accessors = [{"componentType": FLOAT, "count": count, "type": kind, **more.get(name, {})} for name, kind in types.items()]
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "extensions": {COMPRESSION: {"bufferView": 0}}}
+    primitive = {"mode": 0, "attributes": {name: i for i, name in enumerate(types)}, "extensions": {SPLATTING: splats}}
+    document = {
+        "asset": {"version": "2.0"}, **EXTENSIONS, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "matrix": HALF_TURN}],
+        "meshes": [{"primitives": [primitive]}], "accessors": accessors,
+        "bufferViews": [{"buffer": 0, "byteLength": len(spz)}], "buffers": [{"byteLength": len(spz)}],
+    }  # fmt: skip
+    text = json.dumps(document).encode()
+    chunks = [(JSON_CHUNK, text + b" " * (-len(text) % 4)), (BINARY_CHUNK, spz + b"\0" * (-len(spz) % 4))]
+    body = b"".join(struct.pack("<I4s", len(content), kind) + content for kind, content in chunks)
+    return struct.pack("<4sII", GLB, 2, 12 + len(body)) + body
 
 
 def write_tiles(folder: Path, *, overwrite: bool = False) -> Path:
@@ -67,6 +122,6 @@ def write_tiles(folder: Path, *, overwrite: bool = False) -> Path:
     box = bounding_box(load_model(folder / manifest["levels"][0]["file"]))
     with new_folder(folder / TILES, overwrite) as temporary:
         for number, level in enumerate(manifest["levels"]):
-            convert([folder / level["file"]], temporary / f"level_{number}.glb")
+            write_tile(folder / level["file"], temporary / f"level_{number}.glb")
         write_json(temporary / TILESET, tileset(manifest, box), overwrite=False)
     return folder / TILES / TILESET
