@@ -55,7 +55,6 @@ class Packing:
     quats: Literal["octahedral", "stereographic"] | None = None  # `splatting.packing`
     half_means: bool = False  # float16, in the world and again relative to the eye
 
-
     def __post_init__(self) -> None:
         check("packing", self, OF_PACKING, optional=frozenset({"color", "log_scales", "quats"}))
 
@@ -76,7 +75,8 @@ class RenderSettings:
     max_color: float | None = None  # limit of a splat's color, in each channel
     color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are rounded to multiples of these
     radial: bool = False  # splats are sorted by their distance to the eye instead of by depth
-    bucketed: bool = False  # splats are sorted by PlayCanvas's buckets of depth (`splatting.buckets`)
+    bucketed: bool = False  # splats are sorted by PlayCanvas's buckets of depth (`splatting.buckets`),
+    evenly_bucketed: bool = False  # or by Babylon.js's, which are all of one length
     min_variance: float = 0.0  # px², after dilation: splats whose variance along their longer axis is less are culled,
     boxed: bool = False  # or, if this is set, whose larger variance along x and y is less; `max_half_axis` then limits those too
     min_contribution: float = 0.0  # px², after dilation: splats whose opacity · sqrt(det) is less are culled
@@ -94,8 +94,8 @@ class RenderSettings:
             raise SettingsError(f"render settings: packing must be a Packing, or None, got {type(self.packing).__name__}")
         if self.fades and self.radius is None:
             raise SettingsError("`fades` needs the radius at which a splat falls to 0; give radius, such as 8**0.5")
-        if self.radial and self.bucketed:
-            raise SettingsError("`radial` and `bucketed` are different orders of splats; give only one of them")
+        if self.radial + self.bucketed + self.evenly_bucketed > 1:
+            raise SettingsError("`radial`, `bucketed` and `evenly_bucketed` are different orders of splats; give only one of them")
         if self.radius is None and (self.fits_picture or self.max_half_axis < math.inf):
             raise SettingsError("`max_half_axis` and `fits_picture` need the radius at which a splat ends; give radius, such as 8**0.5")
 
@@ -264,7 +264,8 @@ def _viewer_effects(settings: RenderSettings) -> list[Effect]:
          "a comparison per channel and splat"),
         ("order by distance", settings.radial, "splats are sorted by their distance to the eye", "splats are sorted by depth",
          "a square root per splat"),
-        ("coarse order", settings.bucketed, "splats in the same bucket of depth are not sorted", "the order is exact", "a sort of all splats"),
+        ("coarse order", settings.bucketed or settings.evenly_bucketed, "splats in the same bucket of depth are not sorted", "the order is exact",
+         "a sort of all splats"),
         ("rounded picture", settings.picture_step is not None, "8 bits after each splat", "rounded only for display", "another copy of the image"),
         ("packing", rounded, "the viewer keeps rounded splats", "splats are not rounded", "a rounding for each number of a splat"),
     ]  # fmt: skip

@@ -19,7 +19,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import USUAL, Effects, RenderSettings, explain
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.buckets import ranks
+from mipmap_plugin.splatting.buckets import even_ranks, ranks
 from mipmap_plugin.splatting.packing import packed
 from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer
 from mipmap_plugin.wrap import Wrapped
@@ -93,7 +93,8 @@ def test_cesium_drops_splats_smaller_than_two_of_its_pixels(backend):
 
 @BOTH
 @pytest.mark.parametrize(
-    ("viewer", "more"), [("playcanvas", 0.075), ("gaussian-splats-3d", 0.3), ("cesium", 0.01875), ("babylon", 0.075), ("antimatter15", 0.0)]
+    ("viewer", "more"),
+    [("playcanvas", 0.075), ("gaussian-splats-3d", 0.3), ("cesium", 0.01875), ("babylon", 0.075), ("gsplat-js", 0.075), ("antimatter15", 0.0)],
 )
 def test_a_viewer_dilates_by_its_own_variance(backend, viewer, more):
     rendered = alpha(backend, viewer, splat(4.0, 1.0, 0.8))
@@ -189,7 +190,9 @@ def weight(dx: float, dy: float, across: float, down: float) -> float:
 
 
 @BOTH
-@pytest.mark.parametrize(("viewer", "most"), [("spark", 512), ("gaussian-splats-3d", 1024), ("antimatter15", 1024)])
+@pytest.mark.parametrize(
+    ("viewer", "most"), [("spark", 512), ("gaussian-splats-3d", 1024), ("antimatter15", 1024), ("babylon", 1024), ("cesium", 512)]
+)
 def test_half_axes_are_limited_as_the_viewer_does(backend, viewer, most):
     """Root of eight standard deviations are a half-axis: its variance is at most most²/8, and the other's stays."""
     effects = find_viewer(viewer).effects(Effects(0))
@@ -358,9 +361,37 @@ def test_playcanvas_does_not_sort_within_a_bucket(backend):
     assert drawn[2] > 0.9 and drawn[3] < 0.1
 
 
+def test_buckets_of_babylon_are_even():
+    """1025 buckets over 1024 units of depth: one unit each, wherever the camera is. Within one the earlier row is in front."""
+    depths = torch.tensor([0.0, 1024.0, 500.9, 500.1, 499.9])
+    means = torch.cat([torch.zeros(5, 2), depths[:, None]], 1)
+    places = even_ranks(Gaussians(means, torch.ones(5, 4), torch.ones(5, 3), torch.ones(5), torch.zeros(5, 1, 3)), camera())
+    assert places.tolist() == [0, 4, 2, 3, 1]
+
+
+@BOTH
+def test_babylon_does_not_sort_within_a_bucket(backend):
+    """Beside a center so far away that two splats share a bucket, the first row is in front, though it is behind."""
+    rows = (splat(40.0, 40.0, 1.0, 0.0, means=(0.0, 0.0, 10.01)), splat(40.0, 40.0, 1.0, 1.0, means=(0.0, 0.0, 10.0)))
+    far = splat(1.0, 1.0, means=(0.0, 0.0, -1e4))
+    drawn = []
+    for parts in (rows, (*rows, far)):
+        together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(far) if f.name != "covariances"))
+        drawn.append(backend.render(together, camera(), find_viewer("babylon").effects(Effects(0))).image[MIDDLE, MIDDLE, 0].item())
+    assert drawn[0] > 0.9 and drawn[1] < 0.1
+
+
+@BOTH
+def test_babylon_limits_colors_to_those_of_the_frame_buffer(backend):
+    drawn = {name: backend.render(splat(900.0, 900.0, 0.5, 3.0), camera(), find_viewer(name).effects(Effects(0))) for name in ("babylon", "classic")}
+    middle = {name: rendered.image[MIDDLE, MIDDLE, 0].item() for name, rendered in drawn.items()}
+    assert middle == pytest.approx({"babylon": 0.5, "classic": 1.5}, abs=0.01)
+
+
 def test_the_order_is_one_or_the_other():
-    with pytest.raises(SettingsError, match="`radial` and `bucketed` are different orders"):
-        RenderSettings(radial=True, bucketed=True)
+    for orders in ({"radial", "bucketed"}, {"bucketed", "evenly_bucketed"}):
+        with pytest.raises(SettingsError, match="`radial`, `bucketed` and `evenly_bucketed` are different orders"):
+            RenderSettings(**dict.fromkeys(orders, True))
 
 
 # Pictures of 8 bits

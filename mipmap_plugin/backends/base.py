@@ -25,6 +25,7 @@ SETTINGS = {
     "color_steps": "rounded colors",
     "radial": "sorting by distance",
     "bucketed": "sorting by buckets of depth",
+    "evenly_bucketed": "sorting by even buckets of depth",
     "min_variance": "culling by size",
     "boxed": "culling by size along x and y",
     "min_contribution": "culling by contribution",
@@ -38,9 +39,10 @@ SETTINGS = {
 }
 
 # Those that screen filters that integrate support; the others depend on a splat's weight at a point.
-WITH_INTEGRALS = frozenset(
-    {"min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps", "radial", "bucketed", "frozen_beyond", "frame", "packing"}
-)
+WITH_INTEGRALS = frozenset({
+    *("min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps"),
+    *("radial", "bucketed", "evenly_bucketed", "frozen_beyond", "frame", "packing"),
+})
 
 # Incremented when `Backend.render` or the records below change in a way that breaks existing backends.
 API_VERSION = 1

@@ -13,9 +13,10 @@ from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import INTEGRATED, Effects
+from mipmap_plugin.effects import INTEGRATED, Effects, RenderSettings
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.buckets import ranks_for
 from mipmap_plugin.splatting.packing import packed
 
 NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
@@ -41,7 +42,7 @@ class CpuBackend:
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""
         missing = [] if importlib.util.find_spec("numba") else [NO_NUMBA]
-        supported = {"max_color", "color_steps", "radial", "bucketed", "frozen_beyond", "packing"}
+        supported = {"max_color", "color_steps", "radial", "bucketed", "evenly_bucketed", "frozen_beyond", "packing"}
         changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - supported
         unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
         return missing + self.capabilities.lacking(needs) + unsupported
@@ -86,7 +87,7 @@ class CpuBackend:
             raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
         packing = effects.settings.packing
         g = gaussians if packing is None else packed(gaussians, camera, packing)
-        ranks = _ranks(gaussians, camera) if effects.settings.bucketed else None
+        ranks = _ranks(gaussians, camera, effects.settings)
         return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), ranks
 
 
@@ -102,8 +103,11 @@ def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[flo
     return torch.from_numpy(nearest), torch.from_numpy(least)
 
 
-def _ranks(gaussians: Gaussians, camera: Camera) -> Any:
-    """`splatting.buckets.ranks`, compiled."""
+def _ranks(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Any:
+    """`splatting.buckets.ranks_for`; compiled for PlayCanvas's, in whose order many steps of a portable file are drawn."""
+    if not settings.bucketed:
+        found = ranks_for(settings, gaussians, camera)
+        return None if found is None else found.numpy()
     _drawing()  # reports what numba lacks
     from mipmap_plugin.backends.cpu_kernels import bucketing
 

@@ -37,7 +37,7 @@ class ReferenceBackend:
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Only the splats that can touch the image take part in the gradient graph."""
         settings = effects.settings
-        ranks = buckets.ranks(gaussians, camera) if settings.bucketed else None
+        ranks = buckets.ranks_for(settings, gaussians, camera)
         if settings.packing is not None:
             gaussians = packed(gaussians, camera, settings.packing)
         with torch.no_grad():

@@ -1,7 +1,7 @@
-"""The approximate depth order of PlayCanvas on WebGL: a counting sort of splats into buckets of depth.
+"""The approximate depth order of PlayCanvas on WebGL and of Babylon.js: a counting sort of splats into buckets of depth.
 
-Source: playcanvas 2.23.3, gsplat-unified-sort-worker and gsplat-sort-bin-weights. Splats of one bucket keep the order of the rows
-in memory, which is Morton order.
+Sources: playcanvas 2.23.3, gsplat-unified-sort-worker and gsplat-sort-bin-weights; @babylonjs/core 9.35.0, gaussianSplattingSortWorker.
+Splats of one bucket keep the order of the rows in memory, which in PlayCanvas is Morton order.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import RenderSettings
 from mipmap_plugin.gaussians import Gaussians
 
 # The depth range of a box around all splats, BOX standard deviations beyond their centers, is cut into BINS bins of equal length.
@@ -51,6 +52,31 @@ def ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
     return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device)).int()
 
 
+@torch.no_grad()
+def even_ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """As `ranks`, by buckets that divide the depths from the nearest center to the farthest evenly. Within a bucket the earlier row is in front."""
+    means = gaussians.means.double().nan_to_num(0.0, 0.0, 0.0)
+    if not len(means):
+        return torch.zeros(0, dtype=torch.int32, device=means.device)
+    depths = ((means - camera.center.to(means)) * camera.viewmat[2, :3].to(means)).sum(1)
+    farthest = depths.max()
+    extent = (farthest - depths.min()).clamp_min(torch.finfo(means.dtype).tiny)
+    order = (-((farthest - depths) * 2 ** bucket_bits(len(means)) / extent).long()).argsort(stable=True)
+    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device)).int()
+
+
+def ranks_for(settings: RenderSettings, gaussians: Gaussians, camera: Camera) -> Tensor | None:
+    """The ranks by the buckets of these settings; None if splats are sorted exactly."""
+    if settings.bucketed:
+        return ranks(gaussians, camera)
+    return even_ranks(gaussians, camera) if settings.evenly_bucketed else None
+
+
+def bucket_bits(count: int) -> int:
+    """b, for `count` splats in 2^b + 1 buckets."""
+    return min(max(round(math.log2(count / 4)), LEAST_BITS), MOST_BITS)
+
+
 class DepthScale(NamedTuple):
     """The bins of a view, from the farthest to the nearest, and the buckets of each."""
 
@@ -66,7 +92,7 @@ def depth_scale(box: Tensor, count: int, camera: Camera) -> DepthScale:
     nearest, farthest = map(float, (corners @ camera.viewmat[2, :3].to(box)).aminmax())
     extent = max(farthest - nearest, torch.finfo(box.dtype).tiny)
     own = int(min(max(farthest / extent * BINS, 0), BINS - 1))  # the camera's bin
-    most = 2 ** min(max(round(math.log2(count / 4)), LEAST_BITS), MOST_BITS) + 1
+    most = 2 ** bucket_bits(count) + 1
     weights = [next(weight for reach, weight in WEIGHTS if abs(i - own) <= reach) for i in range(BINS)]
     counts = [max(1, weight * most // sum(weights)) for weight in weights]
     counts[-1] = max(1, counts[-1] - max(0, sum(counts) - most))

@@ -94,6 +94,8 @@ INRIA_UNLIKE = "INRIA ends a splat at three standard deviations, rounded up to t
 # RGBA of 8 bits, colors of SH degree 0 within 0..1.
 EIGHT_BITS = Packing(color=1 / 255)
 
+FRONT_TO_BACK = "covariances are stored in float16, quaternions in 8 bits, and the picture is rounded from the front to the back"
+
 BUILT_IN = (
     Viewer(
         "classic", "3DGS: INRIA's viewer, gsplat, nerfstudio", "diff-gaussian-rasterization; gsplat 1.5, rasterize_mode classic",
@@ -135,18 +137,23 @@ BUILT_IN = (
     ),
     Viewer(
         "antimatter15", "antimatter15/splat", "antimatter15/splat ba182b5, main.js", "classic", 0.0,
-        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS), sh_degree=0,
-        unlike="covariances are stored in float16; not compared with its images",
+        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS), sh_degree=0, unlike=FRONT_TO_BACK,
     ),
     Viewer(
-        "cesium", "Cesium", "@cesium/engine 24.0.0, PrimitiveGaussianSplat shaders; cesium-wasm-utils, wasm-splats", "classic", DILATION / 16,
-        replace(WEBGL, frame=1.2, min_variance=PIXEL_SIZE, packing=EIGHT_BITS),
-        unlike="a splat ends at a square instead of an ellipse, and covariances are stored in float16; not compared with its images",
+        "gsplat-js", "gsplat.js", "gsplat 1.2.9, RenderProgram, PLYLoader, sort.cpp", "classic", DILATION / 4,
+        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS), sh_degree=0, unlike=FRONT_TO_BACK,
     ),
     Viewer(
-        "babylon", "Babylon.js", "@babylonjs/core 9.34.0, gaussianSplatting shaders, GaussianSplattingMaterial", "classic", DILATION / 4,
-        replace(WEBGL, frame=1.2, packing=EIGHT_BITS),
-        unlike="covariances are stored in float16 and SH coefficients in 8 bits; not compared with its images",
+        "cesium", "Cesium", "@cesium/engine 26.3.0, PrimitiveGaussianSplat shaders; cesium-wasm-utils, wasm-splats", "classic", DILATION / 16,
+        replace(WEBGL, frame=1.2, max_half_axis=512.0, min_variance=PIXEL_SIZE, packing=EIGHT_BITS),
+        unlike="a splat ends at a square instead of an ellipse, covariances are stored in float16, and its tiles are SPZ, which rounds splats",
+    ),
+    Viewer(
+        # Colors are limited by the frame buffer, which they reach before they are multiplied by alpha.
+        "babylon", "Babylon.js", "@babylonjs/core 9.35.0, gaussianSplatting shaders, GaussianSplattingMaterial", "classic", DILATION / 4,
+        replace(WEBGL, evenly_bucketed=True, frame=1.2, max_half_axis=1024.0, max_color=1.0, packing=EIGHT_BITS),
+        unlike="covariances are stored in float16, quaternions and SH coefficients in 8 bits; an SPZ file that says it was trained with "
+        "antialiasing is drawn with compensation",
     ),
     Viewer(
         "unity", "UnityGaussianSplatting (aras-p)", "UnityGaussianSplatting 1.1.1 (2c6fed3), RenderGaussianSplats, GaussianSplatting.hlsl",

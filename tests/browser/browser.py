@@ -46,6 +46,8 @@ VIEWERS: dict[str, tuple[str, dict[str, Any]]] = {
     "playcanvas-webgpu": ("playcanvas", {"device": "webgpu"}),
     "playcanvas-aa": ("playcanvas", {"antiAlias": True}),
     "gaussian-splats-3d": ("gaussian-splats-3d", {}),
+    "babylon": ("babylon", {}),
+    "gsplat-js": ("gsplat", {}),
 }
 
 
@@ -66,7 +68,7 @@ def missing() -> str:
     """What the tests of viewers lack here, in a sentence; empty where nothing is missing."""
     if lacking := missing_browser():
         return lacking
-    if not (HERE / "node_modules" / "playcanvas").is_dir():
+    if not all((HERE / "node_modules" / package).is_dir() for package in ("playcanvas", "gsplat")):
         return "the viewers are not installed; `npm ci` in tests/browser brings them"
     return ""
 

@@ -20,11 +20,12 @@ pytestmark = pytest.mark.browser
 
 WHITE = (1.0, 1.0, 1.0)
 
-# dB. What is left is rounding.
-ALIKE = 45.0
+# dB. What is left is rounding; gsplat.js rounds its picture from the front to the back, and keeps rotations in 8 bits.
+ALIKE, ALIKE_IN = 45.0, {"gsplat-js": 42.0}
 
-# dB, amid splats larger than the picture and beside it: 39 to 49 in PlayCanvas on WebGPU, for no known reason.
-SURROUNDED = {"playcanvas-webgpu": 42.0}
+# dB, amid splats larger than the picture and beside it: 39 to 49 in PlayCanvas on WebGPU, for no known reason, and 43 in Babylon.js, which
+# keeps rotations in 8 bits.
+SURROUNDED = ALIKE_IN | {"playcanvas-webgpu": 42.0, "babylon": 42.0}
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +38,14 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def blob(tmp_path: Path) -> Path:
-    """Red, opaque, round splats around (0.3, -0.2, 0.5), 0.05 wide: twenty, for GaussianSplats3D draws nothing of a file with one or two."""
-    row = dict(x=0.3, y=-0.2, z=0.5, f_dc_0=1.7, f_dc_1=-1.7, f_dc_2=-1.7, opacity=6.0, rot_0=1.0, rot_1=0.0, rot_2=0.0, rot_3=0.0)
-    row |= {f"scale_{axis}": float(np.log(0.05)) for axis in range(3)}
+    """Red, opaque splats around (0.3, -0.2, 0.5), 0.05 wide: twenty, for GaussianSplats3D draws nothing of a file with one or two, and turned and
+    at different depths, for gsplat.js draws nothing of splats that are round, or all at one depth.
+    """
+    row = dict(x=0.3, y=-0.2, z=0.5, f_dc_0=1.7, f_dc_1=-1.7, f_dc_2=-1.7, opacity=6.0, rot_0=1.0, rot_1=0.3, rot_2=0.0, rot_3=0.0)
+    row |= {f"scale_{axis}": float(np.log(width)) for axis, width in enumerate((0.05, 0.045, 0.05))}
     columns = {name: np.full(20, value, np.float32) for name, value in row.items()}
-    columns["x"] += np.linspace(-0.01, 0.01, 20, dtype=np.float32)
+    for axis in "xz":
+        columns[axis] += np.linspace(-0.01, 0.01, 20, dtype=np.float32)
     return write_ply(tmp_path / "blob.ply", columns)
 
 
@@ -101,7 +105,7 @@ def test_a_view_that_takes_too_long_is_given_up_in_a_sentence(browser: Browser, 
 @pytest.mark.parametrize("viewer", VIEWERS)
 def test_the_demo_looks_as_we_say(browser: Browser, viewer: str) -> None:
     base = embedded()
-    assert likeness(browser, viewer, base, at(base.cameras[:2], 1 / 2)) > ALIKE
+    assert likeness(browser, viewer, base, at(base.cameras[:2], 1 / 2)) > ALIKE_IN.get(viewer, ALIKE)
 
 
 @pytest.mark.parametrize("viewer", VIEWERS)
@@ -109,14 +113,14 @@ def test_an_adapted_file_looks_as_we_say(browser: Browser, viewer: str, tmp_path
     base = embedded()
     base.adapt(1 / 4, recipe="instant").save(tmp_path / "adapted.ply")
     adapted = wrap_model(tmp_path / "adapted.ply", background=WHITE)
-    assert likeness(browser, viewer, adapted, at(base.cameras[:2], 1 / 4)) > ALIKE
+    assert likeness(browser, viewer, adapted, at(base.cameras[:2], 1 / 4)) > ALIKE_IN.get(viewer, ALIKE)
 
 
 @pytest.mark.parametrize("viewer", VIEWERS)
 @pytest.mark.parametrize(("name", "scale"), [("lego_200", 1.0), ("lego_200", 1 / 4), ("chair_400", 1 / 2)])
 def test_a_real_base_looks_as_we_say(browser: Browser, shared_data: Path, viewer: str, name: str, scale: float) -> None:
     base = wrap_model(shared_data / "checkpoints" / "bases" / name)
-    assert likeness(browser, viewer, base, at(base.cameras[0:200:80], scale)) > ALIKE
+    assert likeness(browser, viewer, base, at(base.cameras[0:200:80], scale)) > ALIKE_IN.get(viewer, ALIKE)
 
 
 @pytest.mark.parametrize("viewer", VIEWERS)
@@ -134,7 +138,7 @@ def test_a_column_filter_3d_is_not_read(browser: Browser, viewer: str, tmp_path:
     path = write_ply(tmp_path / "mip.ply", {**columns, "filter_3D": np.full(len(columns["x"]), 0.02, np.float32)})
     model, views = wrap_model(path, background=WHITE), at(base.cameras[:1], 1 / 2)
     assert model.model.family == "mip"
-    assert likeness(browser, viewer, model, views) > ALIKE
+    assert likeness(browser, viewer, model, views) > ALIKE_IN.get(viewer, ALIKE)
     assert likeness(browser, viewer, wrap_model(model.model.fused(), background=WHITE), views, path) < ALIKE - 10
 
 

@@ -115,12 +115,12 @@ def ruled(rule: RenderSettings, seed: int = 1) -> HardCase:
     return case._replace(effects=replace(case.effects, settings=rule))
 
 
-def in_buckets() -> HardCase:
-    """A splat behind the camera, so large that the depths of all others share few buckets."""
+def in_buckets(settings: RenderSettings, depth: float) -> HardCase:
+    """A splat behind the camera, so large or so far that the depths of all others share few buckets."""
     case = random_scene(1, "classic", DILATION)
     first = torch.tensor(0)
-    rows = {name: getattr(case.gaussians, name).index_put((first,), value) for name, value in _row(means=(0.0, 0.0, -5.0), scales=1e3).items()}
-    return HardCase(replace(case.gaussians, **rows), case.camera, replace(case.effects, settings=RenderSettings(bucketed=True)))
+    rows = {name: getattr(case.gaussians, name).index_put((first,), value) for name, value in _row(means=(0.0, 0.0, depth), scales=1e3).items()}
+    return HardCase(replace(case.gaussians, **rows), case.camera, replace(case.effects, settings=settings))
 
 
 def with_covariances(screen_filter: str, broken: bool = False) -> HardCase:
@@ -283,7 +283,8 @@ CASES: dict[str, Builder] = {
         if viewer.eps2d or not name.startswith("needle")  # without any dilation its width is lost in float32
     },
     "rule-rounded-picture": in_a_rounded_picture,
-    "rule-buckets": in_buckets,
+    "rule-buckets": partial(in_buckets, RenderSettings(bucketed=True), -5.0),
+    "rule-even-buckets": partial(in_buckets, RenderSettings(evenly_bucketed=True), -1e3),
     **{f"rule-{name}": partial(ruled, rule) for name, rule in RULES.items()},
     "nan-in-covariances": partial(with_covariances, "classic", broken=True),
     **{

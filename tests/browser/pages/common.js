@@ -19,10 +19,12 @@ export async function drawUntil(settled, frame) {
 }
 
 // The canvas' pixels as base64 of RGBA bytes, the bottom row first; to be asked for in the task that drew them.
-export function readPixels(gl, { width, height }) {
-  const bytes = new Uint8Array(width * height * 4)
+// `behind`: the color of the page behind a canvas that is transparent, 0..1.
+export function readPixels(gl, { width, height }, behind = null) {
+  const bytes = new Uint8ClampedArray(width * height * 4)
   gl.bindFramebuffer(gl.FRAMEBUFFER, null)
-  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes)
+  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(bytes.buffer))
+  if (behind) for (let i = 0; i < bytes.length; i++) if (i % 4 < 3) bytes[i] += (255 - bytes[i - (i % 4) + 3]) * behind[i % 4]
   return base64(bytes)
 }
 
