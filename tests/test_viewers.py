@@ -388,6 +388,13 @@ def test_babylon_limits_colors_to_those_of_the_frame_buffer(backend):
     assert middle == pytest.approx({"babylon": 0.5, "classic": 1.5}, abs=0.01)
 
 
+def test_a_viewer_without_a_record_is_refused_with_what_to_take_instead():
+    for name, instead in (("polycam", "take portable"), ("viser", "classic is closest")):
+        with pytest.raises(SettingsError, match=f"^viewer {name}: .*{instead}"):
+            find_viewer(name)
+    assert find_viewer("nerfstudio") is find_viewer("classic")
+
+
 def test_the_order_is_one_or_the_other():
     for orders in ({"radial", "bucketed"}, {"bucketed", "evenly_bucketed"}):
         with pytest.raises(SettingsError, match="`radial`, `bucketed` and `evenly_bucketed` are different orders"):
@@ -517,7 +524,7 @@ def test_supersplat_is_playcanvas_and_every_record_is_under_its_name():
 
 
 def test_the_error_for_an_unknown_viewer_names_the_known_ones():
-    with pytest.raises(SettingsError, match=r"there is no 'sparks'; choose from antialiased, .*, spark, supersplat"):
+    with pytest.raises(SettingsError, match=r"there is no 'sparks'; choose from aframe, antialiased, .*, spark, supersplat"):
         find_viewer("sparks")
 
 

@@ -11,6 +11,7 @@ import contextlib
 import math
 import re
 from dataclasses import dataclass, replace
+from typing import Any
 
 from mipmap_plugin.allowed import OF_VIEWER, check
 from mipmap_plugin.effects import DILATION, FRUSTUM_MARGIN, NEAR_PLANE, USUAL, Effects, Packing, RenderSettings
@@ -144,6 +145,16 @@ BUILT_IN = (
         replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS), sh_degree=0, unlike=FRONT_TO_BACK,
     ),
     Viewer(
+        "three", "three.js, GaussianSplat", "three 0.187.0, examples/jsm/objects/GaussianSplat", "mip", DILATION,
+        replace(WEBGL, radius=2.0, frame=1.4, max_half_axis=2048.0, max_color=1.0, packing=Packing(color=1 / 255, bands=(1 / 128,) * 3)),
+        unlike="splats in the same of 4096 buckets of depth are not sorted; colors are the file's if the renderer's outputColorSpace is linear",
+    ),
+    Viewer(
+        "aframe", "aframe-gaussian-splatting", "aframe-gaussian-splatting b50238f, index.js", "classic", DILATION,
+        replace(WEBGL, frame=1.2, max_half_axis=2048.0, packing=EIGHT_BITS), sh_degree=0,
+        unlike="covariances are stored in 16 bits, quaternions in 8; not compared with its images",
+    ),
+    Viewer(
         "cesium", "Cesium", "@cesium/engine 26.3.0, PrimitiveGaussianSplat shaders; cesium-wasm-utils, wasm-splats", "classic", DILATION / 16,
         replace(WEBGL, frame=1.2, max_half_axis=512.0, min_variance=PIXEL_SIZE, packing=EIGHT_BITS),
         unlike="a splat ends at a square instead of an ellipse, covariances are stored in float16, and its tiles are SPZ, which rounds splats",
@@ -171,7 +182,18 @@ BUILT_IN = (
 # What a name may be: files that are adapted for the viewer have it in theirs.
 IN_FILES = re.compile(r"\w[\w.+-]*")
 
-ALIASES = {"supersplat": "playcanvas"}
+ALIASES = {
+    **dict.fromkeys(("inria", "gsplat", "nerfstudio", "kiri"), "classic"),
+    **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
+    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three"},
+}
+
+# What is asked for, but has no record: why, and what to take instead.
+SECRET = "its source is not public, so that how it draws is not known; take portable, which suits many viewers"
+NO_RECORD = {
+    **dict.fromkeys(("luma", "polycam", "postshot", "scaniverse"), SECRET),
+    "viser": "it leaves out splats whose opacity · det is below 0.25 px⁴, which is not drawn here; classic is closest",
+}
 
 VIEWERS = Registry("mipmap_plugin.viewers", {})
 
@@ -191,12 +213,18 @@ for _alias, _name in ALIASES.items():
 register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN))
 
 
+def _registered(name: str) -> Any:
+    if name in NO_RECORD and name not in VIEWERS.names():
+        raise SettingsError(f"viewer {name}: {NO_RECORD[name]}")
+    return VIEWERS.get(name)
+
+
 def viewers_for(name: str) -> tuple[str, ...]:
     """The names of the viewers that a file for `name` has to suit: `name` itself, or the members of a group.
 
     Raises SettingsError for an unknown viewer, PluginError for a group that is not made of names.
     """
-    viewer = VIEWERS.get(name)
+    viewer = _registered(name)
     if not isinstance(viewer, tuple):
         return (name,)
     if not viewer or not all(isinstance(member, str) for member in viewer):
@@ -206,7 +234,7 @@ def viewers_for(name: str) -> tuple[str, ...]:
 
 def find_viewer(name: str) -> Viewer:
     """The viewer `name`. Raises SettingsError if it is unknown or a group, PluginError if its target is not a `Viewer`."""
-    viewer = VIEWERS.get(name)
+    viewer = _registered(name)
     if isinstance(viewer, tuple):
         raise SettingsError(f"{name} is a group of viewers, which draw a file differently; name one of them: {', '.join(viewers_for(name))}")
     if not isinstance(viewer, Viewer):

@@ -48,6 +48,7 @@ VIEWERS: dict[str, tuple[str, dict[str, Any]]] = {
     "gaussian-splats-3d": ("gaussian-splats-3d", {}),
     "babylon": ("babylon", {}),
     "gsplat-js": ("gsplat", {}),
+    "three": ("three", {}),
 }
 
 
