@@ -45,7 +45,8 @@ class Exports:
         if self.streamed_sog or self.tiles:
             from mipmap_plugin.levels.streamed import META
 
-            refuse_exchange(output / (META if self.streamed_sog else "tiles.spz"))
+            refuse_exchange(output)  # where it is not installed
+            refuse_exchange(output / (META if self.streamed_sog else "tiles.spz"))  # where it is too old
 
     def write(self, ladder: Path, contents: ZoomContents | DistanceContents) -> list[Path]:
         """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""
