@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import sys
@@ -49,7 +50,9 @@ class Registry:
     def get(self, name: str) -> Any:
         """Return the object of that name. Raises SettingsError for an unknown name, PluginError for a broken target."""
         if not isinstance(name, str) or (name not in self._targets and name not in self._installed()):
-            raise SettingsError(f"{self.group}: there is no {name!r}; choose from {', '.join(self.names())}")
+            meant = difflib.get_close_matches(str(name).lower(), self.names(), 1)
+            guess = f"; did you mean {meant[0]}?" if meant else ""
+            raise SettingsError(f"{self.group}: there is no {name!r}; choose from {', '.join(self.names())}{guess}")
         target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target
 

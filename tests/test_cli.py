@@ -129,7 +129,7 @@ def test_an_output_that_names_a_file_becomes_no_folder(run, tmp_path, option):
 
 def test_a_wrong_scale_of_render_is_named(run, model_folder):
     code, _, err = run("render", model_folder, "--output", "out", "--scale", "0")
-    assert code == 2 and "scale must be from 1e-09 to 10000" in err and "Annotated" not in err
+    assert code == 2 and "scale must be a number or a fraction from 1e-09 to" in err and "Annotated" not in err
 
 
 def test_a_folder_of_a_base_and_its_adaptations_is_the_base(run, tmp_path):
@@ -544,14 +544,14 @@ def test_words_that_are_not_understood_exit_with_2(run, words):
     assert code == 2 and "Traceback" not in err
 
 
-@pytest.mark.parametrize(("text", "scale"), [("1/4", 0.25), ("4", 4.0), ("0.3", 0.3), ("1e-3", 0.001)])
+@pytest.mark.parametrize(("text", "scale"), [("1/4", 0.25), ("4", 4.0), ("1e-3", 0.001), ("1 / 4", 0.25), ("×1/4", 0.25), ("0.25x", 0.25)])
 def test_scales_are_fractions_or_numbers(text, scale):
     assert read_scale(text) == scale
 
 
-@pytest.mark.parametrize("text", ["", "x", "0", "-1/4", "1/0", "inf", "nan", "1e999", "1e308", "1e5", "1e-50"])
+@pytest.mark.parametrize("text", ["", "x", "0", "-1/4", "1/0", "inf", "nan", "1e999", "1e308", "1e5", "1e-50", "25%", "1:4", "0,25", "1 4", "×"])
 def test_scales_that_are_no_zoom(text):
-    with pytest.raises(ValueError, match=r"scale must be from 1e-09 to 10000, such as 1/4 or 4, got "):
+    with pytest.raises(ValueError, match=r"scale must be a number or a fraction from 1e-09 to 10000, such as 1/4, 0\.25 or 4, got "):
         read_scale(text)
 
 

@@ -100,7 +100,7 @@ def test_the_model_is_found_where_programs_leave_it(tmp_path, place):
 def test_the_models_own_folder_finds_the_photographs_too(tmp_path):
     write_text_model(tmp_path / "sparse/0", names(1))
     write_photographs(tmp_path / "images", names(1))
-    assert len(load_scene(tmp_path / "sparse/0").images) == 1
+    assert len(load_scene(tmp_path / "sparse/0").images) == len(load_scene(tmp_path / "sparse").images) == 1
 
 
 BENT = {"SIMPLE_RADIAL": "70 32 24 0.1", "OPENCV": "70 72 32 24 0 0 0.01 0", "OPENCV_FISHEYE": "70 72 32 24 0 0 0 0"}

@@ -208,3 +208,21 @@ def test_real_companions_are_named(shared_data):
     }.items():
         with pytest.raises(CheckpointError, match=sentence):
             load_model(folder / path)
+
+
+@pytest.mark.parametrize(
+    ("there", "said"),
+    [
+        ("phone.SPZ", "no PLY file, but phone.SPZ; give one PLY"),
+        ("scene/point_cloud/iteration_7/point_cloud.ply", "no PLY file, but scene; give one PLY"),
+        ("export/a.ply", "no PLY file, but export; give one PLY"),
+        ("images/a.jpg", r"no PLY file, but photographs or what a scene is trained on \(that is for --images and --cameras\); give one PLY"),
+        ("a.JPG", "no PLY file, but photographs"),
+        ("notes.txt", "no PLY file; give one PLY"),
+    ],
+)
+def test_a_folder_without_splats_says_what_it_holds_instead(tmp_path, there, said):
+    (tmp_path / there).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / there).write_bytes(b"x")
+    with pytest.raises(CheckpointError, match=said):
+        detect(tmp_path)

@@ -13,7 +13,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.health import ACTIVATED, LINEAR, drop, examine
+from mipmap_plugin.models.health import ACTIVATED, LINEAR, drop, examine, units
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 
@@ -194,3 +194,7 @@ def test_only_what_dropped_splats_hold_is_told(tmp_path):
     model = load_vanilla(write(tmp_path / "a.ply", columns))
     told = "1 of 8 splats hold a NaN in means; 1 of 8 splats are above 1e+12 once activated"
     assert model.notes == [f"2 of 8 splats were dropped: {told}"]
+
+
+def test_lengths_have_no_power_of_ten():
+    assert [units(length, 2) for length in (0.0123, 1.26, 99.7, 123.4, 45678.0)] == ["0.012", "1.3", "100", "123", "45,678"]

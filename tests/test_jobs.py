@@ -550,3 +550,8 @@ def test_the_db_before_are_the_bases_and_of_no_other_state():
 def test_an_interruption_is_told_once(tmp_path):
     outcome = Outcome(job_of(tmp_path), "interrupted", reason="interrupted at step 132")
     assert str(outcome).count("interrupted") == 1 and str(replace(outcome, reason="")).endswith(": interrupted")
+
+
+def test_without_words_a_checkpoint_is_asked_for(run):
+    code, _, err = run("adapt")
+    assert code == 2 and "there is no checkpoint to adapt; give a PLY" in err

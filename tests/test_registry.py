@@ -106,7 +106,7 @@ def test_asking_by_name():
     assert (type(backend), why) == (ReferenceBackend, "reference: requested")
     with pytest.raises(BackendUnavailable, match="backend 'fussy' cannot do this: it is not in the mood; nor will it be"):
         choose_backend("fussy", NEEDS)
-    with pytest.raises(SettingsError, match=r"mipmap_plugin\.backends: there is no 'gpu'; choose from fussy, reference"):
+    with pytest.raises(SettingsError, match=r"mipmap_plugin\.backends: there is no 'gpu'; choose from fussy, reference$"):
         choose_backend("gpu", NEEDS)
 
 
@@ -275,3 +275,9 @@ def test_a_backend_that_returns_something_else_than_an_image_is_named(returned):
         base.render(base.cameras[0])
     with pytest.raises(PluginError, match="backend 'wrong' has to return a Rendered"):
         base.adapt(0.5, steps=1)
+
+
+@pytest.mark.parametrize("name", ["Spark", "sparkk"])
+def test_a_name_like_a_known_one_is_asked_for(name):
+    with pytest.raises(SettingsError, match=r"choose from other, spark; did you mean spark\?$"):
+        Registry("mipmap_plugin.viewers", {"spark": 1, "other": 2}).get(name)

@@ -296,6 +296,7 @@ def test_without_a_test_file_val_is_the_test_split(tmp_path):
     [
         ({"k1": "x"}, r"frame 0 \(r_0\), k1: is not made of numbers"),
         ({"camera_model": "EQUIRECTANGULAR"}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
+        ({"camera_model": "EQUIRECTANGULAR", "fl_x": None}, r"has a lens that is not perspective \(EQUIRECTANGULAR\)"),
         ({"fl_x": None}, "has neither 'fl_x' nor 'camera_angle_x'"),
         ({"fl_x": None, "camera_angle_x": 40.0}, "give it in radians"),
         ({"transform_matrix": None}, "has no 'transform_matrix'"),
@@ -336,6 +337,34 @@ def test_a_checkpoint_may_come_with_cameras_or_without(tmp_path):
     assert model_cameras(None) == model_cameras(tmp_path) == []
     write_json(tmp_path / "cameras.json", [entry()])
     assert [camera.size for camera in model_cameras(tmp_path, {"resolution": 2})] == [(24, 32)]
+
+
+def test_a_transforms_file_may_have_any_name(tmp_path):
+    scene = load_scene(write_json(tmp_path / "polycam.json", {"fl_x": 9.0, "w": 8, "h": 8, "frames": [frame()]}))
+    assert [camera.size for camera in scene.cameras] == [(8, 8)]
+    with pytest.raises(SceneError, match="is not a list of cameras"):
+        load_scene(write_json(tmp_path / "other.json", {"fx": 9.0}))
+
+
+@pytest.mark.parametrize("name", ["cameras.xml", "poses.csv", "bundle.out"])
+def test_cameras_in_formats_that_are_not_read_are_refused(tmp_path, name):
+    (tmp_path / name).write_text("<document/>")
+    with pytest.raises(SceneError, match=rf"{name}: is no file of cameras that is read here .*; export them as one of these"):
+        load_scene(tmp_path / name)
+
+
+def test_a_file_of_a_colmap_model_names_its_folder(tmp_path):
+    (tmp_path / "images.bin").write_bytes(b"\0")
+    with pytest.raises(SceneError, match=f"give its folder, {tmp_path}$"):
+        load_scene(tmp_path / "images.bin")
+
+
+def test_cameras_one_level_above_or_below_are_named(tmp_path):
+    (tmp_path / "captures/desk/images").mkdir(parents=True)
+    write_json(tmp_path / "captures/desk/transforms.json", {})
+    for given in ("captures", "captures/desk/images"):
+        with pytest.raises(SceneError, match=f"holds neither .*, such as {tmp_path / 'captures/desk'}$"):
+            load_scene(tmp_path / given)
 
 
 def test_an_empty_folder_is_refused(tmp_path):

@@ -13,7 +13,7 @@ import tiny
 
 from mipmap_plugin import progress
 from mipmap_plugin.cli import main
-from mipmap_plugin.commands.voice import options, say, speaking
+from mipmap_plugin.commands.voice import options, say, speaking, wrapped
 from mipmap_plugin.errors import SettingsError
 
 QUICK = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference"]
@@ -38,6 +38,30 @@ def test_what_is_said_reaches_a_pipe_at_once(tmp_path):
     with pipe, contextlib.redirect_stdout(pipe):
         say("http://localhost:8080")
         assert (tmp_path / "pipe").read_text() == "http://localhost:8080\n"
+
+
+def test_a_long_fact_is_wrapped_under_its_key_in_a_terminal(base, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["inspect", base, "--no-viewers", "--all"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    [command] = [line for line in lines if "mipmap-plugin adapt" in line]  # on one line, to be copied
+    assert command.endswith("--scale 1/4")
+    assert all(len(line) <= 80 for line in lines if line != command and not line.startswith("file:"))
+
+
+def test_a_long_fact_is_one_line_in_a_pipe(base, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["inspect", base, "--no-viewers", "--all"]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) > 100
+
+
+@pytest.mark.parametrize("width", [1, 30, 80])
+def test_wrapping_loses_no_word(width):
+    text = "health:       one of many words, path/without-a-break; next: mipmap-plugin adapt 'a b' --scale 1/4"
+    lines = wrapped(text, 14, width).split("\n")
+    assert " ".join(line.strip() for line in lines) == text and lines[-1].endswith(["", "mipmap-plugin adapt 'a b' --scale 1/4"][1])
+    assert len(lines) > 1 and all(line.startswith(" " * 14) for line in lines[1:])
 
 
 def test_a_quiet_command_prints_json(base, capsys):

@@ -20,6 +20,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
+from mipmap_plugin.models.health import units
 from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, jittered, orbit
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
@@ -223,7 +224,8 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     wrong = "the cameras seem to be in other units; give those of this scene"
     if max(view.fx for view in views) * width / least < width / 2 + CLEAR * near:
         wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; scale the scene and its cameras up"
-    return f"the scene is {width:.2g} units wide, and no view shows it larger than {most:.2g} px: {wrong}"
+    return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
+
 
 
 def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
-from mipmap_plugin.commands.many import Many, Request, adapt_many
+from mipmap_plugin.commands.many import NO_CHECKPOINT, Many, Request, adapt_many
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
@@ -89,6 +89,8 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
+    if not checkpoints and many.list is None:
+        raise SettingsError(NO_CHECKPOINT)
     settings = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed)
     if many.tiles is not None:
         _refuse_for_many(scale, bytes, report)

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from mipmap_plugin.wrap import Wrapped
 
 
+# Columns of a name, before what it names.
+KEY = 14
+
 # The words of this command, which its page shows.
 WORDS: ContextVar[tuple[str, ...]] = ContextVar("WORDS", default=())
 
@@ -72,6 +75,7 @@ def print_facts(facts: Any, as_json: bool) -> None:
         return
     for name, value in facts.items():
         lines = value if isinstance(value, list) else [value]
+        hanging = None if name == "file" else KEY + 2 * (len(lines) > 1)  # a path is copied; of several entries each is seen to begin
         for line in lines:
-            say(f"{name + ':' if name else '':14}{line}")
+            say(f"{name + ':' if name else '':{KEY}}{line}", hanging)
             name = ""

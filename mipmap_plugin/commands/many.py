@@ -19,6 +19,8 @@ from mipmap_plugin.jobs.listing import find_checkpoints, is_pattern, read_list, 
 from mipmap_plugin.jobs.summary import facts, in_order, table, totals
 from mipmap_plugin.progress import counted, note
 
+NO_CHECKPOINT = "there is no checkpoint to adapt; give a PLY or a model folder, several of them, or --list FILE"
+
 
 @dataclass(frozen=True)
 class Many:
@@ -103,7 +105,7 @@ def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -
 def _checkpoints(given: Sequence[Path]) -> list[Path]:
     """The checkpoints of the command and of its list, without outputs of earlier runs, which a pattern such as output/* finds too."""
     if not given:
-        raise SettingsError("there is no checkpoint to adapt; give a PLY or a model folder, several of them, or --list FILE")
+        raise SettingsError(NO_CHECKPOINT)
     checkpoints, outputs = without_outputs(find_checkpoints(given))
     if outputs and not checkpoints:
         raise SettingsError(f"{outputs[0]}: this was adapted already; give the checkpoint that it was made of")

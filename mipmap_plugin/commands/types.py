@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -15,13 +16,13 @@ from mipmap_plugin.screen_filters import TrainedName
 
 
 def read_scale(text: str) -> float:
-    """Parse a scale, such as 0.25, 1/4 or 4. Raises ValueError."""
+    """Parse a scale, such as 0.25, 1/4 or 4, or as pages and names of files write it, ×1/4 or x0.25. Raises ValueError."""
     try:
-        scale = float(Fraction(text))
+        scale = float(Fraction(re.sub(r"\s*/\s*", "/", text.strip(" x×X"))))
     except (ValueError, ZeroDivisionError, OverflowError):
         scale = 0.0
     if not MIN_SCALE <= scale <= MAX_SCALE:
-        raise ValueError(f"scale must be from {MIN_SCALE:g} to {MAX_SCALE:g}, such as 1/4 or 4, got {text}")
+        raise ValueError(f"scale must be a number or a fraction from {MIN_SCALE:g} to {MAX_SCALE:g}, such as 1/4, 0.25 or 4, got {text}")
     return scale
 
 

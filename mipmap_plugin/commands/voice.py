@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -14,6 +16,9 @@ from typing import Any, TextIO, cast
 
 from mipmap_plugin.commands.log import Log
 from mipmap_plugin.errors import OutputError, SettingsError
+
+# What a command is announced by that is to be run next; what stands for its spaces while lines are broken; the columns that a text needs at least.
+NEXT, UNBROKEN, LEAST_WIDTH = "next: ", "\0", 20
 
 
 @dataclass(frozen=True)
@@ -32,12 +37,22 @@ class Voice:
 VOICE: ContextVar[Voice] = ContextVar("VOICE", default=Voice())  # noqa: B039  a voice never changes
 
 
-def say(text: str) -> None:
-    """Print `text` unless the command is quiet; also write it to the log."""
+def say(text: str, hanging: int | None = None) -> None:
+    """Print `text` unless the command is quiet; also write it to the log. `hanging`: in a terminal, wrap it and indent further lines so."""
     voice = VOICE.get()
     voice.write(text)
     if not voice.quiet:
-        put(text)
+        put(text if hanging is None or not sys.stdout.isatty() else wrapped(text, hanging, shutil.get_terminal_size().columns))
+
+
+def wrapped(text: str, hanging: int, width: int) -> str:
+    """A text in lines of `width` columns, of which all but the first are indented. What follows NEXT stays on one line, to be copied."""
+    words, found, command = text.partition(NEXT)
+    kept = words + found + command.replace(" ", UNBROKEN)
+    lines = textwrap.wrap(
+        kept, max(width, hanging + LEAST_WIDTH), subsequent_indent=" " * hanging, break_long_words=False, break_on_hyphens=False
+    )  # fmt: skip
+    return "\n".join(lines).replace(UNBROKEN, " ")
 
 
 def put(text: str) -> None:

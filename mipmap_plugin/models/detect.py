@@ -13,6 +13,9 @@ from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_l
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
 from mipmap_plugin.models.places import REPORT
 
+# Suffixes of files of splats besides PLY, and of photographs.
+EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat"), (".jpg", ".jpeg", ".png")
+
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)
 
@@ -136,8 +139,23 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if len(clouds) == 1:
         return detect(clouds[0])
     some = ", ".join([*(cloud.name for cloud in clouds[:5]), *["..."] * (len(clouds) > 5)])
-    content = f"{len(clouds)} PLY files ({some})" if clouds else "no point_cloud folder and no PLY file"
+    content = f"{len(clouds)} PLY files ({some})" if clouds else f"no point_cloud folder and no PLY file{_instead(folder)}"
     raise CheckpointError(f"{folder} holds {content}; give one PLY file, or a model folder with point_cloud/iteration_<N>")
+
+
+def _instead(folder: Path) -> str:
+    """What people mean who give a folder without splats, in words: a file of another format, a folder below, or what a scene is trained on."""
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError:
+        return ""
+    meant = [entry for entry in entries if entry.suffix.lower() in EXCHANGED]
+    meant += [entry for entry in entries if entry.is_dir() and ((entry / "point_cloud").is_dir() or any(entry.glob("*.ply")))]
+    if meant:
+        return f", but {', '.join(entry.name for entry in meant[:5])}{', ...' * (len(meant) > 5)}"
+    if any(entry.suffix.lower() in PHOTOGRAPHS or entry.name in ("images", "sparse") for entry in entries):
+        return ", but photographs or what a scene is trained on (that is for --images and --cameras)"
+    return ""
 
 
 def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:

@@ -19,6 +19,11 @@ Model = TypeVar("Model", bound="HasRows")
 Read = TypeVar("Read", bound="IsRead")
 
 
+def units(length: float, digits: int) -> str:
+    """A length as people write it: so many digits, but large lengths whole, and without a power of ten."""
+    return f"{length:.{digits}g}" if length < 10**digits - 0.5 else f"{length:,.0f}"
+
+
 class HasRows(Protocol):
     """A model whose rows can be removed."""
 
@@ -95,7 +100,7 @@ class Health:
         counts = [
             (int(self.invalid.sum()), f"are not finite once activated, or above {LARGEST:g}, and would spoil images"),
             (self.zero_quaternions, "have a zero quaternion and are drawn unrotated"),
-            (self.huge, f"are longer than the scene ({self.extent:.3g} units)"),
+            (self.huge, f"are longer than the scene ({units(self.extent, 3)} units)"),
             (self.tiny, f"have an axis below {TINY_SHARE:g} of the scene: sheets or needles"),
             (self.invisible, "have an opacity below 1/255 and are never drawn"),
         ]

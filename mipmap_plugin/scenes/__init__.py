@@ -7,6 +7,7 @@ from typing import Any
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
+from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.scenes.base import Scene
 from mipmap_plugin.scenes.cameras_json import read_cameras, write_cameras
 from mipmap_plugin.scenes.colmap import is_colmap, read_colmap
@@ -14,12 +15,15 @@ from mipmap_plugin.scenes.moving import is_dynerf, is_hypernerf, read_dynerf, re
 from mipmap_plugin.scenes.trajectories import jittered, orbit
 from mipmap_plugin.scenes.transforms import read_transforms
 
+# The names of the files of a COLMAP model.
+COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", "frames", "rigs") for suffix in (".bin", ".txt")}
+
 __all__ = ["Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms", "write_cameras"]
 
 
 def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
-    """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file or its folder, a COLMAP scene,
-    or one of DyNeRF or HyperNeRF as 4DGaussians reads them.
+    """The scene at `path`: a model folder with a cameras.json, that file itself, a transforms file of any name or its folder, a COLMAP
+    scene, or one of DyNeRF or HyperNeRF as 4DGaussians reads them.
 
     `cfg` is the checkpoint's cfg_args, which determine the test split and training size (`read_cameras`, `read_colmap`). A folder
     with both COLMAP's `sparse` and transforms files is read from `sparse`, as graphdeco-inria does.
@@ -29,7 +33,7 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     if not path.exists():
         raise SceneError(f"{path}: there is no such file or folder; check the path")
     if path.is_file():
-        return read_transforms(path) if path.name.startswith("transforms") else _cameras_only(path, path, cfg)
+        return _of_file(path, cfg)
     if (path / "cameras.json").is_file():
         return _cameras_only(path / "cameras.json", path, cfg)
     if (path / "sparse").is_dir():
@@ -42,7 +46,8 @@ def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         return read_hypernerf(path)
     if is_colmap(path):
         return read_colmap(path, cfg)
-    raise SceneError(f"{path}: holds neither cameras.json nor transforms files nor a COLMAP model; give the folder or file that has the cameras")
+    advice = f"give the folder or file that has the cameras{f', such as {found[0]}' if (found := _near(path)) else ''}"
+    raise SceneError(f"{path}: holds neither cameras.json nor transforms files nor a COLMAP model; {advice}")
 
 
 def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) -> list[Camera]:
@@ -50,6 +55,29 @@ def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) 
     if folder is None or not (Path(folder) / "cameras.json").is_file():
         return []
     return read_cameras(Path(folder) / "cameras.json", cfg)
+
+
+def _of_file(path: Path, cfg: dict[str, Any] | None) -> Scene:
+    """The scene of one file: with frames it is a transforms file, whatever its name, else a cameras.json. Raises SceneError."""
+    if path.suffix.lower() != ".json":
+        there = f"; give its folder, {path.parent}" if path.name in COLMAP_FILES else "; export them as one of these"
+        raise SceneError(f"{path}: is no file of cameras that is read here (cameras.json, a transforms.json, or the folder of a COLMAP model){there}")
+    data = read_json(path)
+    if path.name.startswith("transforms") or (isinstance(data, dict) and "frames" in data):
+        return read_transforms(path)
+    return _cameras_only(path, path, cfg)
+
+
+def _near(path: Path) -> list[Path]:
+    """Folders with cameras one level above or below a folder: of a COLMAP scene people give `images`, or what holds several scenes."""
+    try:
+        return [place for place in (path.parent, *sorted(path.iterdir())) if place.is_dir() and _holds_cameras(place)]
+    except OSError:
+        return []
+
+
+def _holds_cameras(path: Path) -> bool:
+    return (path / "cameras.json").is_file() or any(path.glob("transforms*.json")) or is_colmap(path)
 
 
 def _cameras_only(file: Path, source: Path, cfg: dict[str, Any] | None) -> Scene:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 # Folders of a model, in the order in which graphdeco-inria and gsplat search them.
-MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".", "0")  # the last: the folder `sparse` itself was given
 
 
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:

@@ -109,8 +109,9 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
         actual = image_size(image) if image else stated  # the image may have been shrunk since
         if actual:
             name = image.stem if image else listed.replace("\\", "/").rsplit("/", 1)[-1]
+            model = _lens_model(values, f"{where} ({name})")
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
-            lens = _lens(values, camera, f"{where} ({name})")
+            lens = _lens(values, model, camera, f"{where} ({name})")
             views.append((lens.straightened(camera) if lens and can_undistort() else camera, image, lens))
     return views, absent
 
@@ -178,11 +179,16 @@ def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float
     return size / (2 * math.tan(angle / 2))
 
 
-def _lens(values: Mapping[str, Any], camera: Camera, where: str) -> Lens | None:
-    """The lens of a `camera` with distortion, with OpenCV's parameters; None for a pinhole. Raises SceneError if it is not perspective."""
+def _lens_model(values: Mapping[str, Any], where: str) -> str:
+    """The name of the lens model. Raises SceneError if it is not perspective; such files state no focal length either."""
     model = values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV")
     if model not in (*PERSPECTIVE_MODELS, "OPENCV_FISHEYE"):
         raise SceneError(f"{where}: has a lens that is not perspective ({model}); resample its images to a pinhole first")
+    return str(model)
+
+
+def _lens(values: Mapping[str, Any], model: str, camera: Camera, where: str) -> Lens | None:
+    """The lens of a `camera` with distortion, with OpenCV's parameters; None for a pinhole."""
     k1, k2, k3, k4, p1, p2 = (numbers(values.get(key) or 0.0, (), f"{where}, {key}").item() for key in DISTORTION)
     pinhole = (camera.fx, camera.fy, camera.cx, camera.cy)
     if model == "OPENCV_FISHEYE":

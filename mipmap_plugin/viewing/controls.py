@@ -14,7 +14,7 @@ from mipmap_plugin.viewing.stage import Look, Picture
 
 # The zoom slider, in powers of two: the least and the largest zoom, and a step.
 STOPS = (-6.0, 4.0, 0.1)
-MARKS = tuple((float(stop), zoom_name(2.0**stop)) for stop in range(-6, 5, 2))
+MARKS = tuple((float(stop), zoom_name(2.0**stop)) for stop in (-6, -3, 0, 2, 4))  # as many as have room on a phone
 
 # Words for what is None in the state.
 AS_TRAINED, NOTHING = "as trained", "nothing"
