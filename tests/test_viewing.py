@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 from unittest.mock import MagicMock
 
 import anchor_checkpoints
@@ -26,7 +27,7 @@ from mipmap_plugin.viewing import adapting
 from mipmap_plugin.viewing import page as live_page
 from mipmap_plugin.viewing.adapting import Adapter, Live, Progress, Wish
 from mipmap_plugin.viewing.around import BASE_PIXELS, NEAR, PIXELS, views_for_screen
-from mipmap_plugin.viewing.controls import figures, words
+from mipmap_plugin.viewing.controls import MARKS, STOPS, figures, words
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
 from mipmap_plugin.viewing.page import NO_VISER, Page, PageSettings, _check_address
 from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
@@ -461,3 +462,10 @@ def test_a_display_is_known_by_the_environment(monkeypatch):
     assert not has_display()
     monkeypatch.setenv("DISPLAY", ":0")
     assert has_display()
+
+
+def test_the_names_on_the_slider_have_room_on_a_phone():
+    """On a screen of 360 px the slider of viser has 88 px, and a letter 4."""
+    low, high, _ = STOPS
+    ends = [(88 * (stop - low) / (high - low), 4 * len(name) / 2) for stop, name in MARKS]
+    assert all(left[0] + left[1] < right[0] - right[1] for left, right in pairwise(ends))

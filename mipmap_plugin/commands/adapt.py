@@ -89,15 +89,13 @@ def adapt(
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
     """
-    if not checkpoints and many.list is None:
-        raise SettingsError(NO_CHECKPOINT)
     settings = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed)
     if many.tiles is not None:
-        _refuse_for_many(scale, bytes, report)
+        _refuse_for_many(many.holds(checkpoints), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
         return adapt_tiled(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
     if many.asked(checkpoints):
-        _refuse_for_many(scale, bytes, report)
+        _refuse_for_many(many.holds(checkpoints), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
         return adapt_many(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
     [checkpoint] = checkpoints
@@ -111,8 +109,10 @@ def adapt(
     _save_all(wrapped, models, page, overwrite, json)
 
 
-def _refuse_for_many(scales: Sequence[float], size: str | None, page: bool) -> None:
-    """Raise SettingsError for what only one checkpoint can have."""
+def _refuse_for_many(given: bool, scales: Sequence[float], size: str | None, page: bool) -> None:
+    """Raise SettingsError where no checkpoint is given, and for what only one can have."""
+    if not given:
+        raise SettingsError(NO_CHECKPOINT)
     if not scales:
         raise SettingsError("several checkpoints, and tiles, need a scale; give --scale")
     if size is not None or page:

@@ -47,6 +47,10 @@ class Many:
         options = (self.jobs, self.dask, self.shard)
         return self.is_list(checkpoints) or self.skip_existing or any(each is not None for each in options)
 
+    def holds(self, checkpoints: Sequence[Path]) -> bool:
+        """Whether there is a checkpoint at all, or a list of them."""
+        return bool(checkpoints) or self.list is not None
+
     def is_list(self, checkpoints: Sequence[Path]) -> bool:
         """Whether there may be several checkpoints, so that an output is a folder for all."""
         return self.list is not None or len(checkpoints) != 1 or is_pattern(checkpoints[0])

@@ -1,7 +1,10 @@
 "use strict";
 // Two plots as SVG: dB over the seconds of an adaptation, and the Pareto fronts of a tradeoff.
 
-const WIDTH = 640, HEIGHT = 300, MARGIN = { left: 46, right: 14, top: 16, bottom: 42 };
+// Units of a plot are px of the screen on a phone too, or its text could not be read there; the page and the card take 62 px of the width.
+const WIDTH = Math.max(280, Math.min(580, document.documentElement.clientWidth - 62));
+const HEIGHT = 300, MARGIN = { left: 46, right: 14, top: 16, bottom: 42 };
+const LETTER = 6.7; // px, of a name beside a point
 
 /** Round numbers that divide a range into about `count` parts. */
 function ticksOf(low, high, count = 5) {
@@ -50,6 +53,13 @@ function point(x, y, name, text, readout) {
   return dot;
 }
 
+/** Where a name goes that belongs to a point at x: on its right, or where there is no room on its left, or else in the middle. */
+function beside(x, text, gap) {
+  const length = text.length * LETTER;
+  if (x + gap + length <= WIDTH) return { x: x + gap, "text-anchor": "start" };
+  return x - gap - length >= 0 ? { x: x - gap, "text-anchor": "end" } : { x: WIDTH / 2, "text-anchor": "middle" };
+}
+
 const path = (points) => `M${points.map((each) => each.map((value) => value.toFixed(1)).join(" ")).join("L")}`;
 
 /** dB over seconds of one adaptation: what was done before the first step, the steps, and what was taken back. */
@@ -61,7 +71,7 @@ function curveChart(report) {
     title: `dB over seconds, ${report.title}`, x: [0, last], y: spread([...curve.map((each) => each.validation_db), ...(base ? [base[1]] : [])]),
     xTicks: ticksOf(0, last, 8), xLabel: "seconds of adapting", yLabel: "dB on validation views",
   });
-  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark to read it.");
+  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
   const start = curve[0];
   const before = ["compilation", "blend weights", "merging", "closed form", "upsampling"].filter((phase) => report.seconds[phase] >= 0.005)
     .map((phase) => `${phase} ${report.seconds[phase].toFixed(2)} s`).join(", ");
@@ -73,8 +83,8 @@ function curveChart(report) {
   }
   svg.append(draw("path", { class: "curve", d: path(curve.map((each) => [place.x(each.seconds), place.y(each.validation_db)])) }));
   if (made) {
-    const late = place.x(start.seconds) > WIDTH * 0.55, at = { x: place.x(start.seconds) + (late ? -9 : 9), y: place.y(start.validation_db) + 16 };
-    svg.append(draw("text", { class: "start-label", ...at, "text-anchor": late ? "end" : "start" }, made.replace("the start, ", "")));
+    const name = made.replace("the start, ", "");
+    svg.append(draw("text", { class: "start-label", ...beside(place.x(start.seconds), name, 9), y: place.y(start.validation_db) + 16 }, name));
   }
   for (const each of curve) {
     const what = each.step === 0 ? `${made ? made.replace("the start, ", "") : "the start"} (${before || "nothing before it"})`
@@ -105,7 +115,7 @@ function frontChart(scale, { cost, mark, label, unit, points }) {
     title: `dB over ${label}, ${zoomName(scale.scale)}`, x: least ? [0, high * 1.1] : [low / 1.2, high * 1.2], y: spread(points.map((each) => each.psnr_db.median)),
     xTicks: least ? [0, ...logTicks(least, high)] : logTicks(low, high), bend, xLabel: label, yLabel: "dB",
   });
-  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark to read it.");
+  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
   const front = points.filter((each) => each[mark]).sort((a, b) => cost(a).median - cost(b).median);
   const corners = front.flatMap((each, i) => {
     const here = [place.x(cost(each).median), place.y(each.psnr_db.median)];
@@ -116,8 +126,7 @@ function frontChart(scale, { cost, mark, label, unit, points }) {
     if (run.length > 1) svg.append(draw("path", { class: "run", d: path(run.map((each) => [place.x(cost(each).median), place.y(each.psnr_db.median)])) }));
   }
   for (const each of front.filter((one) => one.step == null)) {
-    const x = place.x(cost(each).median), late = x > WIDTH * 0.75;
-    svg.append(draw("text", { class: "point-label", x: x + (late ? 4 : -4), y: place.y(each.psnr_db.median) - 9, "text-anchor": late ? "end" : "start" }, each.name));
+    svg.append(draw("text", { class: "point-label", ...beside(place.x(cost(each).median), each.name, -4), y: place.y(each.psnr_db.median) - 9 }, each.name));
   }
   if (corners.length > 1) svg.append(draw("path", { class: "front", d: path(corners) }));
   for (const each of points) {

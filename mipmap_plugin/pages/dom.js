@@ -24,7 +24,7 @@ function draw(tag, attributes = {}, ...children) {
 }
 
 const SAME_DB = 120; // of identical images (evaluation/metrics.py)
-const decibel = (value) => (value == null ? "–" : value >= SAME_DB ? "identical" : `${value.toFixed(2)} dB`);
+const decibel = (value) => (value == null ? "–" : value >= SAME_DB ? "identical to the truth" : `${value.toFixed(2)} dB`);
 const digits = (value, count) => (value == null ? "–" : value.toFixed(count));
 /** A scale as people write it: ×1/4, ×4. */
 const zoomName = (scale) => (scale < 1 && Math.abs(1 / scale - Math.round(1 / scale)) < 1e-9 ? `×1/${Math.round(1 / scale)}` : `×${scale}`);

@@ -31,11 +31,14 @@ function ladderChart(ladder) {
     title: `dB over ${axis.xLabel}`, x: [axis.of(curve[0]), axis.of(curve.at(-1))], y: spread(curve.flatMap((each) => [each.psnr_db, each.base_db])),
     xTicks: axis.xTicks, nameOf: axis.nameOf, bend: Math.log2, xLabel: axis.xLabel, yLabel: "dB",
   });
-  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark to read it.");
+  const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
+  let named = -Infinity; // where the last switch with a name lies
   for (const each of axis.switches) {
-    const x = place.x(each);
+    const x = place.x(each), name = axis.rounded(each);
     svg.append(draw("line", { class: "switch", x1: x, x2: x, y1: MARGIN.top, y2: HEIGHT - MARGIN.bottom }));
-    svg.append(draw("text", { x, y: MARGIN.top - 3, "text-anchor": "middle" }, axis.rounded(each)));
+    if (Math.abs(x - named) < (name.length + 1) * LETTER) continue;
+    svg.append(draw("text", { x, y: MARGIN.top - 3, "text-anchor": "middle" }, name));
+    named = x;
   }
   const line = (points, of) => path(points.map((each) => [place.x(axis.of(each)), place.y(of(each))]));
   svg.append(draw("path", { class: "base-line", fill: "none", d: line(curve, (each) => each.base_db) }));

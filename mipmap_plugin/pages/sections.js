@@ -58,7 +58,8 @@ function provenanceSection() {
 
 function commandSection() {
   const lines = record.commands.map((command) => {
-    const code = make("code", { tabindex: "0" }, command);
+    const words = command.split(" ").map((word, i) => [i ? " " : "", word.startsWith("-") ? make("span", { class: "option" }, word) : word]);
+    const code = make("code", { tabindex: "0" }, ...words.flat());
     const copy = make("button", { type: "button", class: "copy", onclick: () => {
       getSelection().selectAllChildren(code);
       copy.textContent = document.execCommand("copy") ? "copied" : "selected";

@@ -176,6 +176,25 @@ def test_nothing_is_wider_than_the_screen(open_page: Open, evaluation: Path, tra
         assert page.evaluate("document.documentElement.scrollWidth") <= viewport["width"]
 
 
+@pytest.mark.parametrize("viewport", [PHONE, WIDE], ids=["phone", "wide"])
+def test_plots_can_be_read(open_page: Open, evaluation: Path, tradeoff: Path, ladder: Path, viewport: dict[str, int]) -> None:
+    """Text is neither tiny on a phone nor huge on a desk, and lies within the card."""
+    script = """all => all.map(svg => [svg.getScreenCTM().a, ...[...svg.querySelectorAll("text")].map(text => {
+        const [place, card] = [text.getBoundingClientRect(), svg.closest("figure").getBoundingClientRect()];
+        return Math.max(card.left - place.left, place.right - card.right);
+    })])"""
+    for path in (evaluation.with_suffix(".html"), tradeoff.with_name("report.html"), ladder.with_name("report.html")):
+        for scale, *outside in open_page(path, viewport=viewport).eval_on_selector_all(".chart svg", script):
+            assert 10 <= 12 * scale <= 17 and max(outside) <= 0
+
+
+def test_a_command_is_not_broken_within_an_option(open_page: Open, evaluation: Path) -> None:
+    page = open_page(evaluation.with_suffix(".html"), viewport=PHONE)
+    parts = page.eval_on_selector_all("code .option", "all => all.map(each => [each.textContent, each.getClientRects().length])")
+    assert "--images" in [name for name, _ in parts] and {lines for _, lines in parts} == {1}
+    assert page.text_content("code").startswith("mipmap-plugin evaluate ")
+
+
 def test_light_and_dark(open_page: Open, evaluation: Path) -> None:
     script = "['background-color', 'color'].map(name => getComputedStyle(document.body).getPropertyValue(name).match(/\\d+/g).map(Number)[0])"
     light, dark = (open_page(evaluation.with_suffix(".html"), color_scheme=scheme).evaluate(script) for scheme in ("light", "dark"))
