@@ -106,7 +106,7 @@ function comparison() {
       type: "button", class: `card ${picture.role}`, "data-index": index, title: `Show ${picture.name} on the right`,
       onclick: () => { selects.after.value = index; choose(); stage.scrollIntoView({ block: "nearest" }); },
     },
-    make("img", { src: picture.src, alt: `${picture.name} at ${zoom.label}`, loading: "lazy" }),
+    make("img", { src: picture.src, alt: `${picture.name} at ${zoom.label}` }),
     make("span", { class: "name" }, picture.name),
     mean.length ? make("strong", { class: "mean" }, mean[0]) : null,
     mean.length > 1 ? make("span", { class: "further" }, mean.slice(1).join(" · ")) : null,
@@ -154,7 +154,7 @@ function viewerSection(zoom) {
   if (!zoom.viewers.length) return [section("in-viewers", "What viewers will show", make("p", { class: "note" }, zoom.no_viewers))];
   const rows = zoom.viewers.map((viewer) => make("figure", { class: viewer.made_for ? "viewer made-for" : "viewer" },
     make("div", { class: "pair" }, ...[["base", viewer.base], ["adapted", viewer.adapted]].map(([word, picture]) =>
-      make("div", {}, make("img", { src: picture.src, alt: `${picture.name} at ${zoom.label}`, loading: "lazy" }),
+      make("div", {}, make("img", { src: picture.src, alt: `${picture.name} at ${zoom.label}` }),
         make("span", {}, word, " ", make("strong", {}, picture.view.psnr_db == null ? "" : decibel(picture.view.psnr_db)))))),
     make("figcaption", {}, viewer.title, viewer.made_for ? make("em", {}, " the file was made for it") : null)));
   return [section("in-viewers", "What viewers will show",
