@@ -13,6 +13,7 @@ and `mipmap-plugin adapt output/bicycle --scale 2 --upsampler sharp` uses it.
 from __future__ import annotations
 
 import sys
+from fractions import Fraction
 
 from torch import Tensor
 
@@ -29,4 +30,4 @@ def sharp(image: Tensor, size: tuple[int, int]) -> Tensor:
 
 if __name__ == "__main__":
     register_upsampler("sharp", sharp)
-    print(wrap_model(sys.argv[1]).adapt(float(sys.argv[2]), upsampler="sharp").save("sharp.ply"))
+    print(wrap_model(sys.argv[1]).adapt(float(Fraction(sys.argv[2])), upsampler="sharp").save("sharp.ply"))
