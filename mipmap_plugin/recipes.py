@@ -32,7 +32,7 @@ HIGHEST = 1 + 1e-6
 # loader leaves the factor of their learning rate at 0.
 PAPER = dict(
     returns="last", views="given", steps=1000, resize="bilinear", upsampler="bicubic", quantize_truth=True, closed_form=False, rates=LearningRates(),
-    densify_gradient=2e-4, reset_opacity_at=2,
+    densify_gradient=2e-4, reset_opacity_at=2, moments=None,
 )  # fmt: skip
 
 # Splats drawn by all steps of `default` together: about a minute on two cores. 360 steps of four views draw as many where a view shows 125,000.
@@ -51,7 +51,7 @@ DEFAULT_OUT = dict(
 )  # fmt: skip
 RATES_OUT = LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=1e-3)
 THOROUGH_OUT = dict(
-    DEFAULT_OUT, steps=2500, most_draws=None, views_per_step=8, warm_up=0.05, extra_views=1000, merging_costs=0.1
+    DEFAULT_OUT, steps=2500, most_draws=None, views_per_step=8, warm_up=0.05, extra_views=1000, merging_costs=0.1, moments=48
 )  # fmt: skip
 
 # Without the steps at x1, one view a step is too little to learn another way to draw, where each view shows few of the splats: for spark at x2 a

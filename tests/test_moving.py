@@ -37,7 +37,8 @@ def test_jittered_views_take_the_times_of_the_cameras():
 
 def test_the_report_says_how_a_moving_scene_was_sampled_and_that_of_a_static_one_has_no_times(tmp_path):
     moves = wrap_model(moving.write_deformable(tmp_path / "m"), backend="reference").adapt(4, recipe="instant")
-    assert moves.report.views == "4 train views and 100 around them, 104 of them without a time of their own, spread over 0..1"
+    times = "104 of them without a time of their own, spread over 0..1, each at the nearest of 24 moments"
+    assert moves.report.views == f"4 train views and 100 around them, {times}"
     static = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(4, recipe="instant")
     assert "time" not in static.report.views
 

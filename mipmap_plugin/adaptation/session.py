@@ -16,6 +16,7 @@ from torch import Tensor
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, is_true
+from mipmap_plugin.adaptation.moments import at_their_moments, follower, release
 from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
@@ -34,7 +35,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike, with_times
+from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -113,9 +114,7 @@ class Session:
         if len(shown := showing(validation, means, self.base_effects.near_plane)) > 1:  # one to steer by, and one to choose by
             validation = shown  # others are the same in every state
         if self.base.traits.moves:
-            views, times = with_times(views, self.config.seed)
-            validation, _ = with_times(validation, self.config.seed)
-            note += f", {times}"
+            views, validation, note = at_their_moments(views, validation, self.config, note)
         return views, validation, note
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
@@ -184,6 +183,7 @@ class Session:
         first, *further = [Renderer(self.backend, target) for target in targets]
         together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
         task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together, stepping)
+        task = replace(task, follow=follower(self.base, self.views, self.scale))
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient
@@ -201,6 +201,7 @@ class Session:
         if not run.ended_by:
             task, config = within_budget(run, task, self.config)
             run.ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
+            release(run.student)
         if self.keeps_state:
             keeper.save(run)
         run.optimizer.state.clear()

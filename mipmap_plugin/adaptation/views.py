@@ -257,3 +257,4 @@ def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:
     times = {number: position / max(1, len(timeless) - 1) for number, position in zip(timeless, order, strict=True)}
     timed = [replace(view, time=times.get(number, view.time)) for number, view in enumerate(views)]
     return timed, f"{len(timeless)} of them without a time of their own, spread over 0..1"
+

@@ -20,6 +20,7 @@ from mipmap_plugin.errors import PluginError
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.moving.deformable import DeformNetwork
 from mipmap_plugin.models.moving.hexplane import HexPlane
+from mipmap_plugin.models.moving.model import moved_to
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.splatting import filters, harmonics
 from mipmap_plugin.wrap import wrap_model
@@ -128,12 +129,12 @@ FIELDS = {
 def test_a_field_that_changes_nothing_is_not_evaluated(tmp_path, monkeypatch, family):
     kind, write, state = FIELDS[family]
     model = wrap_model(write(tmp_path / "still", state=zero_heads(state())), cameras=tiny.cameras(2), backend="reference")
-    evaluated = counted(monkeypatch, kind, "__call__")
+    evaluated = counted(monkeypatch, kind, "changes")
     image = model.render(moving.at(0.3)).image
     adapted = model.adapt(1 / 4, **BRIEF)
     assert evaluated == [] and "time" not in adapted.report.views
     assert [effect.on for effect in adapted.report.effects if effect.name == "time"] == [False]
-    forced = ReferenceBackend().render(model.model.field(model.model.canonical, 0.3), moving.at(0.3), model.effects()).image
+    forced = ReferenceBackend().render(moved_to(model.model.field, model.model.canonical, 0.3), moving.at(0.3), model.effects()).image
     assert len(evaluated) == 1
     torch.testing.assert_close(image, forced, atol=1e-5, rtol=0)
 
@@ -143,7 +144,7 @@ def test_a_field_that_changes_something_is_evaluated(tmp_path, monkeypatch, fami
     kind, write, state = FIELDS[family]
     model = wrap_model(write(tmp_path / "moving", state=state()), cameras=tiny.cameras(2), backend="reference")
     model.backend()  # which asks once what the model needs
-    evaluated = counted(monkeypatch, kind, "__call__")
+    evaluated = counted(monkeypatch, kind, "changes")
     model.render(moving.at(0.3))
     assert len(evaluated) == 1
 
@@ -155,7 +156,7 @@ def test_fields_that_multiply_count_as_moving(tmp_path, options, moves):
 
 
 def test_a_static_scene_evaluates_no_field(monkeypatch):
-    evaluated = counted(monkeypatch, DeformNetwork, "__call__"), counted(monkeypatch, HexPlane, "__call__")
+    evaluated = counted(monkeypatch, DeformNetwork, "changes"), counted(monkeypatch, HexPlane, "changes")
     assert "time" not in wrapped(with_bands(1, 1)).adapt(1 / 4, **BRIEF).report.views
     assert evaluated == ([], [])
 

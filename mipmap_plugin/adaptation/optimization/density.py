@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.moments import keep_rows
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.optimizer import change_rows
 from mipmap_plugin.camera import Camera
@@ -73,6 +74,7 @@ def prune(model: SplatModel, optimizer: Adam, keep: Tensor) -> None:
         keep = keep.clone()
         keep[0] = True
     rows = keep.nonzero()[:, 0]
+    keep_rows(model, rows)
     change_rows(model, optimizer, lambda _, old: _moved_up(old, rows), lambda old: _moved_up(old, rows))
 
 

@@ -91,6 +91,7 @@ def is_checked(step: int, config: AdaptConfig) -> bool:
 def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     if run.step == config.reset_opacity_at and task.white_background:
         density.reset_opacities(run.optimizer)
+    task.follow(run.student)
     progress = run.progress(config)
     set_rates(run.optimizer, config, progress, run.steering.rate_factor(run.step, config), frozen=frozen_parameters(run))
     at_once = views_at_once(cameras[view] for view in views) if run.gradients is None else 1

@@ -123,6 +123,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "ended_by": run.ended_by,
         "curve": [point.model_dump() for point in run.curve],
         "parameters": {name: tensor.detach() for name, tensor in run.student.parameters().items()},
+        "held": getattr(run.student, "held", None),
         "shared": {name: tensor.detach() for name, tensor in run.student.shared_parameters().items()},
         "optimizer": run.optimizer.state_dict(),
         "gradients": None if run.gradients is None else (run.gradients.total, run.gradients.seen),
@@ -149,6 +150,8 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     with torch.no_grad():
         for name, tensor in student.shared_parameters().items():
             tensor.copy_(state["shared"][name])
+    if state["held"] is not None:
+        student.held = state["held"].to(device)  # type: ignore[attr-defined]  # of a model that follows its splats
     optimizer = make_optimizer(student, config, pixel=1.0)  # the state holds the actual rates
     optimizer.load_state_dict(state["optimizer"])
     gradients = ScreenGradients.of(student.parameters()["means"], config) if state["gradients"] else None

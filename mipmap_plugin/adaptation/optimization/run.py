@@ -44,6 +44,7 @@ class Task:
     further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
     render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
+    follow: Callable[[SplatModel], None] = lambda student: None  # called before each step (`moments.follower`)
 
     def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""

@@ -13,6 +13,7 @@ from torch.nn.functional import linear, relu
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.state_dict import read_state_dict, require
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.moving.memory import Changes
 from mipmap_plugin.models.moving.model import MovingModel, read_canonical
 from mipmap_plugin.models.vanilla import VanillaModel
 
@@ -25,9 +26,6 @@ SCREW_OFFSET = 1e-5
 
 # Radians: below it (angle - sin(angle)) / angle**3 is computed from its series, which is exact there to 1e-9.
 SMALL_ANGLE = 0.5
-
-# Splats that are evaluated together: a few hundred numbers each are in memory at a time.
-CHUNK = 65_536
 
 
 class DeformNetwork:
@@ -51,26 +49,24 @@ class DeformNetwork:
         self.is_still = not any(self._weights[f"{head}.{part}"].any() for head in self._heads for part in ("weight", "bias"))
         self.cost = f"{sum(w.numel() for name, w in self._weights.items() if name.endswith('weight')):,} multiplications a splat and moment"
 
-    def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
+    def moved(self, canonical: VanillaModel, changes: Changes) -> Gaussians:
         """The splats as the original's kernel receives them: scales are changed additively and may become negative, quaternions are not
         normalized."""
-        still = canonical.gaussians()
-        # Detached: in the original, too, means have no gradient through the network.
-        motion, turn, growth = self.motion(still.means.detach(), time)
+        still, motion = canonical.gaussians(), changes["means"]
         means = move_along_screw(still.means, *motion.split(3, dim=1)) if self.is_6dof else still.means + motion
-        quats, scales = still.quats + turn, still.scales + growth
+        quats, scales = still.quats + changes["quats"], still.scales + changes["scales"]
         return Gaussians(means, quats, scales.abs(), still.opacities, still.sh, kernel_covariances(quats, scales))
 
     @torch.no_grad()
-    def motion(self, means: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Translations [N, 3], or screws [N, 6] with 6-DoF; changes of quaternions [N, 4] and of scales [N, 3]."""
+    def changes(self, means: Tensor, time: float) -> Changes:
+        """Translations [N, 3] of means, or screws [N, 6] with 6-DoF; changes of quaternions [N, 4] and of scales [N, 3]. As in the original,
+        they have no gradient."""
         moment = embed(means.new_tensor([[time]]), self._frequencies_of_time)
         if self.has_timenet:
             moment = self._layer("timenet.2", relu(self._layer("timenet.0", moment)))
-        hidden = [self._hidden(part, moment) for part in means.split(CHUNK)]
-        chunks = [[self._layer(head, h) for head in self._heads] for h in hidden]
-        *motion, turn, growth = (torch.cat(parts) for parts in zip(*chunks, strict=True))
-        return torch.cat(motion, dim=1), turn, growth
+        hidden = self._hidden(means, moment)
+        *motion, turn, growth = (self._layer(head, hidden) for head in self._heads)
+        return {"means": torch.cat(motion, dim=1), "quats": turn, "scales": growth}
 
     def to(self, device: torch.device | str) -> DeformNetwork:
         """The same network on another device."""
@@ -84,7 +80,7 @@ class DeformNetwork:
         inputs = torch.cat([embed(means, POSITION_FREQUENCIES), moment.expand(len(means), -1)], dim=1)
         hidden = inputs
         for number in range(self.depth):
-            hidden = relu(self._layer(f"linear.{number}", hidden))
+            hidden = self._layer(f"linear.{number}", hidden).relu_()
             if number == self.depth // 2:
                 hidden = torch.cat([inputs, hidden], dim=1)
         return hidden

@@ -16,6 +16,7 @@ from mipmap_plugin.formats.state_dict import read_state_dict, require
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.inria_folder import read_options
+from mipmap_plugin.models.moving.memory import Changes
 from mipmap_plugin.models.moving.model import MovingModel, read_canonical
 from mipmap_plugin.models.places import is_coarse
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
@@ -31,6 +32,9 @@ HEADS = {
     "opacity_deform": (1, "no_do", True),
     "shs_deform": (48, "no_dshs", True),
 }
+
+# The parameters that the heads change.
+CHANGED = dict(zip(HEADS, ("means", "scales", "quats", "opacities", "sh"), strict=True))
 
 # The two coordinates of each plane of a scale: xy, xz, xt, yz, yt, zt.
 PLANES = list(combinations(range(4), 2))
@@ -57,25 +61,30 @@ class HexPlane:
         self.is_still = self._is_still()
         self.cost = self._cost()
 
-    def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
-        """The splats at `time`. Changes apply to the raw parameters, before activation."""
+    def moved(self, canonical: VanillaModel, changes: Changes) -> Gaussians:
+        """The splats after `changes`, which apply to the raw parameters, before activation."""
         raw = canonical.parameters()
-        hidden = self.features(raw["means"], time)
-        mask = self._head("static_mlp", hidden) if self._options.get("static_mlp") else torch.ones_like(hidden[:, :1])
-        changes = {name: self._head(name, hidden) for name in self.heads}
+        mask = changes.get("mask", raw["means"].new_ones(()))
         moved = dict(raw)
-        if (shift := changes.get("pos_deform")) is not None:
+        if (shift := changes.get("means")) is not None:
             moved["means"] = raw["means"] * mask + shift
-        if (growth := changes.get("scales_deform")) is not None:
+        if (growth := changes.get("scales")) is not None:
             moved["scales"] = raw["scales"] * mask + growth
-        if (turn := changes.get("rotations_deform")) is not None:
+        if (turn := changes.get("quats")) is not None:
             moved["quats"] = quaternion_product(raw["quats"], turn) if self._options.get("apply_rotation") else raw["quats"] + turn
-        if (fade := changes.get("opacity_deform")) is not None:
-            moved["opacities"] = raw["opacities"] * mask[:, 0] + fade[:, 0]
-        if (tint := changes.get("shs_deform")) is not None:
-            sh = torch.cat([raw["sh0"], raw["shN"]], dim=1) * mask[:, None] + tint.unflatten(1, (-1, 3))
+        if (fade := changes.get("opacities")) is not None:
+            moved["opacities"] = raw["opacities"] * mask.reshape(-1) + fade[:, 0]
+        if (tint := changes.get("sh")) is not None:
+            sh = torch.cat([raw["sh0"], raw["shN"]], dim=1) * mask[..., None] + tint.unflatten(1, (-1, 3))
             moved |= {"sh0": sh[:, :1], "shN": sh[:, 1:]}
         return VanillaModel(moved).gaussians()
+
+    @torch.no_grad()
+    def changes(self, means: Tensor, time: float) -> Changes:
+        """What each head adds, [N, size], by the name of the parameter, and the "mask" [N, 1] that these are multiplied by, if there is one."""
+        hidden = self.features(means, time)
+        masks = {"mask": self._head("static_mlp", hidden)} if self._options.get("static_mlp") else {}
+        return {CHANGED[name]: self._head(name, hidden) for name in self.heads} | masks
 
     def features(self, means: Tensor, time: float) -> Tensor:
         """The inputs of the heads, [N, width], at positions [N, 3] and one time."""

@@ -18,11 +18,16 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.families import find_family
+from mipmap_plugin.models.moving.memory import Changes, Memory
 from mipmap_plugin.models.places import network_of
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 
 # Number of views at whose times opacities are evaluated; each costs one pass through the field.
 ENOUGH_MOMENTS = 8
+
+# While splats are adapted, the field is evaluated again where more than this part of them has moved so far that it would move them otherwise by
+# this many target pixels, or has moved by so many target pixels itself.
+MOVED_FAR, MOTION_ERROR, FARTHEST = 0.1, 0.05, 1.0
 
 TIMELESS = "a camera without a time shows the moment 0; a cameras.json holds no times, so adaptation then spreads them over its views"
 
@@ -34,8 +39,11 @@ class Field(Protocol):
     is_still: bool  # the field changes no splat, and need not be evaluated
     cost: str  # of one evaluation, counted
 
-    def __call__(self, canonical: VanillaModel, time: float) -> Gaussians:
-        """The splats at `time` (0..1), differentiable in the canonical parameters."""
+    def changes(self, means: Tensor, time: float) -> Changes:
+        """What it changes at `means` [N, 3] and `time` (0..1), without gradient: that of a mean through the field is left out."""
+
+    def moved(self, canonical: VanillaModel, changes: Changes) -> Gaussians:
+        """The splats after such changes, differentiable in the canonical parameters."""
 
     def to(self, device: torch.device | str) -> Field:
         """The same field on another device."""
@@ -44,8 +52,12 @@ class Field(Protocol):
 class MovingModel:
     """Canonical splats, stored as in 3DGS, deformed by a frozen field at the time of each camera."""
 
-    def __init__(self, family: str, canonical: VanillaModel, field: Field) -> None:
+    held: Tensor | None = None  # [N, 3]: where the field is evaluated; None: at the means
+
+    def __init__(self, family: str, canonical: VanillaModel, field: Field, memory: Memory | None = None) -> None:
+        """`memory`: that of a model with the same field."""
         self.family, self.canonical, self.field = family, canonical, field
+        self._memory = memory or Memory(lambda means, time: field.changes(means, time))
         self.source, self.folder, self.digest, self.notes = canonical.source, canonical.folder, canonical.digest, canonical.notes
 
     @property
@@ -74,7 +86,30 @@ class MovingModel:
         """All splats at the time of `camera`, 0 if it has none."""
         if not self.moves:
             return self.canonical.gaussians()
-        return self.field(self.canonical, camera.time or 0.0)
+        place = self.parameters()["means"].detach() if self.held is None else self.held
+        return self.field.moved(self.canonical, self._memory(place, camera.time or 0.0))
+
+    def reach(self, pixel: float) -> float:
+        """How far splats may move before the field moves them noticeably otherwise, world units. `pixel`: of the target, world units."""
+        slope = self._memory.slope(self.parameters()["means"].detach(), pixel)
+        return MOTION_ERROR * pixel / max(slope, MOTION_ERROR / FARTHEST)
+
+    @torch.no_grad()
+    def follow(self, reach: float) -> None:
+        """From now on, evaluate the field at the means as they are, if many have moved farther than `reach` since it was last done.
+
+        Between two such moments the splats move as the field moves the places where it was evaluated.
+        """
+        means = self.parameters()["means"].detach()
+        if self.held is None or float(((means - self.held).norm(dim=1) > reach).float().mean()) > MOVED_FAR:
+            self.held = means.clone()
+
+    def keep_rows(self, rows: Tensor) -> None:
+        """Take note that of the parameters only these `rows` [M], ascending, are going to be left."""
+        if self.held is not None:
+            left = self.held[rows]
+            self._memory.keep_rows(self.held, rows, left)
+            self.held = left
 
     def parameters(self) -> dict[str, Tensor]:
         """The parameters of the canonical splats, with the names of `VanillaModel`."""
@@ -82,12 +117,14 @@ class MovingModel:
 
     def copy(self) -> MovingModel:
         """An independent model whose canonical leaves require gradients; the field, which never changes, is shared."""
-        return MovingModel(self.family, self.canonical.copy(), self.field)
+        return MovingModel(self.family, self.canonical.copy(), self.field, self._memory)
 
     def to(self, device: torch.device | str) -> MovingModel:
         return MovingModel(self.family, self.canonical.to(device), self.field.to(device))
 
     def replace_parameters(self, parameters: dict[str, Tensor]) -> None:
+        if self.held is not None and len(self.held) != len(parameters["means"]):
+            self.held = None
         self.canonical.replace_parameters(parameters)
 
     def shared_parameters(self) -> dict[str, Tensor]:
@@ -127,6 +164,11 @@ class MovingModel:
         network = network_of(ply, self.family)
         network.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(network_of(self.source, self.family), network)
+
+
+def moved_to(field: Field, canonical: VanillaModel, time: float) -> Gaussians:
+    """The splats at `time` by an evaluation of the field, whatever is known."""
+    return field.moved(canonical, field.changes(canonical.parameters()["means"].detach(), time))
 
 
 def read_canonical(path: str | Path, iteration: int | None, family: str) -> tuple[VanillaModel, Path]:

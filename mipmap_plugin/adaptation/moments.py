@@ -1,0 +1,77 @@
+"""The moments of a moving scene: which ones views are adapted at, and where the field is evaluated while splats move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import chain, zip_longest
+from typing import Any
+
+from torch import Tensor
+
+from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.views import with_times
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.models.base import SplatModel
+
+# Moments at which the states are compared in the end: the field is evaluated anew at each, for each state.
+CHOOSING = 8
+
+
+def at_moments(views: Sequence[Camera], most: int | None) -> list[Camera]:
+    """The views, each at the nearest of at most so many of their own times, evenly chosen among these."""
+    times = sorted({view.time or 0.0 for view in views})
+    if most is None or len(times) <= most:
+        return list(views)
+    chosen = [times[round(number * (len(times) - 1) / max(1, most - 1))] for number in range(most)]
+    nearest = {time: min(chosen, key=lambda moment: abs(moment - time)) for time in times}
+    return [replace(view, time=nearest[view.time or 0.0]) for view in views]
+
+
+def sharing_moments(views: Sequence[Camera], validation: Sequence[Camera], most: int | None) -> tuple[list[Camera], list[Camera], str]:
+    """The views and the validation views, of which every second one steers, at `most` moments or fewer, and a description of these.
+
+    What chooses in the end has moments of its own, since it is held out.
+    """
+    used = at_moments([*views, *validation[::2]], most)
+    steering, choosing = used[len(views) :], at_moments(validation[1::2], most and min(most, CHOOSING))
+    before, after = (len({view.time for view in some}) for some in ([*views, *validation[::2]], used))
+    paired = [view for view in chain(*zip_longest(steering, choosing)) if view is not None]
+    return used[: len(views)], paired, "" if after == before else f", each at the nearest of {after} moments"
+
+
+def at_their_moments(
+    views: Sequence[Camera], validation: Sequence[Camera], config: AdaptConfig, note: str
+) -> tuple[list[Camera], list[Camera], str]:
+    """The views and the validation views with their times, at as many moments as the settings allow; and the `note` on them with those."""
+    views, times = with_times(views, config.seed)
+    validation, _ = with_times(validation, config.seed)
+    views, validation, moments = sharing_moments(views, validation, config.moments)
+    return views, validation, f"{note}, {times}{moments}"
+
+
+def follower(base: SplatModel, views: Sequence[Camera], scale: float) -> Callable[[SplatModel], None]:
+    """What is called before each step: it lets a field be evaluated where splats are, once that is no longer nearly where it was evaluated last."""
+    moving: Any = base
+    if not (base.traits.moves and hasattr(base, "follow")):
+        return lambda student: None
+    pixel = float(pixel_size(base.parameters()["means"].detach(), views).median()) / scale
+    reach = moving.reach(pixel)
+
+    def follow(student: Any) -> None:
+        student.follow(reach)
+
+    return follow
+
+
+def keep_rows(model: SplatModel, rows: Tensor) -> None:
+    """Tell a model that follows its splats which `rows` [M], ascending, are going to be left."""
+    if callable(keep := getattr(model, "keep_rows", None)):
+        keep(rows)
+
+
+def release(model: SplatModel) -> None:
+    """Let a field be evaluated exactly where the splats are, from now on."""
+    if getattr(model, "held", None) is not None:
+        model.held = None  # type: ignore[attr-defined]  # of a model that follows its splats

@@ -1,0 +1,169 @@
+"""Fields of moving scenes are evaluated once for the splats and a moment, and while splats are adapted only once that matters."""
+
+from dataclasses import replace
+
+import moving
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.moments import at_moments, release, sharing_moments
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.moving import memory
+from mipmap_plugin.models.moving.hexplane import HexPlane
+from mipmap_plugin.models.moving.memory import Memory
+from mipmap_plugin.models.moving.model import moved_to
+from mipmap_plugin.recipes import recipe
+from mipmap_plugin.wrap import wrap_model
+
+ALL_ON = "no_do=False, no_dshs=False, static_mlp=True, apply_rotation=True"
+
+
+def counted_memory(limit=1 << 30):
+    asked = []
+
+    def evaluate(means, time):
+        asked.append((len(means), time))
+        return {"means": means * time}
+
+    return Memory(evaluate, limit), asked
+
+
+def at_times(count):
+    return [replace(view, time=number / (count - 1)) for number, view in enumerate(tiny.cameras(count))]
+
+
+@pytest.mark.parametrize("write", [moving.write_deformable, lambda folder: moving.write_hexplane(folder, ALL_ON)])
+def test_what_is_kept_shows_what_an_evaluation_shows(tmp_path, write):
+    model = load_model(write(tmp_path / "m"))
+    for _ in range(2):
+        known, exact = model.gaussians(moving.at(0.4)), moved_to(model.field, model.canonical, 0.4)
+        for name in ("means", "scales", "quats", "opacities", "sh"):
+            assert torch.equal(getattr(known, name), getattr(exact, name))
+
+
+def test_a_moment_is_evaluated_once_for_a_model_and_its_copies_and_again_where_splats_moved(tmp_path, monkeypatch):
+    model, evaluated = load_model(moving.write_hexplane(tmp_path / "m")), []
+    changes = model.field.changes
+    monkeypatch.setattr(model._memory, "_evaluate", lambda means, time: evaluated.append(time) or changes(means, time))
+    student = model.copy()
+    for each in (model, student, model):
+        each.gaussians(moving.at(0.5))
+    assert evaluated == [0.5]
+    with torch.no_grad():
+        student.parameters()["means"][3] += 0.1
+    assert not torch.equal(student.gaussians(moving.at(0.5)).means[3], model.gaussians(moving.at(0.5)).means[3])
+    assert torch.equal(student.gaussians(moving.at(0.5)).means, moved_to(model.field, student.canonical, 0.5).means)
+    assert evaluated == [0.5, 0.5]  # what was known of the base still is
+
+
+def test_moments_of_no_use_are_forgotten():
+    known, asked = counted_memory(limit=3 * 2 * 10 * 3 * 4)  # places and changes of three moments
+    means = torch.ones(10, 3)
+    for time in (0.1, 0.2, 0.3, 0.1, 0.4, 0.1, 0.2):
+        known(means, time)
+    assert [time for _, time in asked] == [0.1, 0.2, 0.3, 0.4, 0.2]
+
+
+def test_many_splats_are_evaluated_in_parts(monkeypatch):
+    monkeypatch.setattr(memory, "CHUNK", 4)
+    known, asked = counted_memory()
+    means = torch.arange(30.0).reshape(10, 3)
+    assert torch.equal(known(means, 0.5)["means"], means / 2) and [count for count, _ in asked] == [4, 4, 2]
+
+
+def test_a_followed_model_moves_its_splats_as_before_until_they_are_far_off(tmp_path):
+    model = load_model(moving.write_deformable(tmp_path / "m"))
+    student, camera = model.copy(), moving.at(0.7)
+    student.follow(reach=0.1)
+    before = student.gaussians(camera).means - student.parameters()["means"]
+    with torch.no_grad():
+        student.parameters()["means"].add_(0.05)
+    student.follow(reach=0.1)
+    torch.testing.assert_close(student.gaussians(camera).means - student.parameters()["means"], before)
+    with torch.no_grad():
+        student.parameters()["means"].add_(0.05)
+    student.follow(reach=0.1)
+    assert torch.equal(student.gaussians(camera).means, moved_to(model.field, student.canonical, 0.7).means)
+    with torch.no_grad():
+        student.parameters()["means"].add_(0.01)
+    release(student)
+    assert torch.equal(student.gaussians(camera).means, moved_to(model.field, student.canonical, 0.7).means)
+
+
+def test_rows_that_are_left_move_as_before_without_an_evaluation(tmp_path, monkeypatch):
+    model = load_model(moving.write_deformable(tmp_path / "m"))
+    student, camera, rows = model.copy(), moving.at(0.2), torch.arange(0, 60, 3)
+    student.follow(reach=0.1)
+    before = student.gaussians(camera).means[rows]
+    student.keep_rows(rows)
+    student.replace_parameters({name: tensor.detach()[rows].requires_grad_() for name, tensor in student.parameters().items()})
+    monkeypatch.setattr(model._memory, "_evaluate", None)
+    assert torch.equal(student.gaussians(camera).means, before)
+
+
+def test_other_rows_are_evaluated_anew(tmp_path):
+    student = load_model(moving.write_deformable(tmp_path / "m")).copy()
+    student.follow(reach=0.1)
+    student.replace_parameters({name: tensor.detach()[:7].clone().requires_grad_() for name, tensor in student.parameters().items()})
+    assert len(student.gaussians(moving.at(0.2))) == 7
+
+
+def test_the_reach_is_shorter_where_neighbors_move_otherwise(tmp_path):
+    rough, state = moving.deform_state(), moving.deform_state()
+    for name in ("linear.0.weight", "linear.5.weight"):
+        state[name][:, 9:63] = 0  # none but the slowest waves
+    smooth = load_model(moving.write_deformable(tmp_path / "s", state)).reach(0.01)
+    assert load_model(moving.write_deformable(tmp_path / "r", rough)).reach(0.01) < smooth / 3 and smooth <= 0.01
+
+
+def test_views_are_at_the_nearest_of_few_moments():
+    views = at_times(11)
+    assert [view.time for view in at_moments(views, 3)] == [0, 0, 0, 0.5, 0.5, 0.5, 0.5, 0.5, 1, 1, 1][:3] + [0.5] * 5 + [1] * 3
+    assert at_moments(views, None) == views == at_moments(views, 11)
+    assert [view.viewmat.tolist() for view in at_moments(views, 2)] == [view.viewmat.tolist() for view in views]
+
+
+def test_views_that_choose_have_moments_of_their_own():
+    views, validation = at_times(30), [replace(view, time=0.01 + 0.03 * number) for number, view in enumerate(tiny.cameras(24))]
+    used, both, note = sharing_moments(views, validation, 6)
+    moments = {view.time for view in used}
+    assert len(moments) <= 6 and {view.time for view in both[::2]} <= moments and note == ", each at the nearest of 6 moments"
+    own = {view.time for view in both[1::2]}
+    assert len(own) <= 6 and own <= {view.time for view in validation[1::2]}
+    assert sharing_moments(views, validation, None)[::2] == (views, "")
+
+
+def test_the_published_recipe_takes_each_view_at_its_own_time():
+    assert recipe("paper", 1 / 4).moments is None and recipe("default", 1 / 4).moments == recipe("default", 4).moments == 24
+
+
+def test_a_run_evaluates_the_field_a_few_times_a_moment_whatever_its_views(tmp_path, monkeypatch):
+    evaluated, changes = [], HexPlane.changes
+    monkeypatch.setattr(HexPlane, "changes", lambda field, means, time: evaluated.append(len(means)) or changes(field, means, time))
+    cameras = at_times(30)
+    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=cameras, backend="reference")
+    adapted = wrapped.adapt(1 / 2, steps=40, extra_views=10, moments=4, validation_views=4)
+    assert sum(evaluated) / 60 < 60  # of 160 pictures of steps, and 50 others
+    assert adapted.report.views.endswith("at their own times, each at the nearest of 4 moments")
+    assert adapted.model.held is None
+
+
+def test_a_resumed_run_comes_to_the_same(tmp_path):
+    """What it evaluates the field at is part of its state."""
+    folder, settings = moving.write_hexplane(tmp_path / "m"), dict(steps=12, extra_views=2, validation_views=4, returns="last", prune_every=5)
+    whole = wrap_model(folder, backend="reference").adapt(1 / 2, **settings).model.parameters()
+
+    def interrupt(step, seconds, render):
+        if step == 8:
+            raise KeyboardInterrupt
+
+    state = tmp_path / "state"
+    from mipmap_plugin.adaptation.optimization import resume
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(resume, "SAVE_EVERY_S", 0.0)
+        wrap_model(folder, backend="reference").adapt(1 / 2, resume=state, observe=interrupt, **settings)
+    resumed = wrap_model(folder, backend="reference").adapt(1 / 2, resume=state, **settings).model.parameters()
+    for name, tensor in whole.items():
+        torch.testing.assert_close(resumed[name], tensor, rtol=1e-4, atol=1e-4)
