@@ -26,8 +26,9 @@ from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 ENOUGH_MOMENTS = 8
 
 # While splats are adapted, the field is evaluated again where more than this part of them has moved so far that it would move them otherwise by
-# this many target pixels, or has moved by so many target pixels itself.
-MOVED_FAR, MOTION_ERROR, FARTHEST = 0.1, 0.05, 1.0
+# this many target pixels, or has moved by so many target pixels itself. With a fourth of the error a scene of 39,000 splats at x1/4 gains 0.06 dB,
+# for twice as many evaluations.
+MOVED_FAR, MOTION_ERROR, FARTHEST = 0.1, 0.2, 1.0
 
 TIMELESS = "a camera without a time shows the moment 0; a cameras.json holds no times, so adaptation then spreads them over its views"
 
