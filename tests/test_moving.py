@@ -54,3 +54,20 @@ def test_inspect_says_that_the_scene_moves(tmp_path, capsys, write):
     assert main(["inspect", str(tmp_path / "m")]) == 0
     output = capsys.readouterr().out
     assert "is frozen: they adapt as they are before they move" in output and "without a time shows the moment 0" in output
+
+
+def test_render_shows_the_moments_that_are_asked_for(tmp_path, capsys):
+    folder, words = moving.write_hexplane(tmp_path / "m"), ["--backend", "reference", "--view", tiny.cameras(1)[0].name]
+    for output, times in (("one", ["0"]), ("two", ["0.25", "1"])):
+        assert main(["render", str(folder), "--output", str(tmp_path / output), *words, *(w for t in times for w in ("--time", t))]) == 0
+    [one], two = sorted((tmp_path / "one").iterdir()), sorted((tmp_path / "two").iterdir())
+    assert [picture.stem.rpartition("_")[2] for picture in two] == ["t0.25", "t1"] and "_t0" not in one.stem
+    assert len({picture.read_bytes() for picture in (one, *two)}) == 3
+
+
+def test_render_refuses_times_of_no_scene(tmp_path, capsys):
+    still, moves = tiny.folder(tmp_path / "still", tiny.cameras(1)), moving.write_hexplane(tmp_path / "m")
+    cases = (still or tmp_path / "still", "0.5", "nothing moves in this scene"), (moves, "1.5", "must be from 0 to 1, got 1.5")
+    for folder, time, sentence in cases:
+        assert main(["render", str(folder), "--output", str(tmp_path / "out"), "--time", time]) == 2
+        assert sentence in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -28,6 +29,7 @@ def render(
     output: Path,
     scale: OwnScale = None,
     view: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    time: tyro.conf.UseAppendAction[tuple[float, ...]] = (),
     screen_filter: Literal["trained", "scaled"] | Name = "trained",
     viewer: str | None = None,
     supersampling: int = 1,
@@ -47,6 +49,7 @@ def render(
         output: The folder for the pictures.
         scale: Zoom, relative to the cameras; by default the scale that the file was adapted to, or else 1.
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
+        time: Moment of a moving scene, 0 to 1, in place of those of the views; given several times: each view at each moment.
         screen_filter: trained: the filter of the checkpoint's training; scaled: the training-free filter for this scale.
         viewer: Render as this viewer does: classic, spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown name lists all viewers.
         supersampling: N for N x N samples per pixel. The screen filter keeps its size: the exact picture of a zoom-out needs scaled, too.
@@ -60,7 +63,7 @@ def render(
         overwrite: Replace pictures that exist.
     """
     wrapped = wrap(checkpoint, cameras, background, backend)
-    zoom, views = _zoom(wrapped, scale), _named(wrapped, view)
+    zoom, views = _zoom(wrapped, scale), _at_times(wrapped, _named(wrapped, view), time)
     filter_name = None if screen_filter == "trained" else screen_filter
     if viewer is not None:
         wrapped.effects(zoom, filter_name, supersampling, viewer)  # check the options before any work
@@ -76,6 +79,18 @@ def render(
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
     count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
     say(f"{count} in {output}{f', at x{zoom:g}, which the file was adapted to' if scale is None and zoom != 1 else ''}")
+
+
+def _at_times(wrapped: Wrapped, views: Sequence[Camera], times: Sequence[float]) -> list[Camera]:
+    """The views at each of the times, named by both where there are several; the views as they are without times. Raises SettingsError."""
+    if not times:
+        return list(views)
+    if not wrapped.model.traits.moves:
+        raise SettingsError("time: nothing moves in this scene, so that it looks the same at all times; leave it out")
+    if wrong := [time for time in times if not 0 <= time <= 1]:
+        raise SettingsError(f"time: must be from 0 to 1, got {wrong[0]:g}")
+    named = [f"_t{time:g}" if len(times) > 1 else "" for time in times]
+    return [replace(view, name=f"{view.name}{name}", time=time) for view in views for time, name in zip(times, named, strict=True)]
 
 
 def _zoom(wrapped: Wrapped, scale: float | None) -> float:
