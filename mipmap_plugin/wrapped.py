@@ -175,7 +175,7 @@ class Wrapped:
         """Return a new model for `scale` (target focal length in px over base focal length in px); the base does not change.
 
         `viewer`: the viewer that the file will be opened in (`splatting.viewers`), or "portable" for all built-in ones at once; by
-        default renderers that draw as the training did; for a base trained with compensation, the classic ones.
+        default renderers that draw as the training did.
         `cameras`: views of the base scale, instead of the checkpoint's own. `settings` override those of the recipe, by the names
         of AdaptConfig: steps, time_budget_s, target_db, seed, views, ... `resume`: a file to continue from if it exists; Ctrl-C writes it
         and raises Interrupted, a long run writes it every minute, and saving the model removes it. `observe(step, seconds, render)` is
@@ -253,7 +253,7 @@ class Wrapped:
         Raises SettingsError for a model whose splats no viewer renders.
         """
         if viewer is None:
-            return {"": self.effects() if self.trained.keeps_filter else replace(self.effects(), screen_filter="classic", eps2d=DILATION)}
+            return {"": self.effects()}
         if reason := why_no_viewer(self.model):
             raise SettingsError(f"{self.model.family}: {reason}; leave the viewer {viewer} out")
         return {name: self.effects(viewer=name) for name in viewers_for(viewer)}

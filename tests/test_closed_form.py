@@ -17,6 +17,7 @@ from mipmap_plugin.adaptation.start.closed_form import (
     SEEN,
     FormSettings,
     closed_form,
+    draws_alike,
     enough_views,
     filter_suffices,
     pixel_size,
@@ -218,20 +219,41 @@ MIP = Effects(0, "mip", 0.1)
 @pytest.mark.parametrize(
     ("base", "target", "nothing"),
     [
+        (MIP, MIP, False),
+        (Effects(0, "antialiased"), Effects(0, "antialiased"), False),
+        (MIP, Effects(0, "analytic", 0.1), True),  # which does what a pixel does, whatever the base's filter was
+        (MIP, Effects(0, "mip", 0.3), False),
+        (Effects(0), Effects(0), False),
+        (Effects(0), Effects(0, "analytic", 0.1), False),
+        (Effects(0, SURFEL), Effects(0, SURFEL), False),
+    ],
+)
+def test_what_needs_nothing(base, target, nothing):
+    assert filter_suffices(base, target) == nothing
+
+
+@pytest.mark.parametrize(
+    ("base", "target", "alike"),
+    [
         (MIP, MIP, True),
         (Effects(0, "antialiased"), Effects(0, "antialiased"), True),
-        (MIP, Effects(0, "analytic", 0.1), True),  # which does what a pixel does, whatever the base's filter was
         (MIP, Effects(0, "mip", 0.3), False),
         (Effects(0, "antialiased"), MIP, False),
         (Effects(0), Effects(0), False),
         (MIP, Effects(0), False),
-        (Effects(0), MIP, False),
         (Effects(0, SURFEL), Effects(0, SURFEL), False),
     ],
 )
+def test_what_compensates_alike(base, target, alike):
+    assert draws_alike(base, target) == alike
+
+
 @pytest.mark.parametrize("scale", [1 / 4, 4])
-def test_what_needs_nothing(base, target, nothing, scale):
-    assert filter_suffices(scale, base, target) == nothing
+def test_what_compensates_alike_changes_only_where_opacities_are_matched(scale):
+    splat, effects = disc(0.3, 0.05), Effects(0, "antialiased")
+    left, formed = (closed_form(splat, [VIEW], scale, effects, effects, FormSettings(matched=matched)) for matched in (False, True))
+    assert torch.equal(left[0], splat.scales) and torch.equal(left[1], splat.opacities)
+    assert not torch.equal(formed[0], splat.scales) and not torch.equal(formed[1], splat.opacities)
 
 
 @pytest.mark.parametrize("size", [(0.8, 0.8), (3.0, 0.05), (0.01, 0.01)])

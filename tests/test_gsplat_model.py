@@ -125,11 +125,11 @@ def test_version_1_0_keeps_its_own_name_for_the_means_and_its_json(tmp_path):
 
 
 @pytest.mark.parametrize("scale", [1 / 4, 4])
-def test_adapting_raises_the_quality_and_says_classic_in_the_cfg(tmp_path, scale):
+def test_adapting_for_classic_renderers_raises_the_quality_and_says_so_in_the_cfg(tmp_path, scale):
     folder, cameras = gsplat_folder(tmp_path / "r", splats(60), antialiased="true"), tiny.cameras()
     before = (folder / "ckpts/ckpt_6999_rank0.pt").read_bytes()
     base = wrap_model(folder, cameras=cameras, backend="reference")
-    adapted = base.adapt(scale, steps=16 if scale < 1 else 0, extra_views=2)
+    adapted = base.adapt(scale, viewer="classic", steps=16 if scale < 1 else 0, extra_views=2)
     adapted.save(tmp_path / "out")
     again = wrap_model(tmp_path / "out", cameras=cameras, backend="reference")
     camera, truth = cameras[0].zoomed(scale), aim(base, cameras[0], scale)

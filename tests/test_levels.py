@@ -131,9 +131,8 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
     config = SimpleNamespace(most_splats=None, closed_form=True, merge_to=0.1, merging_costs=9.0, returns="best", time_budget_s=None)
     problem = SimpleNamespace(
         base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, quality=quality, may_lose=9.0, name="the finer level",
-        views=[], scale=0.5, phase=lambda _: nullcontext(), base_effects=None, target=Effects(0), has_blend_weights=False,
+        views=[], scale=0.5, phase=lambda _: nullcontext(), base_effects=Effects(0), target=Effects(0), has_blend_weights=False,
     )  # fmt: skip
-    monkeypatch.setattr(candidates, "filter_suffices", lambda *_: False)
     monkeypatch.setattr(candidates.StartSearch, "_base_weights", lambda *_: None)
     monkeypatch.setattr(candidates.StartSearch, "_candidate", candidate)
     assert candidates.StartSearch(problem).best()[0] == ("merged", 0.1, coarsely)

@@ -188,7 +188,7 @@ def test_filters_that_no_camera_sees_are_refused():
 
 
 def test_a_fused_file_is_recognized_by_its_options_or_given_its_filter(tmp_path):
-    """It has the columns of 3DGS: the options beside it or the user name its filter. Adapted, it is for renderers without a 3D filter."""
+    """It has the columns of 3DGS: the options beside it or the user name its filter. Adapted, it is drawn as its training drew it."""
     plain = {name: column for name, column in splats().items() if name != "filter_3D"}
     inside = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras())
     assert inside.model.family == "3dgs" and (inside.effects().screen_filter, inside.effects().eps2d) == ("mip", 0.1)
@@ -197,15 +197,18 @@ def test_a_fused_file_is_recognized_by_its_options_or_given_its_filter(tmp_path)
     wrapped = wrap_model(bare, cameras=tiny.cameras(), screen_filter="mip", backend="reference")
     assert (wrapped.effects().screen_filter, wrapped.effects().eps2d) == ("mip", 0.1)
     adapted = wrapped.adapt(0.25, steps=0)
-    assert adapted.effects.screen_filter == adapted.model.trained.screen_filter == "classic"
-    assert "base mip 0.1 px²; file classic 0.3 px²" in adapted.report.filters
+    assert adapted.effects == wrapped.effects() and adapted.model.trained.screen_filter == "mip"
+    assert "base mip 0.1 px²; file mip 0.1 px²" in adapted.report.filters
+    again = load_model(adapted.save(tmp_path / "small.ply"))
+    assert (again.trained.screen_filter, again.trained.eps2d) == ("mip", 0.1)
+    assert again.notes == ["the header says that the splats are to be drawn mip (0.1 px²)"]
     with pytest.raises(SettingsError, match="no screen filter 'soft'"):
         wrap_model(bare, screen_filter="soft")
 
 
 def test_an_adapted_file_in_a_folder_of_mip_splatting_stays_classic(tmp_path):
     plain = {name: column for name, column in splats().items() if name != "filter_3D"}
-    adapted = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras()).adapt(0.25, steps=0)
+    adapted = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras()).adapt(0.25, viewer="classic", steps=0)
     adapted.save(tmp_path / "adapted")
     assert load_model(tmp_path / "adapted").trained.screen_filter == "classic"
 
@@ -226,7 +229,7 @@ def test_the_command_line_takes_the_filter(tmp_path, capsys):
     assert main(["inspect", str(fused), "--screen-filter", "mip"]) == 0
     assert "mip, 0.1 px²" in capsys.readouterr().out
     assert main(["adapt", str(fused), "--scale", "4", "--screen-filter", "mip", "--steps", "0", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)[0]["filters"].endswith("base mip 0.1 px²; file classic 0.3 px²")
+    assert json.loads(capsys.readouterr().out)[0]["filters"].endswith("base mip 0.1 px²; file mip 0.1 px²")
 
 
 def test_any_model_can_be_rendered_with_a_3d_filter():

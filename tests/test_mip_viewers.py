@@ -72,7 +72,7 @@ def test_at_scale_one_adapting_brings_a_viewer_closer_to_the_bases_own_image(tmp
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize(("viewer", "tag"), [("spark", "antialiased"), ("playcanvas", "classic")])
+@pytest.mark.parametrize(("viewer", "tag"), [("spark", "mip"), ("playcanvas", "classic")])
 def test_what_is_made_for_a_viewer_is_a_checkpoint_of_3dgs(tmp_path, family, viewer, tag):
     base = wrapped(tmp_path, family)
     write_cameras(base.model.folder / "cameras.json", tiny.cameras())
@@ -140,7 +140,7 @@ def test_splats_that_were_fused_elsewhere_leave_the_kernel_size_behind_too(tmp_p
     plain = {name: column for name, column in splats().items() if name != "filter_3D"}
     base = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras(), backend="reference")
     base.adapt(1, viewer="spark", **BRIEF).save(tmp_path / "made")
-    assert (load_model(tmp_path / "made").trained.screen_filter, load_model(tmp_path / "made").trained.eps2d) == ("antialiased", 0.3)
+    assert (load_model(tmp_path / "made").trained.screen_filter, load_model(tmp_path / "made").trained.eps2d) == ("mip", 0.3)
 
 
 def test_who_draws_the_base_has_its_filter_too(tmp_path, monkeypatch):

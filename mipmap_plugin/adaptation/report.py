@@ -26,7 +26,7 @@ class Report(BaseModel):
         settings: Those of the run, as the recipe and its overrides give them.
         backend: Which one, and why.
         views: Which views were adapted to, in a sentence.
-        viewer: What the file is made for; None: any viewer that renders as 3DGS does, or the base's project if it keeps its filter.
+        viewer: What the file is made for; None: what renders as the base's training did.
         filters: Of the pseudo truth, the base and the adapted file.
         effects: What adapting and rendering simulate, what they do not, and why.
         gaussians_before: Splats of the base.
@@ -36,6 +36,7 @@ class Report(BaseModel):
         returned: Which of the run's states the file holds, and why if it is not the last.
         validation: dB of each state on views that nothing was adapted to and that did not steer the run, at most 54 of a view.
         viewers: Of a file for several viewers: dB in each on the same views; `validation` is the worst of the extreme viewers.
+        as_trained: dB of the base itself on the same views, drawn as its training drew it; None at x1, and where the file is drawn so too.
         peak_memory_mib: Of tensors on the GPU while adapting; None without a GPU.
         curve: Quality against time; a point per check.
         versions: Of this package and of torch.
@@ -60,6 +61,7 @@ class Report(BaseModel):
     returned: str
     validation: dict[str, float]
     viewers: dict[str, float] = {}
+    as_trained: float | None = None
     peak_memory_mib: float | None = None
     curve: list[CurvePoint]
     versions: dict[str, str]

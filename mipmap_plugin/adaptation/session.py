@@ -16,6 +16,7 @@ from torch import Tensor
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, is_true
+from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.moments import at_their_moments, follower, release
 from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import within_budget
@@ -253,14 +254,6 @@ class Session:
         facts = [base, self.inputs, self.scale, settings, self.backend.name, asdict(self.base_effects), targets, views]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
-    def _psnr_per_viewer(self, model: SplatModel) -> dict[str, float]:
-        """PSNR (dB) in each viewer, where the file is made for several."""
-        if len(self.targets) == 1:
-            return {}
-        first, *further = [Renderer(self.backend, target) for target in self.targets.values()]
-        psnrs = replace(self.validation, render=first, further_renders=further).viewer_psnrs(model, self.validation.choosing)
-        return dict(zip(self.targets, psnrs, strict=True))
-
     def _effects(self) -> list[Effect]:
         """Every effect; it is on where it is on in any viewer that the file is made for."""
         gaussians, model_effects = self.base.gaussians(self.views[0]), effects_of(self.base)
@@ -270,6 +263,9 @@ class Session:
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, returned: str, validation: dict[str, float]) -> Report:
         known = [*self.base.notes, *(self.finer.model.notes if self.finer else ())]
         notes = [*self.notes, *(note for note in student.notes if note not in known)]
+        as_trained = psnr_as_trained(self.validation, self.backend, self.targets, self.base, self.base_effects) if validation else None
+        shown = next((psnr for state, psnr in validation.items() if returned.startswith(state)), 0.0)
+        notes += better_as_trained(as_trained, shown, self.base_effects)
         for note in notes:
             warn(note)
         return Report(
@@ -287,7 +283,8 @@ class Session:
             ended_by=ended_by,
             returned=returned,
             validation=validation,
-            viewers=self._psnr_per_viewer(student) if validation else {},
+            viewers=psnr_per_viewer(self.validation, self.backend, self.targets, student) if validation else {},
+            as_trained=as_trained,
             peak_memory_mib=self.peak.mib(),
             curve=curve,
             versions=versions(),

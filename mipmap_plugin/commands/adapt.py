@@ -75,7 +75,7 @@ def adapt(
         scale: Target focal length over base focal length, such as 1/4 or 4; may be given several times. Required without splats or bytes.
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
-        viewer: Viewer to make the file for: classic (the default; INRIA, gsplat, nerfstudio), spark, ...; portable: all; repeat it for a file each.
+        viewer: Viewer to make the file for: classic, spark, ...; portable: all; several: a file each. By default what draws as the training did.
         cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
         splats: Maximum number of splats. Without a scale, the file is made for the zoom that so many splats suit.
         bytes: Maximum size of the file, such as 20MB, in place of a number of splats.
@@ -205,9 +205,10 @@ def _made_for(report: Report, model: SplatModel) -> str:
     if why_no_viewer(model):
         return "made for its own project"
     advice = "; for others give --viewer spark, supersplat, ..."
-    if model.trained.keeps_filter:
+    if (trained := model.trained).keeps_filter:
         return f"made for its own project, whose filter it keeps{advice}"
-    return f"made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio){advice}"
+    own = f"its training did ({trained.screen_filter}, {trained.eps2d:g} px²)"
+    return f"made for renderers that draw as {own if trained.screen_filter != 'classic' else '3DGS does (INRIA, gsplat, nerfstudio)'}{advice}"
 
 
 def _say(saved: Path, adapted: Adapted) -> None:
@@ -225,6 +226,8 @@ def _details(report: Report) -> Iterator[str]:
     yield f"holds {report.returned}{f' (dB on views that nothing was adapted to: {psnrs})' if psnrs else ''}; ended by {report.ended_by}"
     if report.viewers:
         yield f"in each viewer: {', '.join(f'{name} {psnr:.1f}' for name, psnr in report.viewers.items())} dB"
+    if report.as_trained is not None:
+        yield f"the base itself, drawn as its training drew it: {report.as_trained:.2f} dB on the same views"
     if report.peak_memory_mib is not None:
         yield f"at most {report.peak_memory_mib:,.0f} MiB on the GPU"
     yield f"{report.views}; {report.filters}; backend {report.backend}"

@@ -13,7 +13,7 @@ from mipmap_plugin.adaptation.optimization.validation import mean_db
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, enough_views, filter_suffices, pixel_size
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, enough_views, filter_suffices, pixel_size
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
 from mipmap_plugin.camera import evenly
@@ -36,7 +36,8 @@ class StartSearch:
     def __init__(self, scene: TiledScene, folder: Path) -> None:
         self.scene, self.folder = scene, folder
         self.truths = Truths(scene, folder)
-        self.matches = scene.scale <= 1 and not filter_suffices(scene.scale, scene.base_effects, scene.target)
+        effects = scene.base_effects, scene.target
+        self.matches = scene.scale <= 1 and not (filter_suffices(*effects) or draws_alike(*effects))
         self.views = evenly(scene.views.adapted, enough_views(scene.base.places[:, :3], scene.views.adapted))
 
     @torch.no_grad()

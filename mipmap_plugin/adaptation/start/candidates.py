@@ -19,6 +19,7 @@ from mipmap_plugin.adaptation.start.closed_form import (
     LEAST_VIEWS,
     FormSettings,
     closed_form,
+    draws_alike,
     filter_suffices,
     pixel_size,
     views_for,
@@ -120,7 +121,9 @@ class StartSearch:
         self._shown = torch.empty(0, dtype=torch.bool)  # of the base's splats (`may_show`), once blend weights are known
         self.notes: list[str] = []  # on what the views show of the base
         self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
-        unchanged = filter_suffices(problem.scale, problem.base_effects, problem.target)
+        self._alike = draws_alike(problem.base_effects, problem.target)
+        self._keeps_shapes = self._alike and problem.config.steps > 0  # steps end 0.1 to 0.2 dB higher from the base's own shapes (lego and chair)
+        unchanged = self._keeps_shapes or filter_suffices(problem.base_effects, problem.target)
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
         self._matches_weights = problem.has_blend_weights and not unchanged and (problem.scale <= 1 or not spreads)
 
@@ -140,11 +143,14 @@ class StartSearch:
         if config.merge_to == 1 and config.returns == "last":
             return formed, start_name(config)
         before, after = problem.quality(base), problem.quality(formed)
+        if self._alike and after.visible < before.visible:  # the filter itself is the better answer, for merged splats too
+            self._keeps_shapes, after = True, before
         bounds = Bounds(after.psnr - config.merging_costs, before.visible - problem.may_lose)
         merged = self._merged(weights, bounds, self._coarse_bounds(bounds, before)) if config.merge_to < 1 else None
         if merged is not None:
             return merged, start_name(config, merged=True)
-        return (formed, start_name(config)) if after.visible >= before.visible and config.closed_form else (base, problem.name)
+        better = after.visible >= before.visible and config.closed_form and not self._keeps_shapes
+        return (formed, start_name(config)) if better else (base, problem.name)
 
     def _merged(self, weights: Tensor | None, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
         """What is merged furthest within bounds; None if merging costs too much.
@@ -189,7 +195,7 @@ class StartSearch:
         if fraction < 1 and weights is not None:
             with problem.phase("merging"):
                 weights = self._merge(student, weights, fraction, coarsely)
-        if problem.config.closed_form:
+        if problem.config.closed_form and not self._keeps_shapes:
             with problem.phase("closed form"):
                 student.reshape(lambda gaussians: self._closed_form(gaussians, weights), problem.views)
         return student
@@ -221,7 +227,7 @@ class StartSearch:
             rounds -= 1
         area_power = 1.0 if rounds else AREA_POWER
         pixel = self._pixel_size(gaussians.means)
-        settings = FormSettings(area_power, problem.config.crispness, self._count, pixel)
+        settings = FormSettings(area_power, problem.config.crispness, self._count, pixel, matched=weights is not None and rounds > 0)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities

@@ -1,0 +1,41 @@
+"""What renderers show that a file is not steered by: each viewer of several, and a renderer of the base's training, which shows the base itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
+from mipmap_plugin.adaptation.renderers import Renderer
+from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.models.base import SplatModel
+
+
+def psnr_per_viewer(validation: Validation, backend: Backend, targets: Mapping[str, Effects], model: SplatModel) -> dict[str, float]:
+    """PSNR (dB) of a model in each viewer on the views that choose among states, where it is made for several; {} for one."""
+    if len(targets) == 1:
+        return {}
+    first, *further = [Renderer(backend, target) for target in targets.values()]
+    psnrs = replace(validation, render=first, further_renders=further).viewer_psnrs(model, validation.choosing)
+    return dict(zip(targets, psnrs, strict=True))
+
+
+def psnr_as_trained(
+    validation: Validation, backend: Backend, targets: Mapping[str, Effects], base: SplatModel, effects: Effects
+) -> float | None:
+    """PSNR (dB) of the base on the same views as its training draws it (`effects`).
+
+    None at x1, where that is the truth itself, and where the file is drawn so too, so that this is the base as it is.
+    """
+    if validation.scale == 1 or not validation.choosing or effects in targets.values():
+        return None
+    return replace(validation, render=Renderer(backend, effects), further_renders=[]).viewer_psnrs(base, validation.choosing)[0]
+
+
+def better_as_trained(as_trained: float | None, psnr: float, effects: Effects) -> list[str]:
+    """A note where a renderer of the base's training shows the base itself better than the file's viewer shows the file; none elsewhere."""
+    if as_trained is None or as_trained <= psnr + HARM_DB:
+        return []
+    own = f"drawn as its training drew it ({effects.screen_filter} {effects.eps2d:g} px²), the base itself has {as_trained:.2f} dB"
+    return [f"{own} on the same views, more than this file's {psnr:.2f}: for a renderer that draws so, adapt without a viewer"]
