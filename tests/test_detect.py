@@ -5,6 +5,7 @@ import gzip
 import numpy as np
 import pytest
 import torch
+import torch_checkpoints
 from ply_files import splat_columns, write, write_model_folder, write_splats
 
 from mipmap_plugin.errors import CheckpointError
@@ -142,6 +143,19 @@ def test_an_incomplete_newest_iteration_is_passed_over_with_a_note(tmp_path):
         detect(folder, iteration=30000)
 
 
+def test_a_folder_above_its_checkpoints_names_them(tmp_path):
+    runs = [tmp_path / "outputs/poster/splatfacto" / day for day in ("2024-05-01_120000", "2024-05-02_120000")]
+    for run in runs:
+        torch_checkpoints.splatfacto_folder(run, torch_checkpoints.splats())
+    for above in ("outputs", "outputs/poster", "outputs/poster/splatfacto"):
+        with pytest.raises(CheckpointError) as caught:
+            detect(tmp_path / above)
+        assert str(caught.value) == f"{tmp_path / above} lies above its checkpoints; give {runs[1]} or {runs[0]}"
+    write_model_folder(tmp_path / "scenes/garden")
+    with pytest.raises(CheckpointError, match=r"scenes lies above its checkpoint; give .*garden$"):
+        detect(tmp_path / "scenes")
+
+
 def test_folders_without_an_answer(tmp_path):
     folder = write_model_folder(tmp_path / "m", 7000)
     with pytest.raises(CheckpointError, match="has no iteration_5; it has 7000"):
@@ -151,8 +165,9 @@ def test_folders_without_an_answer(tmp_path):
     (tmp_path / "e/point_cloud").mkdir(parents=True)
     with pytest.raises(CheckpointError, match="holds no iteration_<N> folder"):
         detect(tmp_path / "e")
+    (tmp_path / "empty/below").mkdir(parents=True)
     with pytest.raises(CheckpointError, match="no point_cloud folder and no PLY file"):
-        detect(tmp_path)
+        detect(tmp_path / "empty")
     with pytest.raises(CheckpointError, match="does not exist"):
         detect(tmp_path / "none")
 
@@ -214,7 +229,6 @@ def test_real_companions_are_named(shared_data):
     ("there", "said"),
     [
         ("phone.SPZ", "no PLY file, but phone.SPZ; give one PLY"),
-        ("scene/point_cloud/iteration_7/point_cloud.ply", "no PLY file, but scene; give one PLY"),
         ("export/a.ply", "no PLY file, but export; give one PLY"),
         ("images/a.jpg", r"no PLY file, but photographs or what a scene is trained on \(that is for --images and --cameras\); give one PLY"),
         ("a.JPG", "no PLY file, but photographs"),

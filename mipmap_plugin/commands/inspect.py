@@ -47,11 +47,12 @@ def inspect(
         model = load_model(checkpoint, iteration=iteration)
         wrapped = wrap_model(model, screen_filter=screen_filter)
     facts = _facts(checkpoint, wrapped, whole=all or json)
+    asked = [note for note in model.notes if "--screen-filter" in note and screen_filter]  # which is answered
     if not json:
         print_facts(facts, json)  # before pictures are drawn, which takes longer
     with announced("drawing as viewers do"):
         differences = _differences(wrapped) if viewers else "not requested"
-    last = {"viewers": differences, "notes": [note for note in model.notes if note not in facts["health"]]}
+    last = {"viewers": differences, "notes": [note for note in model.notes if note not in [*facts["health"], *asked]]}
     print_facts(known | facts | last if json else last, json)
 
 
@@ -97,7 +98,8 @@ def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: 
     if lost := next((note for note in notes if DROPPED in note), None):
         return f"doubtful: {lost}; train or export it again, or adapt what is left"
     place = shlex.quote(str(checkpoint))
-    advice = f"mipmap-plugin adapt {place} --scale 1/4" + ("" if seen else " --cameras SCENE")
+    told = wrapped.asked["screen filter"]
+    advice = f"mipmap-plugin adapt {place} --scale 1/4" + (f" --screen-filter {told}" if told else "") + ("" if seen else " --cameras SCENE")
     if scale not in (None, 1.0):
         advice = f"mipmap-plugin render {place}, at x{scale:g}, which it was adapted to and looks right at"
     remarks = len(health)

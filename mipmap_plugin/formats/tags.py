@@ -45,5 +45,12 @@ def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:
     return None
 
 
+def kernel_size(comments: Iterable[str]) -> float | None:
+    """The dilation (px²) that the provenance of a file with the tag of compensation records; None for one that has that of 3DGS, or no record."""
+    comments = list(comments)
+    size = (provenance_of(comments) or {}).get("kernel_size") if render_mode(comments) == "antialiased" else None
+    return float(size) if isinstance(size, (int, float)) and size >= 0 else None
+
+
 def _tag(comment: str) -> re.Match[str] | None:
     return _RENDER_MODE.match(comment) or _ANTIALIASED.match(comment)

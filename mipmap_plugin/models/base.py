@@ -36,7 +36,7 @@ class TrainedScale:
         resolution: INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px.
         background: RGB, 0..1; None: the checkpoint does not say.
         near_plane: Depth up to which splats were not drawn, world units.
-        keeps_filter: An adapted file needs this filter, so it is for the original project only; else it is classic, or for a viewer.
+        keeps_filter: Files of the family need this filter, so that without a viewer they are for the original project only.
     """
 
     screen_filter: str = "classic"

@@ -28,6 +28,7 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
 RGB = ("red", "green", "blue")
+FILTER_3D = "filter_3D"  # of Mip-Splatting and its successors (`models.mip`)
 
 
 def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> dict[str, Tensor]:

@@ -19,6 +19,9 @@ EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat"), (".jpg", ".jpeg"
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)
 
+# A folder that is given too high is searched so deep, as nerfstudio's outputs/EXPERIMENT/METHOD/TIME are, and in so many folders; so many are named.
+DEPTH, MOST_LOOKED_AT, NAMED = 3, 200, 3
+
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -139,6 +142,9 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if len(clouds) == 1:
         return detect(clouds[0])
     some = ", ".join([*(cloud.name for cloud in clouds[:5]), *["..."] * (len(clouds) > 5)])
+    if not clouds and (below := _below(folder)):
+        more = ", ..." if len(below) > NAMED else ""
+        raise CheckpointError(f"{folder} lies above its checkpoint{'s' * (len(below) > 1)}; give {' or '.join(map(str, below[:NAMED]))}{more}")
     content = f"{len(clouds)} PLY files ({some})" if clouds else f"no point_cloud folder and no PLY file{_instead(folder)}"
     raise CheckpointError(f"{folder} holds {content}; give one PLY file, or a model folder with point_cloud/iteration_<N>")
 
@@ -150,12 +156,41 @@ def _instead(folder: Path) -> str:
     except OSError:
         return ""
     meant = [entry for entry in entries if entry.suffix.lower() in EXCHANGED]
-    meant += [entry for entry in entries if entry.is_dir() and ((entry / "point_cloud").is_dir() or any(entry.glob("*.ply")))]
+    meant += [entry for entry in entries if entry.is_dir() and any(entry.glob("*.ply"))]
     if meant:
         return f", but {', '.join(entry.name for entry in meant[:5])}{', ...' * (len(meant) > 5)}"
     if any(entry.suffix.lower() in PHOTOGRAPHS or entry.name in ("images", "sparse") for entry in entries):
         return ", but photographs or what a scene is trained on (that is for --images and --cameras)"
     return ""
+
+
+def _below(folder: Path) -> list[Path]:
+    """The model folders at most DEPTH levels below a folder, as far as they are found among MOST_LOOKED_AT folders; the newest names first."""
+    level, looked_at, found = [folder], 0, list[Path]()
+    for _ in range(DEPTH):
+        below = [each for parent in level for each in _folders_in(parent)][: MOST_LOOKED_AT - looked_at]
+        looked_at += len(below)
+        holding = [each for each in below if (each / "point_cloud").is_dir() or any(_has_place(each, name) for name in FAMILIES.names())]
+        found += sorted(holding, reverse=True)
+        level = [each for each in below if each not in holding]
+    return found
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    """The folders in a folder; none in one that cannot be read."""
+    try:
+        return sorted(each for each in folder.iterdir() if each.is_dir() and not each.is_symlink())
+    except OSError:
+        return []
+
+
+def _has_place(folder: Path, name: str) -> bool:
+    """Whether the family `name` has checkpoints in a result folder, in a place of its own."""
+    try:
+        family = find_family(name)
+        return bool(family.place and family.place[0] and _steps(folder, family))
+    except Exception:  # third-party code may fail in any way
+        return False
 
 
 def _detect_iteration(folder: Path, wanted: int | None) -> Checkpoint:

@@ -69,8 +69,8 @@ def _screen_filter(options: dict[str, Any], tag: str | None) -> tuple[str, float
     return tag or TrainedScale.screen_filter, TrainedScale.eps2d
 
 
-def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposures, tag: str | None = None) -> list[str]:
-    """Remarks on unusual options, in sentences. `tag`: the screen filter that the header names, if any."""
+def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposures, taken_as_classic: bool = False) -> list[str]:
+    """Remarks on unusual options, in sentences. `taken_as_classic`: no file names the screen filter."""
     notes = []
     if options.get("sh_degree", sh_degree) != sh_degree:
         notes.append(f"cfg_args says SH degree {options['sh_degree']}, but the PLY holds degree {sh_degree}; the PLY is trusted")
@@ -78,7 +78,7 @@ def companion_notes(options: dict[str, Any], sh_degree: int, exposures: Exposure
         notes.append("trained with train_test_exp: the original shows each view by its exposure, which is done here only where asked for")
     if exposures is not NO_EXPOSURES:
         notes.append(exposures.summary())
-    if "train_test_exp" in options and tag is None:
+    if "train_test_exp" in options and taken_as_classic:
         notes.append(ANTIALIASING)
     return notes
 

@@ -20,12 +20,11 @@ from mipmap_plugin.effects import NEAR_PLANE, Effect
 from mipmap_plugin.errors import CheckpointError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import CARRIED, TrainedScale, Traits
+from mipmap_plugin.models.columns import FILTER_3D as COLUMN
 from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.health import LARGEST, drop
 from mipmap_plugin.models.outputs import finite
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
-
-COLUMN = "filter_3D"
 
 # Screen filter of each family, and its dilation in px² if no cfg_args gives the kernel_size.
 SCREEN_FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}

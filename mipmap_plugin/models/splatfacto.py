@@ -166,7 +166,8 @@ def _stored(content: Any, path: Path) -> dict[str, Tensor]:
 def _unusual_options(pipeline: Mapping[str, Any], options: dict[str, Any]) -> list[str]:
     notes = []
     if not options:
-        notes.append("config.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter")
+        advice = "if it was antialiased, say so (--screen-filter antialiased)"
+        notes.append(f"config.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter; {advice}")
     if any(str(key).endswith("camera_optimizer.pose_adjustment") for key in pipeline):
         notes.append("the training moved its cameras (camera_optimizer); the cameras of the scene are rendered as they are given")
     if options.get("use_bilateral_grid"):

@@ -36,7 +36,7 @@ NEAR_PLANE = 0.01
 
 UNKNOWN = (
     "cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter, and not by the trainer of flat"
-    " splats (2DGS), whose files look the same"
+    " splats (2DGS), whose files look the same; if it was trained antialiased, say so (--screen-filter antialiased)"
 )
 
 # Larger numbers overflow float32; a text may have any number of digits.
