@@ -93,7 +93,7 @@ FAMILIES = {
     "gof": Family("GOF", "drawn as EWA splats, an approximation", _filtered("gof")),
     "analytic": Family("Analytic-Splatting", "as Mip-Splatting", _filtered("analytic")),
     "gsplat": Family("gsplat `ckpt_*.pt`", "cameras from its COLMAP scene (`--cameras`)", _gsplat("false")),
-    "gsplat-antialiased": Family("gsplat, `antialiased`", "written classic", _gsplat("true")),
+    "gsplat-antialiased": Family("gsplat, `antialiased`", "written antialiased", _gsplat("true")),
     "splatfacto": Family(
         "splatfacto `.ckpt`", "training cannot go on from a pruned one",
         lambda folder: torch_checkpoints.splatfacto_folder(folder, _plain().parameters()),

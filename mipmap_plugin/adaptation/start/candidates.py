@@ -122,7 +122,8 @@ class StartSearch:
         self.notes: list[str] = []  # on what the views show of the base
         self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
         self._alike = draws_alike(problem.base_effects, problem.target)
-        self._keeps_shapes = self._alike and problem.config.steps > 0  # steps end 0.1 to 0.2 dB higher from the base's own shapes (lego and chair)
+        # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
+        self._keeps_shapes = self._alike and problem.config.steps > 0 and problem.scale <= 1
         unchanged = self._keeps_shapes or filter_suffices(problem.base_effects, problem.target)
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
         self._matches_weights = problem.has_blend_weights and not unchanged and (problem.scale <= 1 or not spreads)

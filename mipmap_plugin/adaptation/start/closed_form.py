@@ -20,7 +20,7 @@ what a zoom takes off them (`FormSettings.crispness`).
 A file that is rendered with the base's own filter needs no change if that filter integrates over the pixel. One that compensates models the
 pixel in each view too, but with a variance of its own, and overlapping splats whose opacities it lowers let through more than their means
 would: with matched opacities the closed form is better by 2 to 8 dB (lego and chair, antialiased, x1/4, x1/8, x2 and x4), at x0.7 it is not.
-Without these, and before steps, it is left out.
+Without these, and before the steps of a zoom-out, it is left out.
 
 Opacities from areas are exact for splats that hide nothing; where blend weights are known they are matched afterwards (`matching`).
 
