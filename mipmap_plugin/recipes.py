@@ -49,7 +49,9 @@ DEFAULT_OUT = dict(
     steps=360, most_draws=MOST_DRAWS, loss="psnr", decay=0.02, betas=(0.9, 0.95), nesterov=True, truth_oversampling=4, views_per_step=4,
     order="spread", gathering=0.25, warm_up=0.1, extra_views=150,
 )  # fmt: skip
-RATES_OUT = LearningRates(means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.01, networks=1e-3)
+RATES_OUT = LearningRates(
+    means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.1, features=0.05, networks=5e-3
+)  # fmt: skip
 THOROUGH_OUT = dict(
     DEFAULT_OUT, steps=2500, most_draws=None, views_per_step=8, warm_up=0.05, extra_views=1000, merging_costs=0.1, moments=48
 )  # fmt: skip

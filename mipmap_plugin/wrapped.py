@@ -189,9 +189,10 @@ class Wrapped:
         scale, cameras = check_scale(scale), None if cameras is None else checked(cameras, some=True)
         check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
-        if not model.traits.same_for_all_views and (settings.setdefault("merge_to", 1.0) < 1 or settings.get("most_splats")):
+        whole = not (model.traits.same_for_all_views or model.traits.thins) and settings.setdefault("merge_to", 1.0) < 1
+        if whole or (settings.get("most_splats") and not model.traits.same_for_all_views):
             reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
-            raise SettingsError(f"{model.family}: {reason}; leave merge_to and most_splats (--splats, --bytes) out")
+            raise SettingsError(f"{model.family}: {reason}; leave {'' if model.traits.thins else 'merge_to and '}most_splats (--splats, --bytes) out")
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         config, targets = self._planned(recipe, scale, viewer, settings)

@@ -168,8 +168,40 @@ def test_the_closed_form_stretches_an_anchors_splats(folder):
     stretched = after["scales"][:, 3:] - before["scales"][:, 3:]
     shown = model.row_opacities(VIEWS[::2]) > 0  # of the views that the closed form looks at
     torch.testing.assert_close(stretched[shown], torch.tensor([0.5, 1.0, 2.0]).log().expand(int(shown.sum()), -1))
+    assert (stretched[~shown] == 0).all()
     assert {name for name in before if not torch.equal(before[name], after[name])} == {"scales"}
     assert torch.equal(after["scales"][:, :3], before["scales"][:, :3])
+
+
+def test_a_splat_that_is_flat_does_not_stretch_its_anchor(folder):
+    """The least width that the closed form gives it is thousands of times its own, and for the next view it may be round."""
+    model = load_model(folder)
+    student = model.copy()
+    for each in (model, student):
+        with torch.no_grad():
+            each.shared_parameters()["cov_mlp.2.bias"][0] = -30.0  # the first axis of the first of three splats
+    student.reshape(lambda g: (g.scales.clamp_min(1e-4), g.opacities), VIEWS)
+    several = model.row_opacities(VIEWS[::2]) > 0
+    stretched = (student.parameters()["scales"] - model.parameters()["scales"]).detach()[several]
+    assert float(stretched.median()) < 1e-3 and float(stretched.mean()) < 0.5
+
+
+def test_a_zoom_out_leaves_anchors_out_and_the_report_says_how_many(folder, monkeypatch):
+    model = load_model(folder)
+    whole = wrap_model(model, cameras=VIEWS, backend="reference").adapt(1 / 4, views="given", steps=1)
+    assert "40 of 40 anchors are left; the splats counted are those of one view" in whole.report.notes  # few splats a pixel
+    monkeypatch.setattr("mipmap_plugin.adaptation.start.thinning.PER_PIXEL", 0.0)
+    adapted = wrap_model(model, cameras=VIEWS, backend="reference").adapt(1 / 4, views="given", steps=1, merge_to=0.5, merging_costs=99)
+    kept = len(adapted.model.parameters()["means"])
+    assert adapted.report.returned.startswith(("the start, the closed form of a part of the base", "the last state"))
+    assert kept == 20
+    assert f"{kept} of 40 anchors are left; the splats counted are those of one view" in adapted.report.notes
+    assert "what the anchors share has changed too: color_mlp, cov_mlp, opacity_mlp" in adapted.report.notes
+
+
+def test_no_number_of_splats_can_be_asked_of_anchors(folder):
+    with pytest.raises(SettingsError, match="leave most_splats"):
+        wrap_model(load_model(folder), cameras=VIEWS).adapt(1 / 4, most_splats=10)
 
 
 def test_an_anchor_is_as_opaque_as_its_most_opaque_splat_gets(folder):
@@ -189,7 +221,7 @@ def test_an_anchor_is_as_opaque_as_its_most_opaque_splat_gets(folder):
 def test_pruning_takes_whole_anchors_and_what_belongs_to_them(folder, tmp_path):
     model = load_model(folder)
     keep = model.row_opacities(VIEWS) >= 0.5
-    _, adapted = gain(model, 1 / 4, steps=3, prune_every=2, min_opacity=0.5)
+    _, adapted = gain(model, 1 / 4, steps=3, prune_every=2, min_opacity=0.5, merge_to=1.0)
     assert 0 < len(adapted) < 40
     kept = [any(torch.equal(row, old) for old in model.parameters()["carried"][keep]) for row in adapted.parameters()["carried"]]
     assert all(kept)

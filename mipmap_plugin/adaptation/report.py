@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, enlarges
+from mipmap_plugin.models.base import SPLATS, SplatModel
 
 # The name of the base among a run's states.
 AS_IT_IS = "the base as it is"
@@ -121,6 +122,18 @@ def filters(scale: float, config: AdaptConfig, base: Effects, files: Sequence[Ef
         truth += f", and {config.upsampler} fused with it" if config.compare_at == "both" else ""
     base_filter, *file_filters = (f"{effects.screen_filter} {effects.eps2d:g} px²" for effects in (base, *files))
     return f"pseudo truth {truth}; base {base_filter}; file {', '.join(dict.fromkeys(file_filters))}"
+
+
+def changes(base: SplatModel, adapted: SplatModel) -> list[str]:
+    """What became of rows that are no splats, and of what all rows share, in sentences without a full stop."""
+    found, before = [], base.shared_parameters()
+    if (rows := base.traits.rows) != SPLATS:
+        left, all_of_them = (len(model.parameters()["means"]) for model in (adapted, base))
+        found.append(f"{left:,} of {all_of_them:,} {rows} are left; the splats counted are those of one view")
+    moved = {name.partition(".")[0] for name, tensor in adapted.shared_parameters().items() if not torch.equal(tensor, before[name])}
+    if moved:
+        found.append(f"what the {rows} share has changed too: {', '.join(sorted(moved))}")
+    return found
 
 
 def versions() -> dict[str, str]:

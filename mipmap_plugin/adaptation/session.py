@@ -27,7 +27,7 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
-from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, filters, versions
+from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
 from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -289,7 +289,7 @@ class Session:
             curve=curve,
             versions=versions(),
             inputs=self.inputs,
-            notes=[*doubts_in(self.base.notes), *notes],
+            notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
         )
 
 

@@ -22,6 +22,9 @@ from mipmap_plugin.plugin_errors import is_third_party
 # Name, among a model's parameters, of values that are never optimized but removed with their rows, such as an anchor's level.
 CARRIED = "carried"
 
+# What the rows of most models are.
+SPLATS = "splats"
+
 # By which the activation of a third-party family may leave 0..1.
 OPACITY_ROUNDING = 1e-4
 
@@ -60,6 +63,8 @@ class Traits:
         no_viewer: Why no viewer (`viewers`) can draw the splats, a sentence without a full stop; empty if one can.
         exposures: The trained color transformation of each photograph.
         effects: Those of `effects.MODEL_EFFECTS` that the model simulates.
+        rows: What a row of its parameters is, in the plural.
+        thins: Some rows can be left out, for others to learn to show what they did: the model has `thin`.
     """
 
     same_for_all_views: bool = False
@@ -70,6 +75,8 @@ class Traits:
     no_viewer: str = ""
     exposures: Exposures = NO_EXPOSURES
     effects: tuple[Effect, ...] = ()
+    rows: str = SPLATS
+    thins: bool = False
 
 
 # Allowed names of parameters, each with a learning rate of its own (`config.LearningRates`). The first is required.
@@ -149,6 +156,13 @@ class Rebuilt(SplatModel, Protocol):
         """Replace the splats by those that `form` returns for them. Only called on a copy."""
 
 
+class Thinned(SplatModel, Protocol):
+    """A model with the trait `thins`."""
+
+    def thin(self, keep: Tensor) -> None:
+        """Leave out the rows where `keep` [N] is False, but for those that its file needs. Only called on a copy."""
+
+
 class Placed(SplatModel, Protocol):
     """A model with the trait `placed`."""
 
@@ -170,7 +184,8 @@ def lacking(model: Any) -> list[str]:
     """What an object lacks to be a SplatModel: members, or the right names of its parameters; [] if nothing."""
     required = [*_members(SplatModel)]
     if isinstance(traits := getattr(model, "traits", None), Traits):
-        required += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed + ["fused", "bare"] * traits.filtered
+        required += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed
+        required += ["thin"] * traits.thins + ["fused", "bare"] * traits.filtered
     missing = [name for name in required if not hasattr(model, name)]
     if "traits" not in missing and not isinstance(traits, Traits):
         missing.append("traits of the type Traits")

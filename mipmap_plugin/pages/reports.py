@@ -39,7 +39,8 @@ def tradeoff_page(title: str, base: Wrapped, facts: dict[str, Any], commands: Se
 def adaptation_page(title: str, zooms: Sequence[Zoom], adaptations: Sequence[dict[str, Any]], commands: Sequence[str]) -> Page:
     """The page of adapted files: their pictures (`adaptation_zoom`) and their reports."""
     lead = " ".join(_gain(zoom, report) for zoom, report in zip(zooms, adaptations, strict=True))
-    return Page(title, lead, commands, zooms, adaptations=adaptations, effects=adaptations[0]["effects"], provenance=versions())
+    notes = list(dict.fromkeys(f"{report['title']}: {note}" for report in adaptations for note in report["notes"]))
+    return Page(title, lead, commands, zooms, adaptations=adaptations, effects=adaptations[0]["effects"], provenance=versions(), notes=notes)
 
 
 @torch.no_grad()

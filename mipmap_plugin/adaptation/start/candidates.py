@@ -26,12 +26,13 @@ from mipmap_plugin.adaptation.start.closed_form import (
 )
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
+from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import INTEGRATED, MIN_ALPHA, SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import Rebuilt, SplatModel
+from mipmap_plugin.models.base import Rebuilt, SplatModel, Thinned
 
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)
@@ -103,9 +104,9 @@ class Bounds(NamedTuple):
         return quality.psnr >= self.psnr and quality.visible >= self.visible
 
 
-def start_name(config: AdaptConfig, *, merged: bool = False) -> str:
-    """What a start is called in the report."""
-    splats = "merged splats" if merged else "the base"
+def start_name(config: AdaptConfig, *, merged: bool = False, thinned: bool = False) -> str:
+    """What a start is called in the report. `thinned`: rows were left out instead of merged."""
+    splats = "a part of the base" if thinned else "merged splats" if merged else "the base"
     if not config.closed_form:
         return splats
     return f"the closed form of {splats}" if merged else "the closed form"
@@ -119,6 +120,7 @@ class StartSearch:
         self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
         self._shown = torch.empty(0, dtype=torch.bool)  # of the base's splats (`may_show`), once blend weights are known
+        self._least = 0.0  # fraction of the rows that stay
         self.notes: list[str] = []  # on what the views show of the base
         self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
         self._alike = draws_alike(problem.base_effects, problem.target)
@@ -136,7 +138,8 @@ class StartSearch:
         if not (config.closed_form or config.merge_to < 1 or too_many):
             return base, problem.name
         with problem.phase("blend weights"):
-            weights = self._base_weights(base) if self._matches_weights or config.merge_to < 1 or too_many else None
+            merges = config.merge_to < 1 and not base.traits.thins
+            weights = self._base_weights(base) if self._matches_weights or merges or too_many else None
         if too_many:
             return self._candidate(weights, 0.0), start_name(config, merged=True)
         with self._clock.timing("candidate"):
@@ -147,9 +150,11 @@ class StartSearch:
         if self._alike and after.visible < before.visible:  # the filter itself is the better answer, for merged splats too
             self._keeps_shapes, after = True, before
         bounds = Bounds(after.psnr - config.merging_costs, before.visible - problem.may_lose)
-        merged = self._merged(weights, bounds, self._coarse_bounds(bounds, before)) if config.merge_to < 1 else None
+        self._least = least_fraction(base, problem.views, problem.scale) if base.traits.thins else 0.0
+        fewer = config.merge_to < 1 and self._least < 1
+        merged = self._merged(weights, bounds, self._coarse_bounds(bounds, before)) if fewer else None
         if merged is not None:
-            return merged, start_name(config, merged=True)
+            return merged, start_name(config, merged=True, thinned=base.traits.thins)
         better = after.visible >= before.visible and config.closed_form and not self._keeps_shapes
         return (formed, start_name(config)) if better else (base, problem.name)
 
@@ -179,7 +184,7 @@ class StartSearch:
 
     def _tried(self, weights: Tensor | None, power: float, coarsely: bool = False) -> tuple[SplatModel, Quality]:
         """A candidate and its quality."""
-        candidate = self._candidate(weights, self._problem.config.merge_to**power, coarsely)
+        candidate = self._candidate(weights, max(self._least, self._problem.config.merge_to**power), coarsely)
         return candidate, self._problem.quality(candidate)
 
     def _coarse_bounds(self, bounds: Bounds, finer: Quality) -> Bounds | None:
@@ -196,6 +201,10 @@ class StartSearch:
         if fraction < 1 and weights is not None:
             with problem.phase("merging"):
                 weights = self._merge(student, weights, fraction, coarsely)
+        elif fraction < 1 and student.traits.thins:
+            with problem.phase("thinning"):
+                means = student.parameters()["means"].detach()
+                cast(Thinned, student).thin(evenly_in_space(means, self._pixel_size(means) / problem.scale, fraction))
         if problem.config.closed_form and not self._keeps_shapes:
             with problem.phase("closed form"):
                 student.reshape(lambda gaussians: self._closed_form(gaussians, weights), problem.views)

@@ -156,7 +156,7 @@ class _Moments:
 
     def pairs(self, shift: Tensor) -> tuple[Tensor, Tensor]:
         """Return pairs of rows that are each other's nearest neighbors, by rising cost. `shift` [3], 0..1, moves the space-filling curve."""
-        order = _curve(self.means, self.pixel.median(), shift)
+        order = along_curve(self.means, self.pixel.median(), shift)
         means, shapes, color, weights, pixel = (
             tensor[order] for tensor in (self.means, self.covariances, self.color, self.weights, self.pixel)
         )
@@ -255,7 +255,7 @@ def _surface(covariances: Tensor) -> Tensor:
     return sum(minors, torch.zeros_like(minors[0])).clamp_min(torch.finfo(covariances.dtype).tiny).sqrt()
 
 
-def _curve(means: Tensor, pixel: Tensor, shift: Tensor) -> Tensor:
+def along_curve(means: Tensor, pixel: Tensor, shift: Tensor) -> Tensor:
     """The order [N] of `means` [N, 3] along a Z-order curve (Morton 1966), on which neighbors in space mostly follow each other.
 
     Its cells measure a quarter of `pixel`. `shift` [3], 0..1, moves them, because neighbors that one curve separates are close on another.

@@ -60,7 +60,8 @@ class AnchorModel(ABC):
 
     @property
     def traits(self) -> Traits:
-        return Traits(no_viewer="networks decode its splats for each camera, which none of the viewers does", effects=self._effects())
+        no_viewer = "networks decode its splats for each camera, which none of the viewers does"
+        return Traits(no_viewer=no_viewer, effects=self._effects(), rows="anchors", thins=True)
 
     def _effects(self) -> tuple[Effect, ...]:
         products = sum(tensor.numel() for name, tensor in self.shared_parameters().items() if tensor.dim() == 2 and not name.startswith("appearance"))
@@ -111,19 +112,23 @@ class AnchorModel(ABC):
 
     @torch.no_grad()
     def reshape(self, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera]) -> None:
-        """Scale each anchor's splats by the mean log ratio of new to old scales, as `form` returns them, over a few of the `views`.
+        """Scale each anchor's splats so that their variances along each axis, summed over a few of the `views`, are as `form` returns them.
 
-        An anchor has one scale for all its splats and no opacity of its own: opacities come from the networks, so the opacities that
-        `form` returns are ignored and left to the optimization.
+        Sums, for a network that makes a splat flat for one view makes it round for the next: a mean of ratios would follow the flat
+        one, whose least width is thousands of times its own. An anchor has no opacity of its own: those that `form` returns are left
+        to the optimization.
         """
         needs_views(views)
-        stretch, count = torch.zeros_like(self._parameters["means"]), torch.zeros_like(self._parameters["means"][:, :1])
+        before, after = (torch.zeros_like(self._parameters["means"]) for _ in range(2))
         for view in every_nth(views, RESHAPE_VIEWS):
             splats, row = self._decode_all(view)
-            ratio = form(splats)[0].clamp_min(MIN_SCALE) / splats.scales.clamp_min(MIN_SCALE)
-            stretch.index_add_(0, row, ratio.log())
-            count.index_add_(0, row, torch.ones_like(ratio[:, :1]))
-        self._parameters["scales"][:, 3:] += stretch / count.clamp_min(1)
+            for variances, scales in ((before, splats.scales), (after, form(splats)[0])):
+                variances.index_add_(0, row, splats.opacities[:, None] * scales.clamp_min(MIN_SCALE).square())
+        self._parameters["scales"][:, 3:] += torch.where(before > 0, after / before, 1.0).log() / 2
+
+    def thin(self, keep: Tensor) -> None:
+        """Leave out the anchors where `keep` [N] is False."""
+        self.replace_parameters({name: tensor.detach()[keep] for name, tensor in self._parameters.items()})
 
     @torch.no_grad()
     def row_opacities(self, views: Sequence[Camera]) -> Tensor:

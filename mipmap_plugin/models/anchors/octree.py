@@ -70,6 +70,13 @@ class OctreeModel(AnchorModel):
         opacities[opacities.topk(min(2, len(opacities))).indices] = 1.0
         return opacities
 
+    def thin(self, keep: Tensor) -> None:
+        """As for other anchors, but the first of the coarsest level stays, and two in all, for the reasons of `row_opacities`."""
+        levels, keep = self._column("level")[:, 0], keep.clone()
+        keep[levels.argmin()] = True
+        keep[:2] |= keep.sum() < 2
+        super().thin(keep)
+
     def _chosen(self, camera: Camera) -> Tensor:
         return self._column("level")[:, 0] <= self.wanted_levels(camera).floor()
 
