@@ -20,7 +20,7 @@ from mipmap_plugin.adaptation.choosing import choose
 from mipmap_plugin.adaptation.conversion import Stages, conversion
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
-from mipmap_plugin.adaptation.start.candidates import FinerLevel
+from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.photographs import placed as placed

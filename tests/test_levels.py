@@ -17,7 +17,7 @@ from mipmap_plugin import cli, load_model, recipes, wrap_model
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start import candidates
-from mipmap_plugin.adaptation.start.candidates import FinerLevel
+from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.image_store import STEPS
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth

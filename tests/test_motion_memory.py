@@ -8,6 +8,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.moments import at_moments, release, sharing_moments
+from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.moving import memory
 from mipmap_plugin.models.moving.hexplane import HexPlane
@@ -16,6 +17,7 @@ from mipmap_plugin.models.moving.model import moved_to
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import wrap_model
 
+best = StartSearch.best  # not a wrapped one
 ALL_ON = "no_do=False, no_dshs=False, static_mlp=True, apply_rotation=True"
 
 
@@ -147,6 +149,19 @@ def test_a_run_evaluates_the_field_a_few_times_a_moment_whatever_its_views(tmp_p
     assert sum(evaluated) / 60 < 60  # of 160 pictures of steps, and 50 others
     assert adapted.report.views.endswith("at their own times, each at the nearest of 4 moments")
     assert adapted.model.held is None
+
+
+def test_the_bases_moments_are_evaluated_in_a_phase_of_their_own(tmp_path, monkeypatch):
+    """A truth costs no evaluation, so that the time left follows from what truths and steps cost."""
+    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=at_times(9), backend="reference")
+    evaluated, changes = [], HexPlane.changes
+    monkeypatch.setattr(HexPlane, "changes", lambda field, means, time: evaluated.append(time) or changes(field, means, time))
+    ahead = []
+    monkeypatch.setattr(StartSearch, "best", lambda search: ahead.append(len(evaluated)) or best(search))
+    adapted = wrapped.adapt(1 / 2, recipe="instant", extra_views=0, moments=5, validation_views=4)
+    assert adapted.report.seconds["motion"] > 0 and len(set(evaluated[: ahead[0]])) >= 5
+    static = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(1 / 2, recipe="instant")
+    assert "motion" not in static.report.seconds
 
 
 def test_a_resumed_run_comes_to_the_same(tmp_path):

@@ -19,7 +19,7 @@ from mipmap_plugin.adaptation.optimization.validation import count_of_views
 from mipmap_plugin.adaptation.renderers import NO_CAMERA
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
-from mipmap_plugin.adaptation.start.candidates import FinerLevel
+from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.views import ORBITED
 from mipmap_plugin.adaptation.warn import warn

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import chain, zip_longest
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.start.closed_form import pixel_size
@@ -49,6 +51,18 @@ def at_their_moments(
     validation, _ = with_times(validation, config.seed)
     views, validation, moments = sharing_moments(views, validation, config.moments)
     return views, validation, f"{note}, {times}{moments}"
+
+
+@torch.no_grad()
+def evaluate_moments(base: SplatModel, views: Sequence[Camera], phase: Callable[[str], AbstractContextManager[None]]) -> None:
+    """Evaluate the field of a moving scene at each moment of the views, in a `phase` of its own.
+
+    Else the first truth and the first step at each moment would pay for it, and the time that is left be told wrongly.
+    """
+    if base.traits.moves:
+        with phase("motion"):
+            for view in {view.time: view for view in views}.values():
+                base.gaussians(view)
 
 
 def follower(base: SplatModel, views: Sequence[Camera], scale: float) -> Callable[[SplatModel], None]:

@@ -17,7 +17,7 @@ from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, is_true
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
-from mipmap_plugin.adaptation.moments import at_their_moments, follower, release
+from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments, follower, release
 from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
@@ -28,8 +28,9 @@ from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
-from mipmap_plugin.adaptation.start.candidates import FinerLevel, StartProblem, StartSearch
+from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.adaptation.start.compilation import warm_up
+from mipmap_plugin.adaptation.start.problem import FinerLevel, StartProblem
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.detail import DetailLoss
 from mipmap_plugin.adaptation.target.photographs import Photographs
@@ -133,6 +134,7 @@ class Session:
             splats, effects = self.base.gaussians(self.views[0]), (self.base_effects, *self.targets.values())
             merging = self.config.merge_to < 1 and self._has_blend_weights
             warm_up(self.backend, splats, effects, gradients=self._takes_steps, merging=merging, by_rows=self.base.traits.plain)
+        evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
         initial, start = search.best()
         self.notes = search.notes

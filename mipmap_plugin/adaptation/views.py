@@ -227,7 +227,6 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
 
 
-
 def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:
     """What is wrong with a scene in views that show something, in sentences. `near`: the near plane, in world units; `orbit`: they were generated."""
     least = LEAST_SHARE * min(views[0].size)
@@ -257,4 +256,3 @@ def with_times(views: Sequence[Camera], seed: int) -> tuple[list[Camera], str]:
     times = {number: position / max(1, len(timeless) - 1) for number, position in zip(timeless, order, strict=True)}
     timed = [replace(view, time=times.get(number, view.time)) for number, view in enumerate(views)]
     return timed, f"{len(timeless)} of them without a time of their own, spread over 0..1"
-

@@ -14,7 +14,7 @@ from pathlib import Path
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import AS_IT_IS
-from mipmap_plugin.adaptation.start.candidates import FinerLevel
+from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, Switch
 from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, make_levels_by_distance

@@ -73,7 +73,7 @@ function curveChart(report) {
   });
   const readout = make("p", { class: "readout", "aria-live": "polite" }, "Point at a mark, or tap it, to read it.");
   const start = curve[0];
-  const before = ["compilation", "blend weights", "merging", "closed form", "upsampling"].filter((phase) => report.seconds[phase] >= 0.005)
+  const before = ["compilation", "motion", "blend weights", "merging", "thinning", "closed form", "upsampling"].filter((phase) => report.seconds[phase] >= 0.005)
     .map((phase) => `${phase} ${report.seconds[phase].toFixed(2)} s`).join(", ");
   const made = Object.keys(report.validation).find((name) => name.startsWith("the start, "));
   svg.prepend(draw("rect", { class: "before-steps", x: place.x(0), y: MARGIN.top, width: place.x(start.seconds) - place.x(0), height: HEIGHT - MARGIN.top - MARGIN.bottom }));
