@@ -7,7 +7,6 @@ import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from operator import index
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -129,7 +128,7 @@ class Camera:
             pose[:3] /= scale
         return pose
 
-    @cached_property
+    @property
     def center(self) -> Tensor:
         """The camera's position in the world, [3] float64."""
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]

@@ -19,7 +19,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import TrainedScale
+from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.inria_folder import ANTIALIASING
 
 TOLD = "drawn as its training drew it"
@@ -49,6 +49,8 @@ def test_merged_splats_keep_their_shapes_where_the_filter_alone_is_better(monkey
     reshaped = []
 
     class Splats:
+        traits = Traits()
+
         def parameters(self):
             return {"means": torch.zeros(100, 3)}
 

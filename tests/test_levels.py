@@ -36,6 +36,7 @@ from mipmap_plugin.levels.manifest import MANIFEST, base_pixel, write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, STEPS_KEPT, WIDE, Band, LadderRequest
 from mipmap_plugin.levels.switching import most_even, switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
+from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import Interrupted, state_path
@@ -125,6 +126,8 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
         return ("formed",) if fraction == 1 else ("merged", fraction, coarsely)
 
     class Base(tuple):
+        traits = Traits()
+
         def parameters(self):
             return {"means": torch.zeros(100, 3)}
 

@@ -74,8 +74,8 @@ def test_at_scale_one_there_is_nothing_to_do(recipe):
     assert all(torch.equal(tensor, model.model.parameters()[name]) for name, tensor in adapted.model.parameters().items())
 
 
-def test_at_scale_one_a_base_of_another_filter_still_becomes_classic():
-    adapted = wrapped(screen_filter="antialiased").adapt(1, steps=2, extra_views=0)
+def test_at_scale_one_a_base_of_another_filter_becomes_classic_where_that_is_asked_for():
+    adapted = wrapped(screen_filter="antialiased").adapt(1, viewer="classic", steps=2, extra_views=0)
     assert adapted.report.ended_by == "2 steps" and adapted.effects.screen_filter == "classic"
 
 
