@@ -59,6 +59,27 @@ def test_a_moment_is_evaluated_once_for_a_model_and_its_copies_and_again_where_s
     assert evaluated == [0.5, 0.5]  # what was known of the base still is
 
 
+@pytest.mark.parametrize("options", ["", ALL_ON])
+def test_the_gradient_of_a_mean_goes_through_a_hexplane_as_in_the_original(tmp_path, options):
+    model = load_model(moving.write_hexplane(tmp_path / "m", options)).copy()
+    means, weights = model.parameters()["means"], torch.linspace(-1, 1, 180).reshape(60, 3)
+    [ours] = torch.autograd.grad((model.gaussians(moving.at(0.3)).means * weights).sum(), means)
+    changes = HexPlane.changes.__wrapped__(model.field, means, 0.3)  # with a gradient
+    [exact] = torch.autograd.grad((model.field.moved(model.canonical, changes).means * weights).sum(), means)
+    torch.testing.assert_close(ours, exact, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(ours, weights, rtol=1e-2)
+
+
+def test_a_followed_hexplane_moves_splats_along_its_slopes(tmp_path):
+    model = load_model(moving.write_hexplane(tmp_path / "m")).copy()
+    model.follow(reach=1.0)
+    with torch.no_grad():
+        model.parameters()["means"].add_(1e-3)
+    known, exact = model.gaussians(moving.at(0.4)).means, moved_to(model.field, model.canonical, 0.4).means
+    stale = model.field.moved(model.canonical, model.field.changes(model.held, 0.4)).means
+    assert float((known - exact).abs().mean()) < float((stale - exact).abs().mean()) / 3
+
+
 def test_moments_of_no_use_are_forgotten():
     known, asked = counted_memory(limit=3 * 2 * 10 * 3 * 4)  # places and changes of three moments
     means = torch.ones(10, 3)

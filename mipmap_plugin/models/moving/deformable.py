@@ -68,6 +68,14 @@ class DeformNetwork:
         *motion, turn, growth = (self._layer(head, hidden) for head in self._heads)
         return {"means": torch.cat(motion, dim=1), "quats": turn, "scales": growth}
 
+    @property
+    def has_slopes(self) -> bool:
+        return False
+
+    def slopes(self, means: Tensor, time: float) -> Changes:
+        """The original has no gradient through the network, so that there are none."""
+        raise NotImplementedError
+
     def to(self, device: torch.device | str) -> DeformNetwork:
         """The same network on another device."""
         return DeformNetwork({name: tensor.to(device) for name, tensor in self._weights.items()})

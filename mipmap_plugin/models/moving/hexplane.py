@@ -34,6 +34,7 @@ HEADS = {
 }
 
 # The parameters that the heads change.
+POSITIONS = "pos_deform"
 CHANGED = dict(zip(HEADS, ("means", "scales", "quats", "opacities", "sh"), strict=True))
 
 # The two coordinates of each plane of a scale: xy, xz, xt, yz, yt, zt.
@@ -85,6 +86,20 @@ class HexPlane:
         hidden = self.features(means, time)
         masks = {"mask": self._head("static_mlp", hidden)} if self._options.get("static_mlp") else {}
         return {CHANGED[name]: self._head(name, hidden) for name in self.heads} | masks
+
+    @property
+    def has_slopes(self) -> bool:
+        return POSITIONS in self.heads
+
+    def slopes(self, means: Tensor, time: float) -> Changes:
+        """The derivatives of what is added to the "means" in these, [N, 3, 3]: the original's gradient goes through the field."""
+        with torch.enable_grad():
+            places = means.detach().requires_grad_()
+            hidden = self.features(places, time)
+            masked = means * self._head("static_mlp", hidden) if self._options.get("static_mlp") else 0
+            added = masked + self._head(POSITIONS, hidden)
+            rows = [torch.autograd.grad(added[:, axis].sum(), places, retain_graph=axis < 2)[0] for axis in range(3)]
+        return {"means": torch.stack(rows, dim=1)}
 
     def features(self, means: Tensor, time: float) -> Tensor:
         """The inputs of the heads, [N, width], at positions [N, 3] and one time."""

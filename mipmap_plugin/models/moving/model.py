@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -46,6 +47,13 @@ class Field(Protocol):
     def moved(self, canonical: VanillaModel, changes: Changes) -> Gaussians:
         """The splats after such changes, differentiable in the canonical parameters."""
 
+    @property
+    def has_slopes(self) -> bool:
+        """Whether the original's gradient of a mean goes through the field."""
+
+    def slopes(self, means: Tensor, time: float) -> Changes:
+        """The derivatives of the moved means in these, beyond those of `moved`: "means", [N, 3, 3]; only with `has_slopes`."""
+
     def to(self, device: torch.device | str) -> Field:
         """The same field on another device."""
 
@@ -55,10 +63,11 @@ class MovingModel:
 
     held: Tensor | None = None  # [N, 3]: where the field is evaluated; None: at the means
 
-    def __init__(self, family: str, canonical: VanillaModel, field: Field, memory: Memory | None = None) -> None:
-        """`memory`: that of a model with the same field."""
+    def __init__(self, family: str, canonical: VanillaModel, field: Field, memories: Sequence[Memory] = ()) -> None:
+        """`memories`: those of a model with the same field: of its changes, and of its slopes if it has any."""
         self.family, self.canonical, self.field = family, canonical, field
-        self._memory = memory or Memory(lambda means, time: field.changes(means, time))
+        own = (Memory(lambda means, time: field.changes(means, time)), *([Memory(field.slopes)] if field.has_slopes else []))
+        self._memory, *self._slopes = self._memories = memories or own
         self.source, self.folder, self.digest, self.notes = canonical.source, canonical.folder, canonical.digest, canonical.notes
 
     @property
@@ -87,8 +96,13 @@ class MovingModel:
         """All splats at the time of `camera`, 0 if it has none."""
         if not self.moves:
             return self.canonical.gaussians()
-        place = self.parameters()["means"].detach() if self.held is None else self.held
-        return self.field.moved(self.canonical, self._memory(place, camera.time or 0.0))
+        means, time = self.parameters()["means"], camera.time or 0.0
+        place = means.detach() if self.held is None else self.held
+        gaussians = self.field.moved(self.canonical, self._memory(place, time))
+        if self._slopes and (self.held is not None or (means.requires_grad and torch.is_grad_enabled())):
+            added = torch.einsum("nij,nj->ni", self._slopes[0](place, time)["means"], means - place)
+            return replace(gaussians, means=gaussians.means + added)
+        return gaussians
 
     def reach(self, pixel: float) -> float:
         """How far splats may move before the field moves them noticeably otherwise, world units. `pixel`: of the target, world units."""
@@ -99,7 +113,7 @@ class MovingModel:
     def follow(self, reach: float) -> None:
         """From now on, evaluate the field at the means as they are, if many have moved farther than `reach` since it was last done.
 
-        Between two such moments the splats move as the field moves the places where it was evaluated.
+        Between two such moments the splats move as the field moves the places where it was evaluated, and along its slopes if it has any.
         """
         means = self.parameters()["means"].detach()
         if self.held is None or float(((means - self.held).norm(dim=1) > reach).float().mean()) > MOVED_FAR:
@@ -109,7 +123,8 @@ class MovingModel:
         """Take note that of the parameters only these `rows` [M], ascending, are going to be left."""
         if self.held is not None:
             left = self.held[rows]
-            self._memory.keep_rows(self.held, rows, left)
+            for memory in self._memories:
+                memory.keep_rows(self.held, rows, left)
             self.held = left
 
     def parameters(self) -> dict[str, Tensor]:
@@ -118,7 +133,7 @@ class MovingModel:
 
     def copy(self) -> MovingModel:
         """An independent model whose canonical leaves require gradients; the field, which never changes, is shared."""
-        return MovingModel(self.family, self.canonical.copy(), self.field, self._memory)
+        return MovingModel(self.family, self.canonical.copy(), self.field, self._memories)
 
     def to(self, device: torch.device | str) -> MovingModel:
         return MovingModel(self.family, self.canonical.to(device), self.field.to(device))
