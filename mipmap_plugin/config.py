@@ -58,7 +58,9 @@ class AdaptConfig(BaseModel):
     truth_oversampling: int | None = Field(None, gt=0, description="Render the base at most this many times finer than the target; None: full size.")
 
     views: ViewPolicy = Field("jittered", description="Which views to adapt to; `jittered`: the train views and random views around them.")
-    moments: int | None = Field(24, gt=0, description="Maximum number of moments of a moving scene that views are adapted at; None: each at its own.")
+    moments: int | None = Field(
+        24, gt=0, description="Maximum number of moments of a moving scene that views are adapted at; None, and with photographs: each at its own."
+    )
     extra_views: int = Field(100, ge=0, description="Number of views that `jittered` adds, or that an orbit has.")
 
     closed_form: bool = Field(True, description="Start from the closed form instead of from the base.")

@@ -1,5 +1,6 @@
 """Fields of moving scenes are evaluated once for the splats and a moment, and while splats are adapted only once that matters."""
 
+import json
 from dataclasses import replace
 
 import moving
@@ -15,6 +16,7 @@ from mipmap_plugin.models.moving.hexplane import HexPlane
 from mipmap_plugin.models.moving.memory import Memory
 from mipmap_plugin.models.moving.model import moved_to
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import wrap_model
 
 best = StartSearch.best  # not a wrapped one
@@ -183,6 +185,17 @@ def test_the_bases_moments_are_evaluated_in_a_phase_of_their_own(tmp_path, monke
     assert adapted.report.seconds["motion"] > 0 and len(set(evaluated[: ahead[0]])) >= 5
     static = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(1 / 2, recipe="instant")
     assert "motion" not in static.report.seconds
+def test_photographs_stay_at_their_own_moments(tmp_path):
+    """They show no other one."""
+    train = [replace(view, time=number / 5) for number, view in enumerate(tiny.cameras(6))]
+    folder = tiny.scene(tmp_path / "scene", train=train, seed=5)
+    path = folder / "transforms_train.json"
+    timed = [{**frame, "time": view.time} for frame, view in zip(json.loads(path.read_text())["frames"], train, strict=True)]
+    path.write_text(json.dumps({"frames": timed}))
+    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=train, backend="reference")
+    adapted = wrapped.adapt(2, images=load_scene(folder), steps=1, extra_views=1, moments=2)
+    assert adapted.report.views.endswith("at their own times, 6 of them real images")
+    assert [view.time for view in adapted.adapted_to[:6]] == [view.time for view in train]
 
 
 def test_a_resumed_run_comes_to_the_same(tmp_path):

@@ -84,11 +84,11 @@ class Session:
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs = request.finer, dict(request.inputs)
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.base.parameters()["means"].device)
+        self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
         self.views = over_band(self.base_views, config)
         self.views_note += f", {real.note(self.base_views)}" if real else ""
-        self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         steering, choosing = (over_band(half, config) for half in (validation[::2], validation[1::2]))
         request.images.keep_only([*self.views, *steering, *choosing])
         self.truth = PseudoTruth(request.images, scale, config, real)
@@ -116,7 +116,8 @@ class Session:
         if len(shown := showing(validation, means, self.base_effects.near_plane)) > 1:  # one to steer by, and one to choose by
             validation = shown  # others are the same in every state
         if self.base.traits.moves:
-            views, validation, note = at_their_moments(views, validation, self.config, note)
+            moments = None if self._has_photographs else self.config.moments  # a photograph shows no moment but its own
+            views, validation, note = at_their_moments(views, validation, self.config.model_copy(update={"moments": moments}), note)
         return views, validation, note
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
