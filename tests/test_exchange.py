@@ -165,6 +165,19 @@ def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, c
     assert main([*words, "--output", str(tmp_path / "phone.ply")]) == 0
 
 
+@pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
+@pytest.mark.parametrize("viewer", [None, "antialiased"])
+def test_splats_that_not_all_viewers_of_a_format_draw_as_trained_are_told_of(tmp_path, tool, ending, viewer, capsys):
+    """Without a viewer they are for renderers of the training; whoever names a viewer knows it."""
+    base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / f"new{ending}"
+    words = ["adapt", str(base), "--scale", "1/2", "--recipe", "instant", "--screen-filter", "antialiased", "--output", str(output)]
+    assert main([*words, *(["--viewer", viewer] if viewer else [])]) == 0
+    told = f"(antialiased, 0.3 px²), which not all viewers of {ending} do"
+    report = json.loads(output.with_name(output.name + ".adaptation.json").read_text())
+    count = int(viewer is None and ending != ".ply")
+    assert capsys.readouterr().err.count(told) == sum(told in note for note in report["notes"]) == count
+
+
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply"])
 def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tmp_path, tool, ending, capsys):
     """Normals that are not 0 too, which 3DGS does not have."""

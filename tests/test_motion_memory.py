@@ -185,6 +185,8 @@ def test_the_bases_moments_are_evaluated_in_a_phase_of_their_own(tmp_path, monke
     assert adapted.report.seconds["motion"] > 0 and len(set(evaluated[: ahead[0]])) >= 5
     static = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(1 / 2, recipe="instant")
     assert "motion" not in static.report.seconds
+
+
 def test_photographs_stay_at_their_own_moments(tmp_path):
     """They show no other one."""
     train = [replace(view, time=number / 5) for number, view in enumerate(tiny.cameras(6))]

@@ -12,6 +12,7 @@ import torch
 from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.report import Report
+from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends import supersample
 from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
@@ -23,7 +24,7 @@ from mipmap_plugin.limits import check_image
 from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of
 from mipmap_plugin.models.exposure import exposed
-from mipmap_plugin.models.outputs import parts_of, without_place
+from mipmap_plugin.models.outputs import drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.torch_modes import usual_modes
@@ -88,12 +89,17 @@ class Adapted:
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
             state.remove()
+        if differs := self._drawn_otherwise(saved):
+            warn(differs)
         return saved
 
     def report_of(self, path: Path) -> Report:
-        """The report of the file at `path`, which also says what its format has no place for."""
-        lost = without_place(path, getattr(self.model, "extras", ()))
-        return self.report.model_copy(update={"notes": [*self.report.notes, lost]}) if lost else self.report
+        """The report of the file at `path`, which also says what its format has no place for, and who draws it otherwise."""
+        lost = filter(None, (without_place(path, getattr(self.model, "extras", ())), self._drawn_otherwise(path)))
+        return self.report.model_copy(update={"notes": [*self.report.notes, *lost]})
+
+    def _drawn_otherwise(self, path: Path) -> str:
+        return "" if self.report.viewer else drawn_otherwise(path, self.model.trained)
 
 
 @torch.no_grad()

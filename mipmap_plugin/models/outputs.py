@@ -75,8 +75,19 @@ def refuse_own_filter(path: Path, trained: TrainedScale) -> None:
 def without_place(path: Path, extras: Iterable[str]) -> str:
     """That the format of `path` has no place for the columns that 3DGS does not define, in a sentence; "" if it has, or if there are none."""
     names = ", ".join(extras) if is_written(path) else ""
-    ending = ".compressed.ply" if path.name.lower().endswith(".compressed.ply") else path.suffix.lower()
-    return f"the extra columns {names} are dropped, since {ending} has no place for them; a .ply has" if names else ""
+    return f"the extra columns {names} are dropped, since {_ending(path)} has no place for them; a .ply has" if names else ""
+
+
+def drawn_otherwise(path: Path, trained: TrainedScale) -> str:
+    """That many viewers of the exchange format of `path` do not draw splats as they were trained, in a sentence; "" if they do, or of a .ply."""
+    if trained.screen_filter == TrainedScale.screen_filter or not is_written(path):
+        return ""
+    own = f"{trained.screen_filter}, {trained.eps2d:g} px²"
+    return f"the file is right where splats are drawn as in training ({own}), which not all viewers of {_ending(path)} do; for others adapt for a viewer"
+
+
+def _ending(path: Path) -> str:
+    return ".compressed.ply" if path.name.lower().endswith(".compressed.ply") else path.suffix.lower()
 
 
 def finite(parameters: Mapping[str, Tensor], most: float) -> dict[str, Tensor]:
