@@ -45,7 +45,7 @@ from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.filters import INTEGRALS, USUAL_EPS2D
-from mipmap_plugin.splatting.viewers import find_viewer, viewers_for
+from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
 from mipmap_plugin.torch_modes import usual_modes
 
 if TYPE_CHECKING:
@@ -242,7 +242,7 @@ class Wrapped:
         report, source = named(path).with_name(named(path).name + REPORT), self.model.source
         parts = parts_of(source, self.model.folder)
         model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
-        refuse_unread(path, viewer)
+        refuse_unread(path, own_name(viewer))
         model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
         refuse_output(report, overwrite, parts, is_file=True)
         refuse_output(state_path(path), True, parts, is_file=True)

@@ -157,9 +157,10 @@ def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
-def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys):
+@pytest.mark.parametrize("viewer", ["gaussian-splats-3d", "mkkellogg"])
+def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys, viewer):
     (tmp_path / "phone.spz").write_bytes(SPZ)
-    words = ["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant", "--viewer", "gaussian-splats-3d"]
+    words = ["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant", "--viewer", viewer]
     assert main(words) == 2
     assert "reads .spz up to version 2, and splat-transform writes 3 at least; give a .ply by --output" in capsys.readouterr().err
     assert main([*words, "--output", str(tmp_path / "phone.ply")]) == 0

@@ -377,8 +377,8 @@ def test_an_interrupted_ladder_goes_on_with_its_finished_levels(tmp_path, small_
 
 @pytest.mark.parametrize(
     ("viewer", "by", "far", "expected"),
-    [("supersplat", "auto", 200, True), ("spark", "auto", 200, False), ("supersplat", "auto", 0, False), ("spark", "distance", 0, True),
-     ("supersplat", "zoom", 200, False)],
+    [("supersplat", "auto", 200, True), ("supersplat-viewer", "auto", 200, True), ("spark", "auto", 200, False),
+     ("supersplat", "auto", 0, False), ("spark", "distance", 0, True), ("supersplat", "zoom", 200, False)],
 )  # fmt: skip
 def test_auto_is_by_distance_for_streaming_viewers_of_unbounded_scenes(viewer, by, far, expected):
     assert by_distance(wrapped(far=far) if far else wrap_model(tiny.model(), cameras=tiny.cameras(6)), LadderRequest(viewer, by=by)) is expected

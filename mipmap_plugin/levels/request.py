@@ -45,7 +45,7 @@ MERGING_COSTS = 9.0
 WAYS = ("auto", "zoom", "distance")
 
 # Viewers that choose a level for each chunk by its distance.
-STREAMING = ("playcanvas", "supersplat", "playcanvas-webgpu", "playcanvas-aa", "babylon")
+STREAMING = ("playcanvas", "playcanvas-webgpu", "playcanvas-aa", "babylon")
 
 
 @dataclass(frozen=True)

@@ -219,6 +219,11 @@ def _registered(name: str) -> Any:
     return VIEWERS.get(name)
 
 
+def own_name(name: str | None) -> str | None:
+    """The name of the record that people know by `name` too."""
+    return ALIASES.get(name, name) if name else name
+
+
 def viewers_for(name: str) -> tuple[str, ...]:
     """The names of the viewers that a file for `name` has to suit: `name` itself, or the members of a group.
 

@@ -22,6 +22,7 @@ from mipmap_plugin.levels.distance.yardstick import measured
 from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.progress import announced
+from mipmap_plugin.splatting.viewers import own_name
 from mipmap_plugin.wrap import Wrapped
 
 # A chunk measures at most this part of the distance of the nearest parts of a scene, so that its rear is at the scale of its front, but at least
@@ -82,7 +83,7 @@ def by_distance(base: Wrapped, request: LadderRequest) -> bool:
         return False
     effects, means = base.effects(), base.model.parameters()["means"].detach()
     mergeable = base.model.traits.same_for_all_views and effects.screen_filter not in INTEGRATED
-    return mergeable and request.viewer in STREAMING and is_unbounded(means, base.views(), effects.near_plane)
+    return mergeable and own_name(request.viewer) in STREAMING and is_unbounded(means, base.views(), effects.near_plane)
 
 
 def refuse(base: Wrapped, request: LadderRequest) -> None:
