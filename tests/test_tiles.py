@@ -517,6 +517,12 @@ def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
     assert report.ended_by.startswith("2 tiles of 4 steps (of 16, because the scene is large")
 
 
+def test_a_file_for_a_filter_that_the_tag_does_not_tell_whole_is_read_back_with_its_dilation(job):
+    joined = adapt_in_tiles(replace(job, viewer="mip", settings=job.settings | {"steps": 0}), 2)
+    trained = load_vanilla(joined.file).trained
+    assert (trained.screen_filter, trained.eps2d) == ("mip", 0.1)
+
+
 def test_a_model_folder_is_written_as_one(job, tmp_path):
     joined = adapt_in_tiles(replace(job, target=tmp_path / "out"), 2)
     assert (tmp_path / "out" / "cameras.json").is_file() and (tmp_path / "out" / "cfg_args").is_file()

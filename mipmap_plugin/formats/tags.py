@@ -25,11 +25,13 @@ def render_mode(comments: Iterable[str]) -> str | None:
     return mode
 
 
-def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any]) -> list[str]:
-    """Foreign comments, followed by the two lines of this package, which replace older ones."""
+def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any], eps2d: float | None = None) -> list[str]:
+    """Foreign comments, followed by the two lines of this package, which replace older ones. `eps2d`: dilation of the filter, px²."""
     foreign = [text for text in comments if not _tag(text) and not text.startswith(PROVENANCE + " {")]
     mode = {"classic": "default", "antialiased": "mip", "mip": "mip", "surfel": "2dgs"}.get(screen_filter)  # others have no tag
     tags = [f"SplatRenderMode: {mode}"] if mode else []
+    if screen_filter == "mip" and eps2d is not None:
+        provenance = {**provenance, "kernel_size": eps2d}  # which the tag does not tell
     return [*foreign, *tags, f"{PROVENANCE} {json.dumps(provenance, default=str)}"]
 
 

@@ -83,7 +83,8 @@ def drawn_otherwise(path: Path, trained: TrainedScale) -> str:
     if trained.screen_filter == TrainedScale.screen_filter or not is_written(path):
         return ""
     own = f"{trained.screen_filter}, {trained.eps2d:g} px²"
-    return f"the file is right where splats are drawn as in training ({own}), which not all viewers of {_ending(path)} do; for others adapt for a viewer"
+    right = f"the file is right where splats are drawn as in training ({own})"
+    return f"{right}, which not all viewers of {_ending(path)} do; for others adapt for a viewer"
 
 
 def _ending(path: Path) -> str:

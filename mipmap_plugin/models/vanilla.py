@@ -200,8 +200,7 @@ class VanillaModel:
         path = Path(path)
         self.refuse_output(path, overwrite=overwrite)
         parameters = finite(self._parameters, LARGEST)
-        kernel = {"kernel_size": self.trained.eps2d} if self.trained.screen_filter == "mip" else {}  # the tag names no dilation
-        comments = with_tags(self._origin.comments, self.trained.screen_filter, {**provenance, **kernel})
+        comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance, self.trained.eps2d)
         if is_written(path):
             refuse_own_filter(path, self.trained)
             if lost := without_place(path, self._origin.extras):

@@ -189,7 +189,7 @@ def _done(jobs: Sequence[Job], engine: Engine, what: str) -> list[Outcome]:
 def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) -> Joined:
     """Write the cores one after the other, as a .ply or within a model folder, and the report beside it."""
     provenance = {**joined.report.provenance(), "tiles": len(files)}
-    comments = with_tags(scene.comments, scene.target.screen_filter, provenance)
+    comments = with_tags(scene.comments, scene.target.screen_filter, provenance, scene.target.eps2d)
 
     def write(ply: Path) -> None:
         with new_file(ply, overwrite=True) as temporary, temporary.open("xb") as out:
