@@ -193,6 +193,8 @@ def test_a_checkpoint_is_read_as_it_is(tmp_path):
     np.testing.assert_allclose(splats.scales[:, 1], np.exp(held["scale_1"]), rtol=1e-6)
     assert (splats.scales[:, 2] == 0).all()
     assert any("flat" in note for note in model.notes)
+    tagged = load_model(model.save(tmp_path / "tagged.ply", provenance={}))
+    assert tagged.trained.eps2d == 0.5 and not any("0.3 px²" in note for note in tagged.notes)  # the dilation of others
 
 
 def test_rendered_by_its_own_convention(tmp_path):

@@ -29,6 +29,7 @@ from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.health import ACTIVATED
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.recipes import recipe
@@ -518,9 +519,12 @@ def test_a_large_scene_takes_fewer_steps_in_tiles_too(job, monkeypatch):
 
 
 def test_a_file_for_a_filter_that_the_tag_does_not_tell_whole_is_read_back_with_its_dilation(job):
-    joined = adapt_in_tiles(replace(job, viewer="mip", settings=job.settings | {"steps": 0}), 2)
-    trained = load_vanilla(joined.file).trained
-    assert (trained.screen_filter, trained.eps2d) == ("mip", 0.1)
+    """The base of tiles too, as one that was converted at x1."""
+    base = tiny.folder(job.target.with_name("base"), trained=TrainedScale("mip", 0.1))
+    again = replace(job.base, checkpoint=next(base.rglob("point_cloud.ply")), cameras=base / "cameras.json")
+    for asked in (replace(job, viewer="mip"), replace(job, base=again, target=job.target.with_name("again.ply"))):
+        trained = load_vanilla(adapt_in_tiles(replace(asked, settings=job.settings | {"steps": 0}), 2).file).trained
+        assert (trained.screen_filter, trained.eps2d) == ("mip", 0.1)
 
 
 def test_a_model_folder_is_written_as_one(job, tmp_path):

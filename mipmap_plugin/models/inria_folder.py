@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeGuard
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.atomic import new_folder
 from mipmap_plugin.formats.cfg_args import format_cfg_args, read_cfg_args_and_rest
+from mipmap_plugin.formats.tags import kernel_size, render_mode
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 
@@ -40,12 +41,14 @@ def read_options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
         return {}, [f"the training options are not known: {error}"]
 
 
-def trained_scale(options: dict[str, Any], screen_filter: str | None) -> TrainedScale:
-    """How the checkpoint was trained, from its options and the screen filter that its header names, if any."""
+def trained_scale(options: dict[str, Any], comments: Sequence[str] = ()) -> TrainedScale:
+    """How the checkpoint was trained, from its options and the screen filter that its header's comments name, if any."""
+    if (kernel := kernel_size(comments)) is not None:
+        options = {**options, "kernel_size": kernel}
     resolution, white = options.get("resolution"), options.get("white_background")
     if not _is_number(resolution):
         resolution = TrainedScale.resolution
-    screen_filter, eps2d = _screen_filter(options, screen_filter)
+    screen_filter, eps2d = _screen_filter(options, render_mode(comments))
     return TrainedScale(
         screen_filter=screen_filter,
         eps2d=eps2d,

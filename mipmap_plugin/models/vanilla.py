@@ -18,7 +18,7 @@ from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply, write_ply
 from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, write_exchange
-from mipmap_plugin.formats.tags import kernel_size, render_mode, with_tags
+from mipmap_plugin.formats.tags import render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.columns import FILTER_3D, extra_columns, to_columns, to_parameters, whole_opacities
@@ -271,16 +271,15 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     ply = read_ply(path)
     parameters, extras = kind.parameters_of(ply.columns, path), extra_columns(ply.columns)
     options, notes = read_options(folder)
-    screen_filter, kernel = render_mode(ply.comments), kernel_size(ply.comments)
+    screen_filter, trained = render_mode(ply.comments), trained_scale(options, ply.comments)
     origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
-    trained = trained_scale(options if kernel is None else {**options, "kernel_size": kernel}, screen_filter)
     model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes])
     model.notes += [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if (whole := whole_opacities(ply.columns)) else []
     del ply  # as large as the model, and no longer needed
     has_filter = FILTER_3D in extras  # whose family knows its screen filter
     taken_as_classic = screen_filter is None and trained.screen_filter == "classic" and not has_filter
     model.notes += companion_notes(options, model.sh_degree, model.traits.exposures, taken_as_classic)
-    if screen_filter and not has_filter:
+    if screen_filter not in (None, "2dgs") and not has_filter:  # flat splats have a note of their own
         model.notes.append(f"the header says that the splats are to be drawn {trained.screen_filter} ({trained.eps2d:g} px²)")
     others = [name for name in extras if name != FILTER_3D]
     model.notes += [f"extra columns are carried along: {', '.join(others)}"] if others else []

@@ -25,7 +25,6 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply_rows import PlyRows
-from mipmap_plugin.formats.tags import render_mode
 from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.jobs.base import COLORS, Base
 from mipmap_plugin.models import Checkpoint, detect
@@ -175,7 +174,7 @@ class TiledScene:
         origin = Origin(
             checkpoint.path, self.digest, checkpoint.folder, checkpoint.iteration, comments, {}, read_exposures(checkpoint.folder)
         )  # fmt: skip
-        trained = trained_scale(options, render_mode(comments))
+        trained = trained_scale(options, comments)
         if self.kind is SurfelModel:
             trained = flat_trained(trained)
         model = self.kind(self.base.parameters(sample), trained, origin)

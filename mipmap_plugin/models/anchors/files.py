@@ -63,13 +63,13 @@ def read_anchors(path: str | Path, family: str, iteration: int | None) -> Anchor
     options, notes = read_options(checkpoint.folder)
     origin = _origin(checkpoint, ply.comments)
     every_note = (*checkpoint.notes, *ply.notes, *notes, *dropped, *_rounded(ply.columns, carried, checkpoint.path))
-    return AnchorFile(parameters, carried, weights, companions, options, trained_scale(options, None), origin, first, every_note)
+    return AnchorFile(parameters, carried, weights, companions, options, trained_scale(options), origin, first, every_note)
 
 
 def anchors_in_memory(parameters: dict[str, Tensor], carried: tuple[str, ...], weights: Weights, name: str) -> AnchorFile:
     """As `read_anchors`, but from tensors of the live object `name`. Raises CheckpointError."""
     parameters, dropped = _checked(parameters, carried, weights, name)
-    return AnchorFile(parameters, carried, weights, {}, {}, trained_scale({}, None), Origin(), notes=(f"copied from a live {name}", *dropped))
+    return AnchorFile(parameters, carried, weights, {}, {}, trained_scale({}), Origin(), notes=(f"copied from a live {name}", *dropped))
 
 
 def to_parameters(columns: Mapping[str, np.ndarray], path: Path) -> tuple[dict[str, Tensor], tuple[str, ...]]:
