@@ -37,14 +37,15 @@ class StartSearch:
         self.scene, self.folder = scene, folder
         self.truths = Truths(scene, folder)
         effects = scene.base_effects, scene.target
-        self.matches = scene.scale <= 1 and not (filter_suffices(*effects) or draws_alike(*effects))
+        self.forms = scene.config.closed_form and not (filter_suffices(*effects) or draws_alike(*effects))
+        self.matches = scene.scale <= 1 and self.forms
         self.views = evenly(scene.views.adapted, enough_views(scene.base.places[:, :3], scene.views.adapted))
 
     @torch.no_grad()
     def run(self) -> None:
         """Write the start of each tile, and `start.pt`: its name, and its PSNR on the steering views."""
         scene, config, base_db = self.scene, self.scene.config, self.steer(self.scene.base)
-        if not (config.closed_form or config.merge_to < 1):
+        if not (self.forms or config.merge_to < 1):
             return self._take_base(base_db)
         weights = scene.painter(scene.base_effects).blend_weights(scene.base, self.views) * scene.scale**2
         pool.release_to_system()
@@ -55,10 +56,10 @@ class StartSearch:
             self._candidate("merged", weights, fraction)
             merged_db = self.steer(self._open("merged"))
             if merged_db >= least_db:
-                return self._take("merged", start_name(config, merged=True), merged_db)
-        if formed_db < base_db or not config.closed_form:
+                return self._take("merged", start_name(self.forms, merged=True), merged_db)
+        if formed_db < base_db or not self.forms:
             return self._take_base(base_db)
-        return self._take("formed", start_name(config), formed_db)
+        return self._take("formed", start_name(self.forms), formed_db)
 
     def steer(self, splats: Splats) -> float:
         """PSNR (dB) on the steering views."""
@@ -75,7 +76,7 @@ class StartSearch:
         cores = range(len(self.scene.cores))
         merged = [self._merged(self._file(name, number), self.scene.cores[number], weights, fraction) for number in cores]
         pool.release_to_system()
-        if self.matches and self.scene.config.closed_form:
+        if self.matches:
             self._match(name, *map(torch.cat, zip(*merged, strict=True)))
             pool.release_to_system()
 
@@ -103,7 +104,7 @@ class StartSearch:
 
         if fraction < 1:
             model.rebuild(merged)
-        if scene.config.closed_form:
+        if self.forms:
             model.reshape(formed)
         write_store(file, model.parameters())
         return found[0], found[1]

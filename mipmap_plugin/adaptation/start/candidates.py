@@ -29,7 +29,6 @@ from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_see
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
-from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import INTEGRATED, MIN_ALPHA, SURFEL
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import Rebuilt, SplatModel, Thinned
@@ -62,10 +61,10 @@ class Bounds(NamedTuple):
         return quality.psnr >= self.psnr and quality.visible >= self.visible
 
 
-def start_name(config: AdaptConfig, *, merged: bool = False, thinned: bool = False) -> str:
-    """What a start is called in the report. `thinned`: rows were left out instead of merged."""
+def start_name(forms: bool, *, merged: bool = False, thinned: bool = False) -> str:
+    """What a start is called in the report. `forms`: it has the closed form; `thinned`: rows were left out instead of merged."""
     splats = "a part of the base" if thinned else "merged splats" if merged else "the base"
-    if not config.closed_form:
+    if not forms:
         return splats
     return f"the closed form of {splats}" if merged else "the closed form"
 
@@ -83,8 +82,9 @@ class StartSearch:
         self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
         self._alike = draws_alike(problem.base_effects, problem.target)
         # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
-        self._keeps_shapes = self._alike and problem.config.steps > 0 and problem.scale <= 1
-        unchanged = self._keeps_shapes or filter_suffices(problem.base_effects, problem.target)
+        keeps = self._alike and problem.config.steps > 0 and problem.scale <= 1
+        unchanged = keeps or filter_suffices(problem.base_effects, problem.target)
+        self._forms = problem.config.closed_form and not keeps
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
         self._matches_weights = problem.has_blend_weights and not unchanged and (problem.scale <= 1 or not spreads)
 
@@ -99,22 +99,21 @@ class StartSearch:
             merges = config.merge_to < 1 and not base.traits.thins
             weights = self._base_weights(base) if self._matches_weights or merges or too_many else None
         if too_many:
-            return self._candidate(weights, 0.0), start_name(config, merged=True)
+            return self._candidate(weights, 0.0), start_name(self._forms, merged=True)
         with self._clock.timing("candidate"):
             formed = self._candidate(weights, 1.0)
         if config.merge_to == 1 and config.returns == "last":
-            return formed, start_name(config)
+            return formed, start_name(self._forms)
         before, after = problem.quality(base), problem.quality(formed)
         if self._alike and after.visible < before.visible:  # the filter itself is the better answer, for merged splats too
-            self._keeps_shapes, after = True, before
+            self._forms, after = False, before
         bounds = Bounds(after.psnr - config.merging_costs, before.visible - problem.may_lose)
         self._least = least_fraction(base, problem.views, problem.scale) if base.traits.thins else 0.0
         fewer = config.merge_to < 1 and self._least < 1
         merged = self._merged(weights, bounds, self._coarse_bounds(bounds, before)) if fewer else None
         if merged is not None:
-            return merged, start_name(config, merged=True, thinned=base.traits.thins)
-        better = after.visible >= before.visible and config.closed_form and not self._keeps_shapes
-        return (formed, start_name(config)) if better else (base, problem.name)
+            return merged, start_name(self._forms, merged=True, thinned=base.traits.thins)
+        return (formed, start_name(True)) if self._forms and after.visible >= before.visible else (base, problem.name)
 
     def _merged(self, weights: Tensor | None, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
         """What is merged furthest within bounds; None if merging costs too much.
@@ -163,7 +162,7 @@ class StartSearch:
             with problem.phase("thinning"):
                 means = student.parameters()["means"].detach()
                 cast(Thinned, student).thin(evenly_in_space(means, self._pixel_size(means) / problem.scale, fraction))
-        if problem.config.closed_form and not self._keeps_shapes:
+        if self._forms:
             with problem.phase("closed form"):
                 student.reshape(lambda gaussians: self._closed_form(gaussians, weights), problem.views)
         return student
