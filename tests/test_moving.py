@@ -1,5 +1,6 @@
 """Times: which moment each view of a moving scene is adapted at."""
 
+import json
 from dataclasses import replace
 
 import moving
@@ -63,6 +64,15 @@ def test_render_shows_the_moments_that_are_asked_for(tmp_path, capsys):
     [one], two = sorted((tmp_path / "one").iterdir()), sorted((tmp_path / "two").iterdir())
     assert [picture.stem.rpartition("_")[2] for picture in two] == ["t0.25", "t1"] and "_t0" not in one.stem
     assert len({picture.read_bytes() for picture in (one, *two)}) == 3
+
+
+def test_a_view_has_the_exposure_of_its_name_at_each_moment(tmp_path):
+    folder, name = moving.write_hexplane(tmp_path / "m"), tiny.cameras(1)[0].name
+    (folder / "exposure.json").write_text(json.dumps({name: [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}))
+    words = ["render", str(folder), "--backend", "reference", "--view", name, "--time", "0.25", "--time", "1"]
+    assert main([*words, "--output", str(tmp_path / "plain")]) == main([*words, "--output", str(tmp_path / "exposed"), "--exposure"]) == 0
+    plain, exposed = ({picture.name: picture.read_bytes() for picture in (tmp_path / each).iterdir()} for each in ("plain", "exposed"))
+    assert len(plain) == 2 and plain.keys() == exposed.keys() and plain != exposed
 
 
 def test_render_refuses_times_of_no_scene(tmp_path, capsys):

@@ -68,7 +68,8 @@ def render(
     if viewer is not None:
         wrapped.effects(zoom, filter_name, supersampling, viewer)  # check the options before any work
     outputs = [name for name, requested in {"depth": depth, "normals": normals}.items() if requested]
-    pictures = [output / name for name in picture_names(views)]
+    told = [replace(camera, name=f"{camera.name}_t{camera.time:g}") for camera in views] if len(time) > 1 else views
+    pictures = [output / name for name in picture_names(told)]
     _refuse(wrapped, pictures, outputs, overwrite)
     if exposure:
         for camera in views:
@@ -82,15 +83,14 @@ def render(
 
 
 def _at_times(wrapped: Wrapped, views: Sequence[Camera], times: Sequence[float]) -> list[Camera]:
-    """The views at each of the times, named by both where there are several; the views as they are without times. Raises SettingsError."""
+    """The views at each of the times; the views as they are without times. Raises SettingsError."""
     if not times:
         return list(views)
     if not wrapped.model.traits.moves:
         raise SettingsError("time: nothing moves in this scene, so that it looks the same at all times; leave it out")
     if wrong := [time for time in times if not 0 <= time <= 1]:
         raise SettingsError(f"time: must be from 0 to 1, got {wrong[0]:g}")
-    named = [f"_t{time:g}" if len(times) > 1 else "" for time in times]
-    return [replace(view, name=f"{view.name}{name}", time=time) for view in views for time, name in zip(times, named, strict=True)]
+    return [replace(view, time=time) for view in views for time in times]
 
 
 def _zoom(wrapped: Wrapped, scale: float | None) -> float:
