@@ -2,15 +2,17 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import moving
 import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.moments import at_moments, release, sharing_moments
+from mipmap_plugin.adaptation.moments import at_moments, evaluate_moments, follower, release, sharing_moments
 from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.base import Traits
 from mipmap_plugin.models.moving import memory
 from mipmap_plugin.models.moving.hexplane import HexPlane
 from mipmap_plugin.models.moving.memory import Memory
@@ -185,6 +187,13 @@ def test_the_bases_moments_are_evaluated_in_a_phase_of_their_own(tmp_path, monke
     assert adapted.report.seconds["motion"] > 0 and len(set(evaluated[: ahead[0]])) >= 5
     static = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(1 / 2, recipe="instant")
     assert "motion" not in static.report.seconds
+
+
+def test_a_moving_model_without_a_memory_is_not_evaluated_ahead():
+    """As one of a third party: nothing of it would be kept."""
+    base = SimpleNamespace(traits=Traits(moves=True), gaussians=None)
+    evaluate_moments(base, at_times(3), phase=None)
+    follower(base, at_times(3), 0.5)(base)
 
 
 def test_photographs_stay_at_their_own_moments(tmp_path):

@@ -74,6 +74,16 @@ def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
         assert all(torch.equal(tensor, parameters[name]) for name, tensor in here.model.parameters().items())
 
 
+def test_anchors_are_left_out_there(monkeypatch, tmp_path):
+    monkeypatch.setattr("mipmap_plugin.adaptation.start.thinning.PER_PIXEL", 0.0)
+    model = load_model(FAMILIES["scaffold"](tmp_path / "base"))
+    thinned = FEW | dict(recipe="instant", merge_to=0.5, merging_costs=99)
+    here = wrap_model(model, cameras=VIEWS, backend="reference").adapt(1 / 4, **thinned)
+    with pretended.pretending():
+        there = wrap_model(model.to(pretended.DEVICE), cameras=VIEWS, backend="reference").adapt(1 / 4, **thinned)
+    assert "a part of the base" in "".join(there.report.validation) and there.report.validation == pytest.approx(here.report.validation, abs=1e-3)
+
+
 @pytest.mark.parametrize("enough", [True, False])
 def test_harmful_growth_is_undone_there(enough, monkeypatch):
     register_upsampler("mine", lambda image, size: resize(image, size, "lanczos"), replace=True)

@@ -59,7 +59,7 @@ def evaluate_moments(base: SplatModel, views: Sequence[Camera], phase: Callable[
 
     Else the first truth and the first step at each moment would pay for it, and the time that is left be told wrongly.
     """
-    if base.traits.moves:
+    if _follows(base):
         with phase("motion"):
             for view in {view.time: view for view in views}.values():
                 base.gaussians(view)
@@ -68,7 +68,7 @@ def evaluate_moments(base: SplatModel, views: Sequence[Camera], phase: Callable[
 def follower(base: SplatModel, views: Sequence[Camera], scale: float) -> Callable[[SplatModel], None]:
     """What is called before each step: it lets a field be evaluated where splats are, once that is no longer nearly where it was evaluated last."""
     moving: Any = base
-    if not (base.traits.moves and hasattr(base, "follow")):
+    if not _follows(base):
         return lambda student: None
     pixel = float(pixel_size(base.parameters()["means"].detach(), views).median()) / scale
     reach = moving.reach(pixel)
@@ -77,6 +77,11 @@ def follower(base: SplatModel, views: Sequence[Camera], scale: float) -> Callabl
         student.follow(reach)
 
     return follow
+
+
+def _follows(base: SplatModel) -> bool:
+    """Whether a model keeps what its field was evaluated to; one of a third party need not."""
+    return base.traits.moves and hasattr(base, "follow")
 
 
 def keep_rows(model: SplatModel, rows: Tensor) -> None:
