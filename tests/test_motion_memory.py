@@ -1,6 +1,8 @@
 """Fields of moving scenes are evaluated once for the splats and a moment, and while splats are adapted only once that matters."""
 
+import copy
 import json
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -82,6 +84,13 @@ def test_a_followed_hexplane_moves_splats_along_its_slopes(tmp_path):
     known, exact = model.gaussians(moving.at(0.4)).means, moved_to(model.field, model.canonical, 0.4).means
     stale = model.field.moved(model.canonical, model.field.changes(model.held, 0.4)).means
     assert float((known - exact).abs().mean()) < float((stale - exact).abs().mean()) / 3
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda model: pickle.loads(pickle.dumps(model))])
+def test_a_model_can_be_copied_by_python_and_sent_to_other_processes(tmp_path, copied):
+    model = load_model(moving.write_hexplane(tmp_path / "m"))
+    before = model.gaussians(moving.at(0.5)).means
+    assert torch.equal(copied(model).gaussians(moving.at(0.5)).means, before)
 
 
 def test_moments_of_no_use_are_forgotten():

@@ -66,9 +66,19 @@ class MovingModel:
     def __init__(self, family: str, canonical: VanillaModel, field: Field, memories: Sequence[Memory] = ()) -> None:
         """`memories`: those of a model with the same field: of its changes, and of its slopes if it has any."""
         self.family, self.canonical, self.field = family, canonical, field
-        own = (Memory(lambda means, time: field.changes(means, time)), *([Memory(field.slopes)] if field.has_slopes else []))
-        self._memory, *self._slopes = self._memories = memories or own
+        self._share(memories or _memories_of(field))
         self.source, self.folder, self.digest, self.notes = canonical.source, canonical.folder, canonical.digest, canonical.notes
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For `pickle` and `copy.deepcopy`: without what is known of the field, which locks guard."""
+        return {name: value for name, value in vars(self).items() if name not in ("_memories", "_memory", "_slopes")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._share(_memories_of(self.field))
+
+    def _share(self, memories: Sequence[Memory]) -> None:
+        self._memory, *self._slopes = self._memories = memories
 
     @property
     def trained(self) -> TrainedScale:
@@ -180,6 +190,11 @@ class MovingModel:
         network = network_of(ply, self.family)
         network.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(network_of(self.source, self.family), network)
+
+
+def _memories_of(field: Field) -> Sequence[Memory]:
+    changes = Memory(lambda means, time: field.changes(means, time))
+    return (changes, Memory(field.slopes)) if field.has_slopes else (changes,)
 
 
 def moved_to(field: Field, canonical: VanillaModel, time: float) -> Gaussians:
