@@ -61,7 +61,7 @@ class AdaptationRequest:
 
     images: BaseImages  # of the model, rendered as in its training, by the backend
     targets: Mapping[str, Effects]  # how the adapted file is rendered, by viewer; the file names the first of them
-    viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: no particular one
+    viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: what draws as the training did
     backend_note: str  # which backend was chosen, and why
     has_gradients: bool  # whether the backend has gradients for this request
     base_in_viewer: SplatModel  # what the viewer reads of the base's own file: the base itself, where the viewer reads all of it

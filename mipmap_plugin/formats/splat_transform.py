@@ -69,7 +69,7 @@ def refuse_exchange(path: Path) -> list[str]:
     """The command of splat-transform. Raises SettingsError, naming the output `path`, if it is not installed, or too old for this format."""
     tool = find_tool()
     if tool is None:
-        instead = "; or give a .ply" if path.suffix else ""  # of a file
+        instead = "; or give a .ply" if is_written(path) else ""  # of a file; the name of a folder may have a dot
         raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}{instead}")
     oldest = OLDEST.get(path.suffix.lower(), ())
     version = _version(tool) if oldest else ()
