@@ -139,6 +139,14 @@ def test_adapting_for_classic_renderers_raises_the_quality_and_says_so_in_the_cf
     assert (folder / "ckpts/ckpt_6999_rank0.pt").read_bytes() == before
 
 
+@pytest.mark.parametrize("viewer", ["mip", "playcanvas-aa"])
+def test_a_file_for_a_viewer_is_read_back_with_its_dilation(tmp_path, viewer):
+    base = wrap_model(gsplat_folder(tmp_path / "r", splats(60)), cameras=tiny.cameras(), backend="reference")
+    adapted = base.adapt(1 / 2, viewer=viewer, recipe="instant")
+    trained = load_model(adapted.save(tmp_path / "out")).trained
+    assert (trained.screen_filter, trained.eps2d) == ("mip", base.effects(viewer=viewer).eps2d)
+
+
 def test_a_ply_is_written_on_request(tmp_path):
     raw = splats()
     saved = load_model(gsplat_folder(tmp_path / "r", raw)).save(tmp_path / "out.ply", provenance={})

@@ -163,6 +163,14 @@ def test_adapting_raises_the_quality_and_leaves_the_base_alone(tmp_path, scale):
     assert saved.with_name(saved.name + ".adaptation.json").is_file()
 
 
+@pytest.mark.parametrize("viewer", ["mip", "playcanvas-aa"])
+def test_a_file_for_a_viewer_is_read_back_with_its_dilation(tmp_path, viewer):
+    base = wrap_model(splatfacto_folder(tmp_path / "r", splats(60)), cameras=tiny.cameras(), backend="reference")
+    adapted = base.adapt(1 / 2, viewer=viewer, recipe="instant")
+    trained = load_model(adapted.save(tmp_path / "out")).trained
+    assert (trained.screen_filter, trained.eps2d) == ("mip", base.effects(viewer=viewer).eps2d)
+
+
 # Notes and refusals
 
 

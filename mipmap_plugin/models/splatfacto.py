@@ -24,6 +24,7 @@ from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.health import without_invalid
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.places import SPLATFACTO
+from mipmap_plugin.models.tagged import as_tagged
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.splatting.harmonics import C0
 
@@ -125,7 +126,7 @@ def load_splatfacto(path: str | Path, *, iteration: int | None = None) -> Vanill
     origin = Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, comments, host=host)
     antialiased = "antialiased" if options.get("rasterize_mode") == "antialiased" else "classic"
     background = BACKGROUNDS.get(str(options.get("background_color")))
-    trained = TrainedScale(render_mode(comments) or antialiased, background=background, near_plane=NEAR_PLANE)
+    trained = as_tagged(TrainedScale(antialiased, background=background, near_plane=NEAR_PLANE), comments)
     try:
         model = VanillaModel(to_parameters(stored), trained, origin, _unusual_options(content["pipeline"], options))
     except (ShapeError, RuntimeError, IndexError) as error:  # what torch raises for a tensor with too few axes

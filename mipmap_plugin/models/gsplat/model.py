@@ -27,6 +27,7 @@ from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.models.places import GSPLAT
 from mipmap_plugin.models.surfels import NOTE as FLAT_NOTE
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
+from mipmap_plugin.models.tagged import as_tagged
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
@@ -106,7 +107,8 @@ def load_gsplat(path: str | Path, *, iteration: int | None = None) -> VanillaMod
     try:
         parameters = {name: torch.cat([part[name] for part in parts]) for name in NAMES}
         flat = str(options.get("model_type", "")).startswith("2dgs")
-        kind, trained = (SurfelModel, flat_trained(_trained(options, None))) if flat else (VanillaModel, _trained(options, render_mode(comments)))
+        trained = _trained(options)
+        kind, trained = (SurfelModel, flat_trained(trained)) if flat else (VanillaModel, as_tagged(trained, comments))
         model = kind(parameters, trained, origin, [*notes, *[FLAT_NOTE] * flat])
     except (ShapeError, RuntimeError) as error:  # what torch.cat raises for ranks that do not fit together
         raise CheckpointError(f"{checkpoint.path} holds tensors that do not fit together: {error}; copy it again") from error
@@ -184,10 +186,10 @@ def _options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
     return options, []
 
 
-def _trained(options: dict[str, Any], tagged: str | None) -> TrainedScale:
+def _trained(options: dict[str, Any]) -> TrainedScale:
     antialiased = "antialiased" if options.get("antialiased") else "classic"
     resolution, near = _positive(options, "data_factor", TrainedScale.resolution), _positive(options, "near_plane", NEAR_PLANE)
-    return TrainedScale(tagged or antialiased, resolution=resolution, near_plane=near)
+    return TrainedScale(antialiased, resolution=resolution, near_plane=near)
 
 
 def _positive(options: dict[str, Any], key: str, default: float) -> float:
