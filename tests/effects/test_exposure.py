@@ -113,7 +113,7 @@ def test_an_adapted_model_and_its_folder_keep_exposures(tmp_path):
 
 def test_families_built_on_3dgs_have_exposures_too(tmp_path):
     splats = base(tmp_path / "a", {"view_1": WARM}).model
-    field = SimpleNamespace(has_slopes=False, is_still=True, cost="")
+    field = SimpleNamespace(slopes=None, is_still=True, cost="")
     around = [MipModel("mip", splats, torch.ones(len(splats))), MovingModel("deformable", splats, field)]
     assert [model.traits.exposures is splats.traits.exposures for model in around] == [True, True]
 

@@ -47,6 +47,7 @@ class DeformNetwork:
         self._refuse_other_inputs(where)
         require(self._weights, self._shapes(), where)
         self.is_still = not any(self._weights[f"{head}.{part}"].any() for head in self._heads for part in ("weight", "bias"))
+        self.slopes = None  # the original has no gradient through the network
         self.cost = f"{sum(w.numel() for name, w in self._weights.items() if name.endswith('weight')):,} multiplications a splat and moment"
 
     def moved(self, canonical: VanillaModel, changes: Changes) -> Gaussians:
@@ -67,14 +68,6 @@ class DeformNetwork:
         hidden = self._hidden(means, moment)
         *motion, turn, growth = (self._layer(head, hidden) for head in self._heads)
         return {"means": torch.cat(motion, dim=1), "quats": turn, "scales": growth}
-
-    @property
-    def has_slopes(self) -> bool:
-        return False
-
-    def slopes(self, means: Tensor, time: float) -> Changes:
-        """The original has no gradient through the network, so that there are none."""
-        raise NotImplementedError
 
     def to(self, device: torch.device | str) -> DeformNetwork:
         """The same network on another device."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import combinations, count, takewhile
 from pathlib import Path
 from typing import Any
@@ -88,11 +88,12 @@ class HexPlane:
         return {CHANGED[name]: self._head(name, hidden) for name in self.heads} | masks
 
     @property
-    def has_slopes(self) -> bool:
-        return POSITIONS in self.heads
+    def slopes(self) -> Callable[[Tensor, float], Changes] | None:
+        """As the original's gradient of a mean goes through the field; None if it moves none."""
+        return self._slopes if POSITIONS in self.heads else None
 
-    def slopes(self, means: Tensor, time: float) -> Changes:
-        """The derivatives of what is added to the "means" in these, [N, 3, 3]: the original's gradient goes through the field."""
+    def _slopes(self, means: Tensor, time: float) -> Changes:
+        """The derivatives of what is added to the "means" in these, [N, 3, 3]."""
         with torch.enable_grad():
             places = means.detach().requires_grad_()
             hidden = self.features(places, time)

@@ -48,11 +48,9 @@ class Field(Protocol):
         """The splats after such changes, differentiable in the canonical parameters."""
 
     @property
-    def has_slopes(self) -> bool:
-        """Whether the original's gradient of a mean goes through the field."""
-
-    def slopes(self, means: Tensor, time: float) -> Changes:
-        """The derivatives of the moved means in these, beyond those of `moved`: "means", [N, 3, 3]; only with `has_slopes`."""
+    def slopes(self) -> Callable[[Tensor, float], Changes] | None:
+        """Of means [N, 3] and a time: the derivatives of the moved means in these, beyond those of `moved`, as "means" [N, 3, 3]; None if the
+        original's gradient of a mean does not go through the field."""
 
     def to(self, device: torch.device | str) -> Field:
         """The same field on another device."""
@@ -194,7 +192,7 @@ class MovingModel:
 
 def _memories_of(field: Field) -> Sequence[Memory]:
     changes = Memory(lambda means, time: field.changes(means, time))
-    return (changes, Memory(field.slopes)) if field.has_slopes else (changes,)
+    return (changes,) if field.slopes is None else (changes, Memory(field.slopes))
 
 
 def moved_to(field: Field, canonical: VanillaModel, time: float) -> Gaussians:
