@@ -17,7 +17,7 @@ from typing import Any
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.errors import MipmapPluginError, SettingsError, install
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.viewing.adapting import Adapter, Live, Wish
 from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, NOWHERE, Controls
@@ -28,7 +28,7 @@ from mipmap_plugin.viewing.stage import Look, Stage, smaller
 
 OUT_OF_MEMORY = "out of memory; enlarge pixels, or make the window smaller"
 
-NO_VISER = "the live view needs viser: pip install 'mipmap-plugin[view]'"
+NO_VISER = f"the live view needs viser; {install('view')}"
 
 # Of JPEG, while the camera moves; pictures that stay are PNGs, whose pixels are exact.
 QUALITY = 80
