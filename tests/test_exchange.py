@@ -20,6 +20,7 @@ from ply_files import write
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.splatting.harmonics import basis
@@ -157,13 +158,24 @@ def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("viewer", ["gaussian-splats-3d", "mkkellogg"])
-def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys, viewer):
+UP_TO_2, NONE = "reads .spz up to version 2, and splat-transform writes 3 at least", "read no .spz"
+
+
+@pytest.mark.parametrize(("viewer", "why"), [("gaussian-splats-3d", UP_TO_2), ("mkkellogg", UP_TO_2), ("gsplat-js", NONE), ("drei", NONE)])
+def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys, viewer, why):
     (tmp_path / "phone.spz").write_bytes(SPZ)
     words = ["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant", "--viewer", viewer]
     assert main(words) == 2
-    assert "reads .spz up to version 2, and splat-transform writes 3 at least; give a .ply by --output" in capsys.readouterr().err
+    assert f"{why}; give a .ply by --output" in capsys.readouterr().err
     assert main([*words, "--output", str(tmp_path / "phone.ply")]) == 0
+
+
+def test_spz_for_several_viewers_is_written_with_a_warning_of_those_that_do_not_read_it(tmp_path, recwarn):
+    refuse_unread(tmp_path / "a.spz", ["spark", "three"])
+    refuse_unread(tmp_path / "a.ply", ["spark", "gaussian-splats-3d"])
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"GaussianSplats3D .*; antimatter15/splat, .* read no .spz; give a .ply by --output if it is for these too"):
+        refuse_unread(tmp_path / "a.spz", ["spark", "gaussian-splats-3d", "antimatter15"])
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])

@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -41,7 +42,10 @@ OLDEST: dict[str, tuple[int, ...]] = {".sog": (3, 0), ".json": (3, 0), ".spz": (
 SPZ_VERSION = "3"
 
 # Viewers that do not read it, by their source: for these a PLY has to be written.
-NO_SPZ = {"gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2"}
+NO_SPZ = {
+    "gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2, and splat-transform writes 3 at least",
+    **dict.fromkeys(("antimatter15", "aframe", "gsplat-js"), "antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no .spz"),
+}
 
 # From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them
 # in the frame in which they are stored.
@@ -80,10 +84,15 @@ def refuse_exchange(path: Path) -> list[str]:
     return tool
 
 
-def refuse_unread(path: Path, viewer: str | None) -> None:
-    """Raise SettingsError for an output that the viewer it is made for does not read."""
-    if viewer in NO_SPZ and _is_spz(path):
-        raise SettingsError(f"{path}: {NO_SPZ[viewer]}, and {TOOL} writes {SPZ_VERSION} at least; give a .ply by --output")
+def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
+    """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read."""
+    without = [viewer for viewer in viewers if viewer in NO_SPZ]
+    if not without or not _is_spz(path):
+        return
+    advice = f"{path}: {'; '.join(dict.fromkeys(NO_SPZ[viewer] for viewer in without))}; give a .ply by --output"
+    if len(without) == len(viewers):
+        raise SettingsError(advice)
+    warnings.warn(f"{advice} if it is for these too", stacklevel=3)
 
 
 def _version(tool: Sequence[str]) -> tuple[int, ...]:
