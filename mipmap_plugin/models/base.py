@@ -232,6 +232,12 @@ def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
     return gaussians
 
 
+@torch.no_grad()
+def count_of(model: SplatModel, view: Camera) -> int:
+    """The number of splats that a camera sees. They are made for it only where the rows of the parameters are something else."""
+    return len(model.parameters()["means"]) if model.traits.rows == SPLATS else len(model.gaussians(view))
+
+
 def digest_of_parameters(model: SplatModel) -> str:
     """The sha256 of the parameters of a model, hexadecimal: for one that was made in memory, or changed there."""
     digest = sha256()
