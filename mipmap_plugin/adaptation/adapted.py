@@ -97,7 +97,8 @@ class Adapted:
 
     def report_of(self, path: Path) -> Report:
         """The report of the file at `path`, which also says what its format has no place for, and who draws it otherwise."""
-        lost = filter(None, (without_place(path, getattr(self.model, "extras", ())), self._drawn_otherwise(path)))
+        left_out = without_place(path, getattr(self.model, "extras", ()), getattr(self.model, "sh_degree", 0))
+        lost = filter(None, (left_out, self._drawn_otherwise(path)))
         return self.report.model_copy(update={"notes": [*self.report.notes, *lost]})
 
     def _drawn_otherwise(self, path: Path) -> str:

@@ -41,6 +41,9 @@ OLDEST: dict[str, tuple[int, ...]] = {".sog": (3, 0), ".json": (3, 0), ".spz": (
 # The last version of SPZ that Spark 2.2 reads, and the first that splat-transform can write; its own choice is 4.
 SPZ_VERSION = "3"
 
+# The highest SH degree that its versions from 3.0 on read and write, though SPZ itself has room for 4.
+MOST_BANDS = 3
+
 # Viewers that do not read it, by their source: for these a PLY has to be written.
 NO_SPZ = {
     "gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2, and splat-transform writes 3 at least",

@@ -17,7 +17,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply, write_ply
-from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, write_exchange
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_written, refuse_exchange, write_exchange
 from mipmap_plugin.formats.tags import recorded_filter, render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
@@ -203,9 +203,10 @@ class VanillaModel:
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance, self.trained.eps2d)
         if is_written(path):
             refuse_own_filter(path, self.trained)
-            if lost := without_place(path, self._origin.extras):
+            if lost := without_place(path, self._origin.extras, self.sh_degree):
                 warnings.warn(lost, stacklevel=2)
-            return write_exchange(path, lambda ply: write_ply(ply, self._columns(parameters), comments), overwrite=overwrite)
+            exchanged = self._columns(parameters | {"shN": parameters["shN"][:, : (MOST_BANDS + 1) ** 2 - 1]})
+            return write_exchange(path, lambda ply: write_ply(ply, exchanged, comments), overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
         columns = {**self._columns(parameters), **self._origin.extras}
