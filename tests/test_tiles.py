@@ -836,3 +836,10 @@ def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypa
 def test_commands_that_cannot_be(words, reason, capsys):
     assert main(["adapt", *words.split()]) == 2
     assert reason in capsys.readouterr().err
+
+
+def test_help_says_what_a_time_budget_is_of(capsys):
+    with pytest.raises(SystemExit):
+        main(["adapt", "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Maximum number of seconds for each file; with --tiles for each tile instead" in said
