@@ -13,8 +13,8 @@ from mipmap_plugin.models.families import BUILT_IN, find_family
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
     """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder.
 
-    Exchange formats that can only be read are written as a PLY, and files of third-party families as these say (`Family.saves`). Files that
-    other projects save with torch become a folder, as those of INRIA are.
+    Exchange formats that can only be read are written as a PLY, as is a PLY in a zip archive, and files of third-party families as these say
+    (`Family.saves`). Files that other projects save with torch become a folder, as those of INRIA are.
     """
     name = checkpoint.resolve().name
     read, written = _endings(checkpoint, name)
@@ -32,5 +32,5 @@ def _endings(checkpoint: Path, name: str) -> tuple[str, str]:
     except MipmapPluginError:  # whoever loads it says so
         return "", ""
     if family in BUILT_IN:
-        return "", ""
+        return (Path(name).suffix, ".ply") if family.name == "zipped" else ("", "")
     return Path(name).suffix, Path(name).suffix if family.saves is None else family.saves
