@@ -11,6 +11,8 @@ from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.evaluation.tradeoff.truth import photographs
+from mipmap_plugin.scenes import load_scene
 
 DOUBT = "they may be of another scene, or their cameras in another frame; check --images"
 
@@ -34,9 +36,15 @@ def doubt(base, views):
 
 @pytest.mark.parametrize(("seed", "told"), [(0, False), (5, True)], ids=["its own scene", "another"])
 def test_evaluate_tells_of_photographs_of_another_scene(tmp_path, capsys, seed, told):
-    base, photographs = tiny.folder(tmp_path / "base"), tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=seed)
-    assert main(["evaluate", str(base), "--images", str(photographs), "--scale", "1/2", "--backend", "reference", "--no-report"]) == 0
+    base, images = tiny.folder(tmp_path / "base"), tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=seed)
+    assert main(["evaluate", str(base), "--images", str(images), "--scale", "1/2", "--backend", "reference", "--no-report"]) == 0
     assert (DOUBT in capsys.readouterr().err) == told
+
+
+@pytest.mark.parametrize(("seed", "told"), [(0, False), (5, True)], ids=["its own scene", "another"])
+def test_a_tradeoff_tells_of_them_too(tmp_path, base, recwarn, seed, told):
+    photographs(base, load_scene(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=seed)), 1 / 2, None)
+    assert any(DOUBT in str(warning.message) for warning in recwarn) == told
 
 
 def test_photographs_of_other_views_are_told_of(base):
