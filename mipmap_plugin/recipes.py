@@ -1,4 +1,4 @@
-"""Recipes: named sets of settings. How each number was found, and what it is worth, is in docs/recipes.md."""
+"""Recipes: named sets of settings. How each number was found, and what it is worth, is in docs/recipes_found.md."""
 
 from __future__ import annotations
 
