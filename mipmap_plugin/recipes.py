@@ -80,7 +80,7 @@ def default(scale: float, network: bool) -> dict[str, Any]:
 
 
 def thorough(scale: float, network: bool) -> dict[str, Any]:
-    """Better quality in several times the time; at zoom-in without a network the same as `default`."""
+    """Better quality in ten to twenty times the time; at zoom-in without a network the same as `default`."""
     return THOROUGH_OUT | _zoom_out_settings(scale) if scale <= 1 else dict(THOROUGH_UPSAMPLED if network else DEFAULT_IN)
 
 
