@@ -1,4 +1,4 @@
-"""Register your own family of checkpoints; here: splats in a NumPy archive.
+"""Register your own family of checkpoints; here: splats in a NumPy archive, whose adapted files are PLYs.
 
     python examples/register_family.py scene.npz 1/4
 
