@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from mipmap_plugin import Gaussians, register_model, wrap_model
-from mipmap_plugin.formats.atomic import new_file, refuse_output
+from mipmap_plugin.formats.atomic import new_file, refuse_output, sha256
 from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Files, Match
-from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.splatting.rotations import quaternions, rotations
 
@@ -59,7 +59,8 @@ def load(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     axes[torch.linalg.det(axes) < 0] *= -1  # rotations, not reflections
     scales = variances.clamp_min(0).sqrt().float()
     splats = Gaussians(means, quaternions(axes).float(), scales, opacities, (rgb[:, None] - 0.5) / C0)
-    return CholeskyModel.from_gaussians(splats).with_source(Path(path))
+    origin = Origin(Path(path), sha256(Path(path)), folder=Path(path).parent)  # whose cameras.json is read
+    return CholeskyModel(VanillaModel.from_gaussians(splats).parameters(), origin=origin)
 
 
 FAMILY = Family("cholesky", "splats as Cholesky factors", recognize, API_VERSION, load)

@@ -183,13 +183,30 @@ class Faint(Theirs):
         self.traits = replace(self.traits, plain=True)
 
 
+class Full(Theirs):
+    """It says that rows can be left out, and keeps them."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.traits = replace(self.traits, thins=True)
+
+    def thin(self, keep):
+        pass
+
+
 class Forgetful(Theirs):
     def reshape(self, form, views=()):
         VanillaModel.reshape(self, lambda gaussians: (2 * form(gaussians)[0], form(gaussians)[1]), views)
 
 
-@pytest.mark.parametrize(("kind", "test"), [(Faint, "test_keeps_what_its_traits_promise"), (Forgetful, "test_shapes_that_stay_keep_the_picture")])
-def test_the_suite_sees_models_that_draw_something_else(kind, test):
+@pytest.mark.parametrize(
+    ("kind", "test"),
+    [
+        (Faint, "test_keeps_what_its_traits_promise"), (Full, "test_rows_can_be_left_out"),
+        (Forgetful, "test_shapes_that_stay_keep_the_picture"),
+    ],
+)  # fmt: skip
+def test_the_suite_sees_models_that_break_a_promise(kind, test):
     with pytest.raises(AssertionError):
         getattr(ModelSuite(), test)(wrap_model(kind(tiny.model().parameters()), cameras=tiny.cameras(2), backend="reference"))
 
@@ -197,6 +214,6 @@ def test_the_suite_sees_models_that_draw_something_else(kind, test):
 def test_the_suite_wants_a_ply_for_viewers(tmp_path):
     with pytest.raises(PluginError, match="save"):
         ModelSuite().test_writes_a_ply_for_viewers(wrapped(save=save_as_text), tmp_path)
-    moving = wrapped()
+    moving = wrapped(save=save_as_text)
     moving.model.traits = Traits(moves=True)
-    ModelSuite().test_writes_a_ply_for_viewers(moving, tmp_path)  # no viewer draws it
+    ModelSuite().test_writes_a_ply_for_viewers(moving, tmp_path)  # as no viewer draws it

@@ -75,6 +75,11 @@ def test_an_adapted_file_keeps_the_suffix_by_which_its_family_knows_it(tmp_path,
     assert len(load_model(tmp_path / name).parameters()["means"])
 
 
+def test_a_file_for_a_viewer_is_a_ply(tmp_path):
+    register_model("cholesky", FILES["FAMILY"])
+    assert adapted_name(factors(tmp_path / "scene.npz"), 0.25, "spark") == "scene_x0.25_spark.ply"
+
+
 @pytest.mark.parametrize("ending", [".pt", ".npz"])
 def test_other_files_become_a_folder(tmp_path, ending):
     """Those that a built-in family reads, and those that none does."""

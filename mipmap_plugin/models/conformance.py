@@ -16,7 +16,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.models import contract, detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
-from mipmap_plugin.models.base import Filtered, Rebuilt, SplatModel, why_no_viewer
+from mipmap_plugin.models.base import Filtered, Rebuilt, SplatModel, Thinned, why_no_viewer
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.trajectories import orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
@@ -76,7 +76,15 @@ class ModelSuite:
         half = {name: tensor.detach()[: max(1, len(tensor) // 2)].clone().requires_grad_() for name, tensor in copied.parameters().items()}
         copied.replace_parameters(half)
         assert all(copied.parameters()[name] is tensor for name, tensor in half.items())
-        assert copied.row_opacities(base.cameras).shape == (len(half["means"]),)
+        assert contract.row_opacities(copied, base.cameras).shape == (len(half["means"]),)
+        assert copied.gaussians(base.cameras[0]).means.isfinite().all()
+
+    def test_rows_can_be_left_out(self, base: Wrapped) -> None:
+        copied, count = base.model.copy(), len(base.model.parameters()["means"])
+        if not copied.traits.thins:
+            return
+        cast(Thinned, copied).thin(torch.arange(count) < count // 2)
+        assert len(copied.parameters()["means"]) < count == len(base.model.parameters()["means"])
         assert copied.gaussians(base.cameras[0]).means.isfinite().all()
 
     def test_keeps_what_its_traits_promise(self, base: Wrapped) -> None:
