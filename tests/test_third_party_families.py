@@ -75,6 +75,11 @@ def test_an_adapted_file_keeps_the_suffix_by_which_its_family_knows_it(tmp_path,
     assert len(load_model(tmp_path / name).parameters()["means"])
 
 
+def test_a_numpy_archive_that_nobody_claims_is_told_to_be_one(tmp_path):
+    with pytest.raises(CheckpointError, match=r"scene\.npz is a NumPy archive that no family knows; .* or register its family$"):
+        detect(archive(tmp_path / "scene.npz"))
+
+
 def test_a_file_for_a_viewer_is_a_ply(tmp_path):
     register_model("cholesky", FILES["FAMILY"])
     assert adapted_name(factors(tmp_path / "scene.npz"), 0.25, "spark") == "scene_x0.25_spark.ply"
