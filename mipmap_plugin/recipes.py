@@ -115,7 +115,7 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
         raise PluginError(f"recipe {name!r} is of type {type(function).__name__}; make it a function (scale, network) -> settings")
     try:
         settings = {**function(scale, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)}
-    except Exception as error:  # third-party code may fail in any way
+    except (Exception, SystemExit) as error:  # third-party code may fail in any way
         raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
     if any(overrides.get(end) is not None for end in ENDS):
         settings |= {"most_draws": None, "least_zoom_in": 1.0}
