@@ -321,6 +321,17 @@ def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_
         tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
 
 
+def test_streamed_sog_is_read_by_a_splat_transform_that_knows_it(tmp_path, tool):
+    (tmp_path / "lod-meta.json").write_text(json.dumps({"lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json"], "tree": {}}))
+    assert len(load_model(tmp_path)) == 60
+    assert tool_request(tool)[1] == str(tmp_path / "lod-meta.json")
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.7.1 (b42b60c)', file=sys.stderr)\n")
+    assert sentence(tmp_path).endswith(
+        "lod-meta.json is Streamed SOG: splat-transform 2.7.1 is too old for it, and 3.2 or newer is needed, which needs Node.js 22; "
+        "run: npm install -g @playcanvas/splat-transform@latest"
+    )
+
+
 def seen(splats, turn):
     """Places, covariances, and colors in every direction, of splats after a turn [3, 3] of the scene."""
     axes = turn @ axes_of(splats.quats, splats.scales)

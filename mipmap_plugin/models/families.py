@@ -234,6 +234,8 @@ def find_family(name: str) -> Family:
         raise PluginError(f"family {name!r} calls itself {record.name!r}; register it under its own name")
     if not isinstance(record.before, tuple):
         raise PluginError(f"family {name!r}: `before` must be a tuple of names, got {record.before!r}")
+    if record.saves is not None and not str(record.saves).startswith("."):
+        raise PluginError(f"family {name!r}: `saves` must be the ending of a file's name, such as .ply, got {record.saves!r}")
     if record.api_version != API_VERSION:
         raise PluginError(f"family {name!r} is written for API version {record.api_version}, but this package has API version {API_VERSION}")
     return record
