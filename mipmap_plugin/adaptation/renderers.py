@@ -46,7 +46,7 @@ class Renderer:
         Buckets of depth are those of the splats before they are rounded, so that these are not rounded once for all.
         """
         settings = self.effects.settings
-        if settings.packing is None or settings.bucketed or settings.evenly_bucketed:
+        if settings.packing is None or settings.bucketed:
             return partial(self, gaussians)
         once, rest = in_two_steps(settings.packing)
         rounded = packed(gaussians, NO_CAMERA, once)
