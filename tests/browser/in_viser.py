@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -23,8 +23,10 @@ from mipmap_plugin.splatting.rotations import quaternions, rotations
 # Seconds in which the page has the splats, and they have grown to their sizes.
 GROWING = 3.0
 
-# px: the least side of the page's window; and the seconds in which it has another shape.
-WINDOW, SETTLING = 400, 1.0
+# px: the least side of the page's window; and how many of its frames are awaited once it has another shape.
+WINDOW, FRAMES = 400, 5
+
+LATER = "async frames => { while (frames-- > 0) await new Promise(requestAnimationFrame) }"
 
 
 @contextmanager
@@ -35,11 +37,7 @@ def in_viser(browser: Browser, splats: Gaussians) -> Iterator[tuple[Any, Any]]:
     server = viser.ViserServer(host="localhost", port=0, verbose=False)
     page = browser.visit(f"http://localhost:{server.get_port()}")
     try:
-        deadline = time.monotonic() + PATIENCE / 1000
-        while not server.get_clients():
-            if time.monotonic() > deadline:
-                raise BrowserError(f"viser: its page did not connect in {PATIENCE / 1000:g} s")
-            page.wait_for_timeout(100)
+        _wait(page, server.get_clients)
         axes = (rotations(splats.quats) * splats.scales[:, None]).numpy()
         colors = (0.5 + C0 * splats.sh[:, 0]).clamp(0, 1).numpy()
         server.scene.add_gaussian_splats("/splats", splats.means.numpy(), axes @ axes.transpose(0, 2, 1), colors, splats.opacities[:, None].numpy())
@@ -56,10 +54,21 @@ def drawn(page: Any, client: Any, camera: Camera, background: Sequence[float] = 
     position = (-rotation @ camera.viewmat[:3, 3]).numpy()
     # Whatever the camera of a picture, splats are projected by the window's field of view and shape.
     times = math.ceil(WINDOW / min(camera.width, camera.height))
-    page.set_viewport_size({"width": camera.width * times, "height": camera.height * times})
+    size = camera.width * times, camera.height * times
+    page.set_viewport_size({"width": size[0], "height": size[1]})
     client.camera.fov = fov
-    page.wait_for_timeout(1000 * SETTLING)
+    _wait(page, lambda: (client.camera.image_width, client.camera.image_height) == size)
+    page.evaluate(LATER, FRAMES)
     view = {"wxyz": quaternions(rotation[None])[0].numpy(), "position": position, "fov": fov}
     image = client.get_render(camera.height, camera.width, transport_format="png", timeout=PATIENCE / 1000, **view)
     color, alpha = np.split(image.astype(np.float32) / 255, [3], axis=2)
     return color * alpha + (1 - alpha) * np.float32(background)
+
+
+def _wait(page: Any, condition: Callable[[], Any]) -> None:
+    """Until a condition on what the page tells its server holds. Raises BrowserError if that takes longer than PATIENCE."""
+    deadline = time.monotonic() + PATIENCE / 1000
+    while not condition():
+        if time.monotonic() > deadline:
+            raise BrowserError(f"viser: its page did not answer in {PATIENCE / 1000:g} s")
+        page.wait_for_timeout(100)
