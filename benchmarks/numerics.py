@@ -20,8 +20,9 @@ from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.conformance.cases import HardCase, crowd, far_from_the_origin, odd_row, view
 from mipmap_plugin.backends.conformance.checks import Answer, draw
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects, RenderSettings
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, footprint
 from mipmap_plugin.splatting.projection import Projected, _from_factors
 

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import FRUSTUM_MARGIN, MAX_ALPHA, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import FRUSTUM_MARGIN, MAX_ALPHA
 from mipmap_plugin.splatting.harmonics import colors
 from mipmap_plugin.splatting.rotations import rotations
 

@@ -16,7 +16,7 @@ import sys
 from fractions import Fraction
 
 from mipmap_plugin import register_viewer, wrap_model
-from mipmap_plugin.effects import RenderSettings
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.viewers import Viewer
 
 KIOSK = Viewer(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from dataclasses import dataclass, replace
 
-from mipmap_plugin.allowed import OF_PACKING, OF_SETTINGS, check
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.screen_filters import COMPENSATED as COMPENSATED
 from mipmap_plugin.screen_filters import DILATION as DILATION
 from mipmap_plugin.screen_filters import INTEGRATED as INTEGRATED
@@ -22,111 +21,11 @@ SURFEL, LOW_PASS = "surfel", 0.5
 # World units: splats whose center is nearer than this are not rendered (diff-gaussian-rasterization, auxiliary.h).
 NEAR_PLANE = 0.2
 
-# Thresholds of every 3DGS rasterizer (diff-gaussian-rasterization, forward.cu).
-MIN_ALPHA = 1 / 255  # below one 8-bit step a splat cannot change a displayed pixel
-MIN_TRANSMITTANCE = 1e-4  # a pixel with less is finished
-
-# The largest alpha in every 3DGS rasterizer (diff-gaussian-rasterization, forward.cu): it keeps 1 - alpha away from 0, where the gradient of
-# everything behind the splat vanishes.
-MAX_ALPHA = 0.99
-
-# The fraction of the half field of view by which a center may lie outside the image before the Jacobian is frozen there; farther out,
-# the affine approximation would make splats far too large (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
-FRUSTUM_MARGIN = 0.3
-
-TILE = 16  # px
-
 # What can be rendered beside the image (`backends.geometry`), and the cost of each.
 OUTPUTS = {
     "depth": "another image, whose colors are distances",
     "normals": "another image, whose colors are directions, and the shortest axis of each splat",
 }
-
-
-@dataclass(frozen=True)
-class Packing:
-    """Quantization of splats in a viewer's memory: values are rounded to the nearest multiple of a step. None: not rounded."""
-
-    opacity: tuple[float, ...] = (1 / 255,)  # steps of successive roundings
-    color: float | None = None  # step of the color of SH degree 0, which is clamped to 0..1
-    downwards: bool = False  # opacities and colors are rounded down
-    bands: tuple[float, ...] = ()  # steps of the coefficients of SH degree 1, 2, ..., clamped to -1..1
-    log_scales: tuple[float, float, float] | None = None  # minimum, maximum and step of the natural logarithms
-    quats: Literal["octahedral", "stereographic"] | None = None  # `splatting.packing`
-    half_means: bool = False  # float16, in the world and again relative to the eye
-
-    def __post_init__(self) -> None:
-        check("packing", self, OF_PACKING, optional=frozenset({"color", "log_scales", "quats"}))
-
-
-@dataclass(frozen=True)
-class RenderSettings:
-    """How splats are rasterized, and which are left out. `tile` affects only the time. Viewers' own settings are in `splatting.viewers`.
-
-    A splat that is culled (by `min_variance`, `min_contribution` or `least_spread`) is not rendered, but has a gradient (`splatting.culls`).
-    """
-
-    min_alpha: float = MIN_ALPHA  # a splat of lower alpha is skipped in a pixel
-    min_transmittance: float = MIN_TRANSMITTANCE  # a pixel ends before the splat that would leave less
-    radius: float | None = None  # standard deviations at which a splat ends; None: where its alpha falls below `min_alpha`
-    tile: int = TILE  # px: pixels that share a list of splats
-    max_alpha: float = MAX_ALPHA  # alpha of a splat in a pixel is clamped to this
-    fades: bool = False  # a splat falls to 0 at `radius`: its weight w becomes (w - w_end) / (1 - w_end), where w_end is the weight at `radius`
-    max_color: float | None = None  # limit of a splat's color, in each channel
-    color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are rounded to multiples of these
-    radial: bool = False  # splats are sorted by their distance to the eye instead of by depth
-    bucketed: bool = False  # splats are sorted by PlayCanvas's buckets of depth (`splatting.buckets`),
-    evenly_bucketed: bool = False  # or by Babylon.js's, which are all of one length
-    min_variance: float = 0.0  # px², after dilation: splats whose variance along their longer axis is less are culled,
-    boxed: bool = False  # or, if this is set, whose larger variance along x and y is less; `max_half_axis` then limits those too
-    min_contribution: float = 0.0  # px², after dilation: splats whose opacity · sqrt(det) is less are culled
-    least_spread: float = 0.0  # px², after dilation: minimum distance of variances from their mean; splats whose smaller one becomes 0 are culled
-    max_half_axis: float = math.inf  # px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat is shrunk
-    fits_picture: bool = False  # half-axes are also limited to the picture's shorter side
-    packing: Packing | None = None  # quantization of splats in memory
-    frozen_beyond: float = FRUSTUM_MARGIN  # where the Jacobian is frozen; infinity: nowhere
-    frame: float = math.inf  # in halves of the picture from its middle: splats whose center lies farther out along x or y are not rendered
-    picture_step: float | None = None  # the picture is rounded to multiples after each splat, back to front; the gradient ignores the rounding
-
-    def __post_init__(self) -> None:
-        check("render settings", self, OF_SETTINGS, optional=frozenset({"radius", "max_color", "color_steps", "picture_step"}))
-        if not isinstance(self.packing, Packing | None):
-            raise SettingsError(f"render settings: packing must be a Packing, or None, got {type(self.packing).__name__}")
-        if self.fades and self.radius is None:
-            raise SettingsError("`fades` needs the radius at which a splat falls to 0; give radius, such as 8**0.5")
-        if self.radial + self.bucketed + self.evenly_bucketed > 1:
-            raise SettingsError("`radial`, `bucketed` and `evenly_bucketed` are different orders of splats; give only one of them")
-        if self.radius is None and (self.fits_picture or self.max_half_axis < math.inf):
-            raise SettingsError("`max_half_axis` and `fits_picture` need the radius at which a splat ends; give radius, such as 8**0.5")
-
-    @property
-    def culls(self) -> bool:
-        """Whether any splats are culled."""
-        return max(self.min_variance, self.min_contribution, self.least_spread) > 0
-
-    def max_variance(self, width: int, height: int) -> float:
-        """The largest variance (px², after dilation) of a splat in a picture of this size."""
-        longest = min(self.max_half_axis, width, height) if self.fits_picture else self.max_half_axis
-        return math.inf if self.radius is None else (longest / self.radius) ** 2
-
-    def changed(self) -> list[str]:
-        """The names of the settings that differ from the defaults."""
-        if self == USUAL:  # a quick answer, as this is asked for every image
-            return []
-        return [f.name for f in fields(self) if getattr(self, f.name) != getattr(USUAL, f.name)]
-
-    def without_color_rounding(self) -> RenderSettings:
-        """These settings without limits and rounding of colors, for images whose colors are other quantities."""
-        packing = None if self.packing is None else replace(self.packing, color=None, bands=())
-        return replace(self, max_color=None, color_steps=None, packing=packing, picture_step=None)
-
-    def finer(self, n: float) -> RenderSettings:
-        """These settings for an image with n times as many pixels along each axis: areas in px² are scaled by n²."""
-        areas = {name: getattr(self, name) * n**2 for name in ("min_variance", "min_contribution", "least_spread")}
-        return replace(self, **areas, max_half_axis=self.max_half_axis * n) if self.culls or self.max_half_axis < math.inf else self
-
-
-USUAL = RenderSettings()
 
 
 @dataclass(frozen=True)
@@ -245,15 +144,17 @@ def _viewer_effects(settings: RenderSettings) -> list[Effect]:
     size, contribution, spread = settings.min_variance, settings.min_contribution, settings.least_spread
     end = f"a splat {'falls to 0' if settings.fades else 'is cut off'} at {settings.radius or 0:.3g} standard deviations"
     variance = "larger variance along x and y" if settings.boxed else "variance along its longer axis"
+    measure = "sqrt(opacity · det)" if settings.rooted else "opacity · sqrt(det)"
     stretched = f"variances are at least {spread:.3g} px² from their mean; splats whose smaller variance would be 0 are not rendered"
     limited = settings.fits_picture or settings.max_half_axis < math.inf
     limits = [f"{settings.max_half_axis:g} px"] * (settings.max_half_axis < math.inf) + ["the picture's shorter side"] * settings.fits_picture
+    coarse = settings.bucketed or settings.even_buckets is not None
     root, max_color = "a square root and a comparison per splat", settings.max_color
     rounded = settings.packing is not None or settings.color_steps is not None
     parts = [
         ("edge", settings.radius is not None, end, f"a splat ends where its alpha is below {settings.min_alpha:.2g}", "an exponential per splat"),
         ("size cull", size > 0, f"a splat is not rendered if its {variance} is below {size:.3g} px²", "small splats are rendered too", root),
-        ("contribution cull", contribution > 0, f"a splat is not rendered if its opacity · sqrt(det) is below {contribution:.3g} px²",
+        ("contribution cull", contribution > 0, f"a splat is not rendered if its {measure} is below {contribution:.3g} px²",
          "no splat contributes too little", root),
         ("stretching", spread > 0, stretched, "round splats stay round", "two square roots and four divisions per splat"),
         ("size limit", limited, f"a splat's half-axes are at most {' and '.join(limits)}", "splats may be of any size",
@@ -264,7 +165,7 @@ def _viewer_effects(settings: RenderSettings) -> list[Effect]:
          "a comparison per channel and splat"),
         ("order by distance", settings.radial, "splats are sorted by their distance to the eye", "splats are sorted by depth",
          "a square root per splat"),
-        ("coarse order", settings.bucketed or settings.evenly_bucketed, "splats in the same bucket of depth are not sorted", "the order is exact",
+        ("coarse order", coarse, "splats in the same bucket of depth are not sorted", "the order is exact",
          "a sort of all splats"),
         ("rounded picture", settings.picture_step is not None, "8 bits after each splat", "rounded only for display", "another copy of the image"),
         ("packing", rounded, "the viewer keeps rounded splats", "splats are not rounded", "a rounding for each number of a splat"),

@@ -9,8 +9,8 @@ import torch
 
 from mipmap_plugin.backends.inria import NEWER, OLDER
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import MIN_ALPHA, USUAL
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import MIN_ALPHA, USUAL
 from mipmap_plugin.splatting.compositing import SortedSplats, composite, independent
 from mipmap_plugin.splatting.filters import Footprint
 from mipmap_plugin.splatting.harmonics import colors as colors_of

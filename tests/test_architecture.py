@@ -17,6 +17,7 @@ STOREYS = [
     {"errors", "freed_memory", "garbage"},
     {"limits", "pool"},
     {"registry", "config", "torchvision_absent", "torch_modes", "threads", "progress", "screen_filters", "allowed", "plugin_errors"},
+    {"render_settings"},
     {"gaussians", "camera"},
     {"formats"},
     {"effects"},

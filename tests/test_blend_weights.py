@@ -11,8 +11,9 @@ from mipmap_plugin.adaptation.start.blend_weights import _color_gradient, blend_
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import USUAL, Effects, RenderSettings
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.splatting.harmonics import C0
 
 

@@ -20,9 +20,10 @@ from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.cpu import NO_NUMBA, CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.effects import Effects, RenderSettings
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.viewers import BUILT_IN
 
 needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")

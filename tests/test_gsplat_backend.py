@@ -22,8 +22,9 @@ from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.gsplat import NO_GSPLAT, NOT_COMPILED, GsplatBackend, arguments
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.effects import Effects, RenderSettings
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.rotations import unit
 
 gsplat = pytest.importorskip("gsplat", reason="gsplat is in the test extra")

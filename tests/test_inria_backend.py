@@ -19,8 +19,9 @@ from mipmap_plugin.backends.conformance import CASES, check_backend
 from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.inria import NO_PACKAGE, OLDER, PACKAGE, Frame, InriaBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.effects import Effects, RenderSettings
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.render_settings import RenderSettings
 
 USUAL = Needs("cuda", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
 WIDE = camera(50, 40, 30.0, 26.0, cx=21.3, cy=18.9)

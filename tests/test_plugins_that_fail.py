@@ -14,12 +14,12 @@ from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Rendered
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
-from mipmap_plugin.effects import Packing, RenderSettings
 from mipmap_plugin.errors import OutputExists, PluginError, SettingsError
 from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, detect
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.plugin_errors import naming_any
 from mipmap_plugin.recipes import default
+from mipmap_plugin.render_settings import Packing, RenderSettings
 from mipmap_plugin.splatting.viewers import Viewer, single_viewers
 
 

@@ -18,7 +18,7 @@ from mipmap_plugin.backends import choose_backend, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
-from mipmap_plugin.effects import Effects, RenderSettings
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.gaussians import Gaussians
@@ -27,6 +27,7 @@ from mipmap_plugin.models.columns import to_columns
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained, flattened
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.splatting.projection import Projected
 from mipmap_plugin.splatting.rotations import rotations

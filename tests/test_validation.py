@@ -419,3 +419,12 @@ def test_splats_that_are_rounded_once_for_all_views_give_the_same_images(viewer)
     alone = draw.of(splats)
     for camera in base.cameras:
         assert torch.equal(alone(camera), draw(splats, camera))
+
+
+def test_an_order_that_rounding_would_change_is_that_of_the_splats_before():
+    """antimatter15/splat draws the larger of two splats at one depth first; rounded to 8 bits their opacities are the same."""
+    one = tiny.gaussians(1).detach()
+    pair = replace(one.joined(one), opacities=torch.tensor([0.5001, 0.5002]), sh=torch.stack([torch.zeros(4, 3), torch.ones(4, 3)]))
+    base = wrap_model(tiny.model(4), cameras=tiny.cameras(1), backend="cpu")
+    draw = Renderer(base.backend()[0], base.effects(viewer="antimatter15"))
+    assert torch.equal(draw.of(pair)(base.cameras[0]), draw(pair, base.cameras[0]))

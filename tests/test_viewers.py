@@ -16,9 +16,10 @@ from mipmap_plugin.backends.inria import InriaBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.triton import TritonBackend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import USUAL, Effects, RenderSettings, explain
+from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import USUAL, EvenBuckets, RenderSettings
 from mipmap_plugin.splatting.buckets import even_ranks, ranks
 from mipmap_plugin.splatting.packing import packed
 from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer
@@ -79,6 +80,22 @@ def test_webgpu_drops_a_splat_that_contributes_less_than_three(backend):
     assert alpha(backend, "playcanvas-webgpu", splat(0.1, 0.2, least * 0.999)).max() == 0
     assert alpha(backend, "playcanvas-webgpu", splat(0.1, 0.2, least * 1.001)).max() > 0
     assert alpha(backend, "playcanvas", splat(0.1, 0.2, least * 0.999)).max() > 0
+
+
+@BOTH
+def test_viser_drops_a_splat_whose_opacity_times_determinant_is_less_than_a_quarter(backend):
+    # Dilated: 0.5 + 0.3 and 0.1 + 0.3 px², a determinant of 0.32 px⁴
+    least = 0.25 / 0.32
+    assert alpha(backend, "viser", splat(0.5, 0.1, least * 0.999)).max() == 0
+    assert alpha(backend, "viser", splat(0.5, 0.1, least * 1.001)).max() > 0
+    assert alpha(backend, "classic", splat(0.5, 0.1, least * 0.999)).max() > 0
+
+
+@BOTH
+def test_viser_leaves_out_alpha_below_a_hundredth(backend):
+    # Dilated to 4 px²: sqrt(2·4·ln(0.2 / 0.01)) = 4.90 px
+    rendered = alpha(backend, "viser", splat(3.7, 3.7, 0.2))[MIDDLE]
+    assert rendered[MIDDLE + 5] == 0 < rendered[MIDDLE + 4]
 
 
 @BOTH
@@ -365,15 +382,42 @@ def test_buckets_of_babylon_are_even():
     """1025 buckets over 1024 units of depth: one unit each, wherever the camera is. Within one the earlier row is in front."""
     depths = torch.tensor([0.0, 1024.0, 500.9, 500.1, 499.9])
     means = torch.cat([torch.zeros(5, 2), depths[:, None]], 1)
-    places = even_ranks(Gaussians(means, torch.ones(5, 4), torch.ones(5, 3), torch.ones(5), torch.zeros(5, 1, 3)), camera())
-    assert places.tolist() == [0, 4, 2, 3, 1]
+    splats = Gaussians(means, torch.ones(5, 4), torch.ones(5, 3), torch.ones(5), torch.zeros(5, 1, 3))
+    assert even_ranks(splats, camera(), EvenBuckets()).tolist() == [0, 4, 2, 3, 1]
+    assert even_ranks(splats, camera(), EvenBuckets(1024, later_in_front=True)).tolist() == [0, 4, 3, 2, 1]
+    larger = replace(splats, scales=torch.tensor([1.0, 1.0, 1.0, 2.0, 1.0])[:, None].expand(5, 3))
+    assert even_ranks(larger, camera(), EvenBuckets(1024, largest_first=True)).tolist() == [0, 4, 3, 2, 1]
+
+
+def test_buckets_of_three_js_divide_a_sphere_around_all_splats():
+    """Of a middle at a depth of 50 and a radius of 50 + 2 · 5: it ends at 110, and begins before the camera's least depth of 10."""
+    means = torch.zeros(5, 3)
+    means[:, 2] = torch.tensor([0.0, 100.0, 29.9, 20.1, 19.9])
+    splats = Gaussians(means, torch.ones(5, 4), torch.full((5, 3), 5.0), torch.ones(5), torch.zeros(5, 1, 3))
+    places = even_ranks(splats, camera(), EvenBuckets(10, sphere_from=10.0, later_in_front=True))  # buckets of 10 units
+    assert places.tolist() == [1, 4, 3, 2, 0]
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("viewer", "front"), [("three", 1.0), ("gaussian-splats-3d", 1.0), ("viser", 1.0), ("gsplat-js", 0.0), ("antimatter15", 0.0)]
+)
+def test_a_viewer_does_not_sort_within_a_bucket(backend, viewer, front):
+    """Beside a center so far away that two splats share a bucket, either the later row is in front, or the earlier one, whatever their depths."""
+    rows = [splat(40.0, 40.0, 1.0, color, means=(0.0, 0.0, 10.0)) for color in (0.0, 1.0)]
+    nearer = replace(rows[0], means=rows[0].means - torch.tensor([0.0, 0.0, 0.01]))
+    far = splat(1.0, 1.0, means=(0.0, 0.0, 1e4))
+    for parts, expected in (((nearer, rows[1]), 0.0), ((nearer, rows[1], far), front), ((rows[1], nearer, far), 1 - front)):
+        together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(far) if f.name != "covariances"))
+        drawn = backend.render(together, camera(), find_viewer(viewer).effects(Effects(0))).image[MIDDLE, MIDDLE, 0].item()
+        assert drawn == pytest.approx(expected, abs=0.1)
 
 
 @BOTH
 def test_babylon_does_not_sort_within_a_bucket(backend):
     """Beside a center so far away that two splats share a bucket, the first row is in front, though it is behind."""
     rows = (splat(40.0, 40.0, 1.0, 0.0, means=(0.0, 0.0, 10.01)), splat(40.0, 40.0, 1.0, 1.0, means=(0.0, 0.0, 10.0)))
-    far = splat(1.0, 1.0, means=(0.0, 0.0, -1e4))
+    far = splat(1.0, 1.0, means=(0.0, 0.0, 1e4))
     drawn = []
     for parts in (rows, (*rows, far)):
         together = Gaussians(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(far) if f.name != "covariances"))
@@ -389,16 +433,15 @@ def test_babylon_limits_colors_to_those_of_the_frame_buffer(backend):
 
 
 def test_a_viewer_without_a_record_is_refused_with_what_to_take_instead():
-    for name, instead in (("polycam", "take portable"), ("viser", "classic is closest")):
-        with pytest.raises(SettingsError, match=f"^viewer {name}: .*{instead}"):
-            find_viewer(name)
+    with pytest.raises(SettingsError, match=r"^viewer polycam: .*take portable"):
+        find_viewer("polycam")
     assert find_viewer("nerfstudio") is find_viewer("classic")
 
 
 def test_the_order_is_one_or_the_other():
-    for orders in ({"radial", "bucketed"}, {"bucketed", "evenly_bucketed"}):
-        with pytest.raises(SettingsError, match="`radial`, `bucketed` and `evenly_bucketed` are different orders"):
-            RenderSettings(**dict.fromkeys(orders, True))
+    for orders in (dict(radial=True, bucketed=True), dict(bucketed=True, even_buckets=EvenBuckets())):
+        with pytest.raises(SettingsError, match="`radial`, `bucketed` and `even_buckets` are different orders"):
+            RenderSettings(**orders)
 
 
 # Pictures of 8 bits
@@ -510,7 +553,7 @@ def test_effects_of_a_viewer_are_on_and_the_rest_is_off():
     assert active["spark"] == web | {"compensation", "frame", "color limit", "order by distance"}
     assert active["playcanvas"] == web | {"size cull", "color limit", "coarse order"}
     assert active["playcanvas-webgpu"] == active["playcanvas"] - {"coarse order"} | {"contribution cull"}
-    assert active["gaussian-splats-3d"] == web | {"frame", "stretching"}
+    assert active["gaussian-splats-3d"] == web | {"frame", "stretching", "coarse order"}
 
 
 def test_the_usual_viewers_have_the_usual_settings():

@@ -43,10 +43,11 @@ class Renderer:
     def of(self, gaussians: Gaussians) -> Callable[[Camera], Tensor]:
         """What renders these splats alone, several times: a viewer's rounding of them takes longer than an image, and most is the same for all.
 
-        Buckets of depth are those of the splats before they are rounded, so that these are not rounded once for all.
+        Splats are sorted by what they are before they are rounded, so that they are not rounded once for all if their order depends on it.
         """
         settings = self.effects.settings
-        if settings.packing is None or settings.bucketed or settings.evenly_bucketed:
+        even = settings.even_buckets
+        if settings.packing is None or settings.bucketed or (even is not None and (even.largest_first or even.sphere_from is not None)):
             return partial(self, gaussians)
         once, rest = in_two_steps(settings.packing)
         rounded = packed(gaussians, NO_CAMERA, once)

@@ -14,13 +14,13 @@ from torch import Tensor
 from mipmap_plugin.adaptation.spreading import places, spread
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import MIN_ALPHA
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
+from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, jittered, orbit
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import INTEGRATED, USUAL, Effect, Effects, RenderSettings
+from mipmap_plugin.effects import INTEGRATED, Effect, Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import USUAL, RenderSettings
 
 # Render settings other than the default that a backend may support: field of RenderSettings -> its name in messages.
 SETTINGS = {
@@ -25,10 +26,11 @@ SETTINGS = {
     "color_steps": "rounded colors",
     "radial": "sorting by distance",
     "bucketed": "sorting by buckets of depth",
-    "evenly_bucketed": "sorting by even buckets of depth",
+    "even_buckets": "sorting by even buckets of depth",
     "min_variance": "culling by size",
     "boxed": "culling by size along x and y",
     "min_contribution": "culling by contribution",
+    "rooted": "culling by the root of opacity · det",
     "least_spread": "stretching of round splats",
     "max_half_axis": "a largest splat",
     "fits_picture": "splats no larger than the image",
@@ -41,7 +43,7 @@ SETTINGS = {
 # Those that screen filters that integrate support; the others depend on a splat's weight at a point.
 WITH_INTEGRALS = frozenset({
     *("min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps"),
-    *("radial", "bucketed", "evenly_bucketed", "frozen_beyond", "frame", "packing"),
+    *("radial", "bucketed", "even_buckets", "frozen_beyond", "frame", "packing"),
 })
 
 # Incremented when `Backend.render` or the records below change in a way that breaks existing backends.

@@ -13,9 +13,10 @@ from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import INTEGRATED, Effects, RenderSettings
+from mipmap_plugin.effects import INTEGRATED, Effects
 from mipmap_plugin.errors import BackendUnavailable, install
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting.buckets import ranks_for
 from mipmap_plugin.splatting.packing import packed
 
@@ -42,7 +43,7 @@ class CpuBackend:
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""
         missing = [] if importlib.util.find_spec("numba") else [NO_NUMBA]
-        supported = {"max_color", "color_steps", "radial", "bucketed", "evenly_bucketed", "frozen_beyond", "packing"}
+        supported = {"max_color", "color_steps", "radial", "bucketed", "even_buckets", "frozen_beyond", "packing"}
         changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - supported
         unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
         return missing + self.capabilities.lacking(needs) + unsupported

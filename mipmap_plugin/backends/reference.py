@@ -9,8 +9,9 @@ from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import SURFEL, Effects, RenderSettings
+from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting import buckets
 from mipmap_plugin.splatting.compositing import SortedSplats, composite, independent
 from mipmap_plugin.splatting.filters import SCREEN_FILTERS, Footprint, footprint

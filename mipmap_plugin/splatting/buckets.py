@@ -1,7 +1,8 @@
-"""The approximate depth order of PlayCanvas on WebGL and of Babylon.js: a counting sort of splats into buckets of depth.
+"""The approximate depth order of most viewers in a browser: a counting sort of splats into buckets of depth.
 
-Sources: playcanvas 2.23.3, gsplat-unified-sort-worker and gsplat-sort-bin-weights; @babylonjs/core 9.35.0, gaussianSplattingSortWorker.
-Splats of one bucket keep the order of the rows in memory, which in PlayCanvas is Morton order.
+Sources: playcanvas 2.23.3, gsplat-unified-sort-worker and gsplat-sort-bin-weights; @babylonjs/core 9.35.0, gaussianSplattingSortWorker;
+three 0.187.0, GaussianSplat and CountingSort; antimatter15/splat ba182b5, runSort, of which those of gsplat.js, GaussianSplats3D, viser and
+aframe-gaussian-splatting are versions. Splats of one bucket keep the order of the rows in memory, which in PlayCanvas is Morton order.
 """
 
 from __future__ import annotations
@@ -14,11 +15,15 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import RenderSettings
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import EvenBuckets, RenderSettings
+from mipmap_plugin.splatting.rotations import rotations
 
 # The depth range of a box around all splats, BOX standard deviations beyond their centers, is cut into BINS bins of equal length.
 BOX, BINS = 2, 32
+
+# Standard deviations along x, y or z, whichever are most, by which three.js's sphere around all splats lies beyond their centers.
+SPHERE = 2
 
 # (distance to the camera's bin in bins, weight): a bin has buckets in proportion to the weight of the first entry whose distance covers it.
 WEIGHTS = ((0, 40), (2, 20), (5, 8), (10, 3), (BINS, 1))
@@ -48,28 +53,47 @@ def ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
     first, count_of = means.new_tensor(scale.firsts), means.new_tensor([*scale.counts, 0])
     whole = bins.long().clamp(0, BINS)
     buckets = (first[whole] + count_of[whole] * (bins - whole)).long()
-    order = ((buckets.max() - buckets) << 3 * MORTON_BITS | _morton(means)).argsort(stable=True)
-    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device)).int()
+    return _ranks_of((buckets.max() - buckets) << 3 * MORTON_BITS | _morton(means)).int()
 
 
 @torch.no_grad()
-def even_ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """As `ranks`, by buckets that divide the depths from the nearest center to the farthest evenly. Within a bucket the earlier row is in front."""
+def even_ranks(gaussians: Gaussians, camera: Camera, even: EvenBuckets) -> Tensor:
+    """As `ranks`, by buckets that divide a range of depths evenly."""
     means = gaussians.means.double().nan_to_num(0.0, 0.0, 0.0)
     if not len(means):
         return torch.zeros(0, dtype=torch.int32, device=means.device)
     depths = ((means - camera.center.to(means)) * camera.viewmat[2, :3].to(means)).sum(1)
-    farthest = depths.max()
-    extent = (farthest - depths.min()).clamp_min(torch.finfo(means.dtype).tiny)
-    order = (-((farthest - depths) * 2 ** bucket_bits(len(means)) / extent).long()).argsort(stable=True)
-    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device)).int()
+    nearest, farthest = depths.aminmax() if even.sphere_from is None else _sphere(gaussians, camera, even.sphere_from)
+    steps = 2 ** bucket_bits(len(means)) if even.steps is None else even.steps
+    extent = (farthest - nearest).clamp_min(torch.finfo(means.dtype).tiny)
+    buckets = ((depths - nearest) * steps / extent).clamp(0, steps).long()
+    rows = torch.arange(len(buckets), device=buckets.device)
+    places = _ranks_of(-gaussians.scales.double().prod(1) * gaussians.opacities.double()) if even.largest_first else rows
+    return _ranks_of(buckets * len(rows) + (-places if even.later_in_front else places)).int()
+
+
+def _ranks_of(keys: Tensor) -> Tensor:
+    """The place of each key in ascending order, [N]; of equal keys the earlier comes first."""
+    order = keys.argsort(stable=True)
+    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+
+
+def _sphere(gaussians: Gaussians, camera: Camera, least: float) -> tuple[Tensor, Tensor]:
+    """Depths of the nearest and the farthest point of three.js's sphere around all splats, the nearest at least `least`."""
+    means, quats, scales = (part.nan_to_num(0.0, 0.0, 0.0) for part in (gaussians.means.double(), gaussians.quats, gaussians.scales))
+    variances = (rotations(quats).square() @ scales.square()[:, :, None])[:, :, 0]  # along x, y and z
+    reach = SPHERE * variances.amax(1, keepdim=True).sqrt().double()
+    middle = ((means - reach).amin(0) + (means + reach).amax(0)) / 2
+    radius = ((means - middle).norm(dim=1, keepdim=True) + reach).max()
+    depth = (middle - camera.center.to(means)) @ camera.viewmat[2, :3].to(means)
+    return (depth - radius).clamp_min(least), depth + radius
 
 
 def ranks_for(settings: RenderSettings, gaussians: Gaussians, camera: Camera) -> Tensor | None:
     """The ranks by the buckets of these settings; None if splats are sorted exactly."""
     if settings.bucketed:
         return ranks(gaussians, camera)
-    return even_ranks(gaussians, camera) if settings.evenly_bucketed else None
+    return even_ranks(gaussians, camera, settings.even_buckets) if settings.even_buckets else None
 
 
 def bucket_bits(count: int) -> int:

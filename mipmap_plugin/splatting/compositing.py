@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import MAX_ALPHA, RenderSettings
+from mipmap_plugin.render_settings import MAX_ALPHA, RenderSettings
 
 # (splat, pixel) pairs composited at once. About ten float32 tensors of this size are alive together: 0.3 GiB.
 BATCH_PAIRS = 1 << 23

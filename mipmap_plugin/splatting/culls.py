@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mipmap_plugin.effects import RenderSettings
+from mipmap_plugin.render_settings import RenderSettings
 
 STEEPNESS = 4.0
 
@@ -28,7 +28,9 @@ def gate(shape: tuple[Tensor, Tensor, Tensor, Tensor], opacities: Tensor, settin
         larger = torch.maximum(xx, yy) if settings.boxed else (xx + yy) / 2 + spread(shape)
         ratios.append(larger / settings.min_variance)
     if settings.min_contribution:
-        ratios.append(opacities * det.sqrt() / settings.min_contribution)
+        # `where` before the root: the root's gradient at 0 is infinite.
+        weights = torch.where(opacities > 0, opacities, 1.0).sqrt() * (opacities > 0) if settings.rooted else opacities
+        ratios.append(weights * det.sqrt() / settings.min_contribution)
     if settings.least_spread:
         ratios.append((xx + yy) / 2 / settings.least_spread)
     least = torch.stack(ratios).amin(0)

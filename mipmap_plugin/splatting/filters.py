@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mipmap_plugin.effects import USUAL, RenderSettings
+from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.screen_filters import SCREEN_FILTERS as RECORDS
 from mipmap_plugin.screen_filters import USUAL_EPS2D as USUAL_EPS2D
 from mipmap_plugin.splatting import culls

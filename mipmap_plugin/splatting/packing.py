@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Packing
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import Packing
 from mipmap_plugin.splatting.harmonics import C0
 
 # Sine of half the angle below which a rotation's axis is undefined.

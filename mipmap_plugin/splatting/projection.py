@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import FRUSTUM_MARGIN
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import FRUSTUM_MARGIN
 from mipmap_plugin.splatting.rotations import rotations
 
 

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mipmap_plugin.allowed import OF_VIEWER, check
-from mipmap_plugin.effects import DILATION, FRUSTUM_MARGIN, NEAR_PLANE, USUAL, Effects, Packing, RenderSettings
+from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effects
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.registry import Registry
+from mipmap_plugin.render_settings import FRUSTUM_MARGIN, USUAL, EvenBuckets, Packing, RenderSettings
 from mipmap_plugin.screen_filters import SCREEN_FILTERS
 
 
@@ -95,6 +96,9 @@ INRIA_UNLIKE = "INRIA ends a splat at three standard deviations, rounded up to t
 # RGBA of 8 bits, colors of SH degree 0 within 0..1.
 EIGHT_BITS = Packing(color=1 / 255)
 
+# antimatter15's sort, in 16 bits. Of two splats in a bucket the first is drawn first: it is in front if splats are drawn front to back.
+FRONT_FIRST, BACK_FIRST = EvenBuckets(2**16 - 1), EvenBuckets(2**16 - 1, later_in_front=True)
+
 FRONT_TO_BACK = "covariances are stored in float16, quaternions in 8 bits, and the picture is rounded from the front to the back"
 
 BUILT_IN = (
@@ -133,27 +137,49 @@ BUILT_IN = (
     Viewer(
         "gaussian-splats-3d", "GaussianSplats3D", "@mkkellogg/gaussian-splats-3d 0.4.7, SplatMaterial3D",
         "classic", DILATION,
-        replace(WEBGL, frame=1.2, max_half_axis=1024.0, least_spread=0.1**0.5, packing=replace(EIGHT_BITS, downwards=True)), sh_degree=0,
+        replace(
+            WEBGL, frame=1.2, max_half_axis=1024.0, least_spread=0.1**0.5, packing=replace(EIGHT_BITS, downwards=True), even_buckets=BACK_FIRST,
+        ),
+        sh_degree=0,
         unlike="SH degree 0 is its default; it can draw up to degree 2",
     ),
     Viewer(
         "antimatter15", "antimatter15/splat", "antimatter15/splat ba182b5, main.js", "classic", 0.0,
-        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS), sh_degree=0, unlike=FRONT_TO_BACK,
+        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS, even_buckets=replace(FRONT_FIRST, largest_first=True)),
+        sh_degree=0, unlike=FRONT_TO_BACK,
     ),
     Viewer(
         "gsplat-js", "gsplat.js", "gsplat 1.2.9, RenderProgram, PLYLoader, sort.cpp", "classic", DILATION / 4,
-        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS), sh_degree=0, unlike=FRONT_TO_BACK,
+        replace(WEBGL, frame=1.2, max_half_axis=1024.0, packing=EIGHT_BITS, even_buckets=FRONT_FIRST), sh_degree=0, unlike=FRONT_TO_BACK,
     ),
     Viewer(
         "three", "three.js, GaussianSplat", "three 0.187.0, examples/jsm/objects/GaussianSplat", "mip", DILATION,
-        replace(WEBGL, radius=2.0, frame=1.4, max_half_axis=2048.0, max_color=1.0, packing=Packing(color=1 / 255, bands=(1 / 128,) * 3)),
-        unlike="splats in the same of 4096 buckets of depth are not sorted; colors are the file's if the renderer's outputColorSpace is linear",
+        replace(
+            WEBGL, radius=2.0, frame=1.4, max_half_axis=2048.0, max_color=1.0, packing=Packing(color=1 / 255, bands=(1 / 128,) * 3),
+            even_buckets=EvenBuckets(4095, sphere_from=0.1, later_in_front=True),
+        ),
+        unlike="buckets of depth are those of a camera whose near plane is at 0.1, three.js's default; colors are the file's if the renderer's "
+        "outputColorSpace is linear",
     ),
     Viewer(
         "aframe", "aframe-gaussian-splatting, and drei's Splat", "aframe-gaussian-splatting b50238f, index.js; drei 0d9864e, Splat.tsx", "classic",
         DILATION,
-        replace(WEBGL, frame=1.2, max_half_axis=2048.0, packing=EIGHT_BITS), sh_degree=0,
-        unlike="covariances are stored in 16 bits, quaternions in 8; drei rounds colors to 8 bits of linear light; not compared with their images",
+        replace(WEBGL, frame=1.2, max_half_axis=2048.0, packing=EIGHT_BITS, even_buckets=replace(BACK_FIRST, largest_first=True)),
+        sh_degree=0,
+        unlike="covariances are stored in 16 bits, quaternions in 8; splats whose opacity times longest axis is below 1e-4 of their depth "
+        "are left out, which hardly shows; the package on npm, 0.0.19, leaves out those up to ten times as large; drei rounds colors to 8 bits of "
+        "linear light",
+    ),
+    Viewer(
+        # A splat's opacity · det is at least 1/4 px⁴, whose root is 1/2 px².
+        "viser", "viser", "viser 1.1.1, client/src/Splatting, GaussianSplatsHelpers and sorter.cpp", "classic", DILATION,
+        replace(
+            WEBGL, min_alpha=0.01, frame=1.1, max_half_axis=2048.0, min_contribution=0.5, rooted=True, even_buckets=BACK_FIRST,
+            packing=replace(EIGHT_BITS, downwards=True),
+        ),
+        sh_degree=0,
+        unlike="covariances are stored in float16, in world units: of widths below 2e-4 nothing is left; pixels are square, and colors those that "
+        "its caller gives it, taken here as those of SH degree 0",
     ),
     Viewer(
         "cesium", "Cesium", "@cesium/engine 26.3.0, PrimitiveGaussianSplat shaders; cesium-wasm-utils, wasm-splats", "classic", DILATION / 16,
@@ -163,15 +189,15 @@ BUILT_IN = (
     Viewer(
         # Colors are limited by the frame buffer, which they reach before they are multiplied by alpha.
         "babylon", "Babylon.js", "@babylonjs/core 9.35.0, gaussianSplatting shaders, GaussianSplattingMaterial", "classic", DILATION / 4,
-        replace(WEBGL, evenly_bucketed=True, frame=1.2, max_half_axis=1024.0, max_color=1.0, packing=EIGHT_BITS),
+        replace(WEBGL, even_buckets=EvenBuckets(), frame=1.2, max_half_axis=1024.0, max_color=1.0, packing=EIGHT_BITS),
         unlike="covariances are stored in float16, quaternions and SH coefficients in 8 bits; an SPZ file that says it was trained with "
         "antialiasing is drawn with compensation",
     ),
     Viewer(
         "unity", "UnityGaussianSplatting (aras-p)", "UnityGaussianSplatting 1.1.1 (2c6fed3), RenderGaussianSplats, GaussianSplatting.hlsl",
         "classic", DILATION, replace(WEBGL, min_alpha=1 / 255, frozen_beyond=FRUSTUM_MARGIN, picture_step=None),
-        unlike="a splat ends at a square instead of an ellipse, and assets are packed at the quality chosen on import; "
-        "not compared with its images",
+        unlike="a splat ends at a square instead of an ellipse, assets are packed at the quality chosen on import, and the background shines "
+        "through in linear light; not compared with its images",
     ),
     Viewer(
         "brush", "Brush", "brush 8b7f5c6c, brush-render, for a file without SplatRenderMode mip", "classic", DILATION,
@@ -191,10 +217,7 @@ ALIASES = {
 
 # What is asked for, but has no record: why, and what to take instead.
 SECRET = "its source is not public, so that how it draws is not known; take portable, which suits many viewers"
-NO_RECORD = {
-    **dict.fromkeys(("luma", "polycam", "postshot", "scaniverse"), SECRET),
-    "viser": "it leaves out splats whose opacity · det is below 0.25 px⁴, which is not drawn here; classic is closest",
-}
+NO_RECORD = dict.fromkeys(("luma", "polycam", "postshot", "scaniverse"), SECRET)
 
 VIEWERS = Registry("mipmap_plugin.viewers", {})
 

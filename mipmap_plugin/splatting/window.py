@@ -22,7 +22,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from mipmap_plugin.effects import MAX_ALPHA
+from mipmap_plugin.render_settings import MAX_ALPHA
 from mipmap_plugin.splatting.pixel_integral import PixelIntegral
 
 # px²: the least variance of a window along x or y.

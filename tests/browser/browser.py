@@ -113,13 +113,18 @@ class Browser:
         _told(viewer, shown, "([url, component]) => viewer.open(url, component)", [f"{url}/lod-meta.json", component])
         return Page(viewer, shown)
 
+    def visit(self, url: str) -> Any:
+        """A new page at an address of this machine."""
+        page = self._chromium.new_page(viewport={"width": 1000, "height": 1000}, device_scale_factor=1)
+        page.set_default_timeout(PATIENCE)
+        page.goto(url)
+        return page
+
     def _started(self, page: str, settings: dict[str, Any]) -> Any:
         """The page of a viewer with these settings, started once: compiling its shaders costs more than a view."""
         key = page + json.dumps(settings, sort_keys=True)
         if key not in self._pages:
-            self._pages[key] = shown = self._chromium.new_page(viewport={"width": 1000, "height": 1000}, device_scale_factor=1)
-            shown.set_default_timeout(PATIENCE)
-            shown.goto(f"http://localhost:{self._server.server_port}/pages/index.html")
+            self._pages[key] = shown = self.visit(f"http://localhost:{self._server.server_port}/pages/index.html")
             start = f"async settings => {{ window.viewer = await (await import('/pages/{page}.js')).start(settings) }}"
             _told(page, shown, start, settings)
         return self._pages[key]

@@ -15,13 +15,14 @@ from tiny import with_bands
 
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation.report import Report
-from mipmap_plugin.effects import MODEL_EFFECTS, Effect, Effects, Packing, RenderSettings, explain
+from mipmap_plugin.effects import MODEL_EFFECTS, Effect, Effects, explain
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.mip import MipModel, load_mip
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.render_settings import EvenBuckets, Packing, RenderSettings
 from mipmap_plugin.wrap import wrap_model
 
 
@@ -76,6 +77,9 @@ def test_everything_on():
     effects = explain(requested, splats_with_covariances, of_model, recipe("paper", 4), 4)
     assert [effect.name for effect in effects if not effect.on] == ["coarse order"]  # there is another already
     assert states(Effects(settings=RenderSettings(bucketed=True)), splats)["coarse order"][0]
+    assert states(Effects(settings=RenderSettings(even_buckets=EvenBuckets())), splats)["coarse order"][0]
+    rooted = states(Effects(settings=RenderSettings(min_contribution=0.5, rooted=True)), splats)["contribution cull"]
+    assert rooted == (True, "a splat is not rendered if its sqrt(opacity · det) is below 0.5 px²")
     reasons = {effect.name: effect.reason for effect in effects}
     assert [reasons[name] for name in ("supersampling", "covariances")] == ["16 samples per pixel", "the model provides them"]
     assert reasons["upsampler"] == "bicubic enlarges the base's image to the truth"

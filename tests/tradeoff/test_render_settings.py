@@ -9,8 +9,9 @@ import torch
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.reference import ReferenceBackend
-from mipmap_plugin.effects import Effects, RenderSettings
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import RenderSettings
 
 BACKEND = ReferenceBackend()
 

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, USUAL, Effects, RenderSettings
+from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import USUAL, EvenBuckets, RenderSettings
 from mipmap_plugin.splatting.filters import USUAL_EPS2D
 from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.splatting.viewers import BUILT_IN, Viewer
@@ -242,7 +243,6 @@ BAD = (math.nan, math.inf)
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 FILTERS = tuple(USUAL_EPS2D)
 
-# Viewers with render settings of their own.
 WITH_SETTINGS = tuple(viewer for viewer in BUILT_IN if viewer.settings != USUAL)
 RULES = {
     "radius": RenderSettings(radius=2.0),
@@ -284,7 +284,7 @@ CASES: dict[str, Builder] = {
     },
     "rule-rounded-picture": in_a_rounded_picture,
     "rule-buckets": partial(in_buckets, RenderSettings(bucketed=True), -5.0),
-    "rule-even-buckets": partial(in_buckets, RenderSettings(evenly_bucketed=True), -1e3),
+    "rule-even-buckets": partial(in_buckets, RenderSettings(even_buckets=EvenBuckets()), -1e3),
     **{f"rule-{name}": partial(ruled, rule) for name, rule in RULES.items()},
     "nan-in-covariances": partial(with_covariances, "classic", broken=True),
     **{

@@ -8,7 +8,7 @@ import math
 from mipmap_plugin.backends.cpu_kernels import inner, kernel, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import get, put
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, both, ceil, floor, lowest_bit, maximum, minimum, narrow, select, sqrt, wide
-from mipmap_plugin.effects import MIN_ALPHA
+from mipmap_plugin.render_settings import MIN_ALPHA
 
 # px. Tiles are wide so that splats touch few of them; what lies outside an ellipse costs little, since a splat visits only the patches of
 # 4 x 4 px that it touches (`planes`). There are 64 of those, the bits of an integer. A tile's state fits a first-level cache.

@@ -25,7 +25,7 @@ from mipmap_plugin.backends.cpu_kernels.planes import (
 )
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
-from mipmap_plugin.effects import MIN_ALPHA
+from mipmap_plugin.render_settings import MIN_ALPHA
 
 
 @inner

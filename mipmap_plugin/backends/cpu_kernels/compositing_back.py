@@ -24,7 +24,7 @@ from mipmap_plugin.backends.cpu_kernels.planes import (
     unblend,
 )
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
-from mipmap_plugin.effects import MIN_ALPHA
+from mipmap_plugin.render_settings import MIN_ALPHA
 
 
 @kernel

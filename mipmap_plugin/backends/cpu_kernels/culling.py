@@ -32,7 +32,7 @@ def ratios(view, shape, opacity):
     if view.min_variance > 0:
         size = (maximum(xx, yy) if view.boxed else mean + spread) / view.min_variance
     if view.min_contribution > 0:
-        contribution = opacity * sqrt(det) / view.min_contribution
+        contribution = (sqrt(opacity) if view.rooted else opacity) * sqrt(det) / view.min_contribution
     if view.least_spread > 0:
         elongation = mean / view.least_spread
     return size, contribution, elongation, spread
@@ -67,7 +67,8 @@ def grad_gate(view, shape, opacity, d_gate):
         d_per_spread = select(spread > 0, d_longer / select(spread > 0, spread, 1.0), 0.0)
         d_half = d_per_spread * 0.5 * (xx - yy)
         d_xx, d_yy, d_xy = d_xx + 0.5 * (d_longer + d_half), d_yy + 0.5 * (d_longer - d_half), d_per_spread * xy
-    d_opacity = select(opacity > 0, d_contribution / select(opacity > 0, opacity, 1.0), 0.0)
+    power = 0.5 if view.rooted else 1.0
+    d_opacity = select(opacity > 0, d_contribution * power / select(opacity > 0, opacity, 1.0), 0.0)
     return (d_xx, d_xy, d_yy, 0.5 * d_contribution / det), d_opacity
 
 

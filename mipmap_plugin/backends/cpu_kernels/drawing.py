@@ -195,6 +195,7 @@ def _view_of(camera: Camera, effects: Effects, sh_degree: int, gradients: bool) 
         min_variance=float(settings.min_variance),
         boxed=settings.boxed,
         min_contribution=float(settings.min_contribution),
+        rooted=settings.rooted,
         least_spread=float(settings.least_spread),
         max_variance=settings.max_variance(camera.width, camera.height),
         lists_culled=gradients,

@@ -12,7 +12,7 @@ from mipmap_plugin.backends.cpu_kernels import inner, layout
 from mipmap_plugin.backends.cpu_kernels.blocks import put
 from mipmap_plugin.backends.cpu_kernels.lanes import fma, maximum, minimum, narrow, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.powers import exp2, log2, tanh
-from mipmap_plugin.effects import MIN_ALPHA
+from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.splatting.pixel_integral import BOUND, CUBIC, LINEAR, MAX_POWER, ROUND
 
 LOG2E = 1 / math.log(2)

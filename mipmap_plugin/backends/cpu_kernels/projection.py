@@ -18,7 +18,7 @@ from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, st
 from mipmap_plugin.backends.cpu_kernels.powers import log2
 from mipmap_plugin.backends.cpu_kernels.records import OVER_PIXEL
 from mipmap_plugin.backends.cpu_kernels.tuples import apply, dot, minus, plus, times
-from mipmap_plugin.effects import MIN_ALPHA
+from mipmap_plugin.render_settings import MIN_ALPHA
 
 # -q/2 = -HALF_LOG2E · q in powers of two.
 HALF_LOG2E = 0.5 / math.log(2)

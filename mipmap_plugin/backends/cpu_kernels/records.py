@@ -54,6 +54,7 @@ class View(NamedTuple):
     min_variance: float  # px²
     boxed: bool
     min_contribution: float  # px²
+    rooted: bool
     least_spread: float  # px²
     max_variance: float  # px²; infinite: no limit
     lists_culled: bool  # whether the lists of tiles contain culled splats, for their gradient

@@ -17,8 +17,9 @@ from mipmap_plugin.backends.cpu_kernels.powers import exp2
 from mipmap_plugin.backends.cpu_kernels.records import Limits, SplatArrays
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import MIN_ALPHA, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.pool import empty
+from mipmap_plugin.render_settings import MIN_ALPHA
 
 
 def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None) -> np.ndarray:

@@ -19,7 +19,7 @@ from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, scr
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
 from mipmap_plugin.backends.cpu_kernels.planes import PATCHES, PLANE, STATE_SIZE, STOPS, TRANSMITTANCE, blend, distances, unblend
 from mipmap_plugin.backends.cpu_kernels.sorting import sort
-from mipmap_plugin.effects import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from mipmap_plugin.render_settings import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
 
 USUAL_LIMITS = (MAX_ALPHA, MIN_TRANSMITTANCE, 0.0)
 

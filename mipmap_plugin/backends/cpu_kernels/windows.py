@@ -8,7 +8,7 @@ import math
 from mipmap_plugin.backends.cpu_kernels import inner, layout
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, bits, fma, maximum, minimum, select, sqrt
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
-from mipmap_plugin.effects import MAX_ALPHA
+from mipmap_plugin.render_settings import MAX_ALPHA
 from mipmap_plugin.splatting.window import FARTHEST, LEAST_VARIANCE, POINTS, WEIGHTS, WIDE
 
 HALF_LOG2E = 0.5 / math.log(2)

@@ -10,7 +10,8 @@ import triton.language as tl
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import FRUSTUM_MARGIN, Effects
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.render_settings import FRUSTUM_MARGIN
 from mipmap_plugin.splatting import filters
 
 # Indices into the array. It begins with the rotation, row by row, at 0.

@@ -11,7 +11,6 @@ export async function start(settings) {
   renderer.setPixelRatio(1)
   const scene = new Scene()
   const camera = new PerspectiveCamera()
-  camera.near = 0.01
   let splats = null
 
   return {

@@ -1,0 +1,128 @@
+"""How splats are rasterized, as data: what is left out, in which order the rest is drawn, and what is rounded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+from mipmap_plugin.allowed import OF_PACKING, OF_SETTINGS, check
+from mipmap_plugin.errors import SettingsError
+
+# Thresholds of every 3DGS rasterizer (diff-gaussian-rasterization, forward.cu).
+MIN_ALPHA = 1 / 255  # below one 8-bit step a splat cannot change a displayed pixel
+MIN_TRANSMITTANCE = 1e-4  # a pixel with less is finished
+
+# The largest alpha in every 3DGS rasterizer (diff-gaussian-rasterization, forward.cu): it keeps 1 - alpha away from 0, where the gradient of
+# everything behind the splat vanishes.
+MAX_ALPHA = 0.99
+
+# The fraction of the half field of view by which a center may lie outside the image before the Jacobian is frozen there; farther out,
+# the affine approximation would make splats far too large (diff-gaussian-rasterization, forward.cu; gsplat, Utils.cuh).
+FRUSTUM_MARGIN = 0.3
+
+TILE = 16  # px
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Quantization of splats in a viewer's memory: values are rounded to the nearest multiple of a step. None: not rounded."""
+
+    opacity: tuple[float, ...] = (1 / 255,)  # steps of successive roundings
+    color: float | None = None  # step of the color of SH degree 0, which is clamped to 0..1
+    downwards: bool = False  # opacities and colors are rounded down
+    bands: tuple[float, ...] = ()  # steps of the coefficients of SH degree 1, 2, ..., clamped to -1..1
+    log_scales: tuple[float, float, float] | None = None  # minimum, maximum and step of the natural logarithms
+    quats: Literal["octahedral", "stereographic"] | None = None  # `splatting.packing`
+    half_means: bool = False  # float16, in the world and again relative to the eye
+
+    def __post_init__(self) -> None:
+        check("packing", self, OF_PACKING, optional=frozenset({"color", "log_scales", "quats"}))
+
+
+@dataclass(frozen=True)
+class EvenBuckets:
+    """An order of splats by buckets of depth that are all equally long (`splatting.buckets`).
+
+    Attributes:
+        steps: Buckets from the nearest center to the farthest, less one; None: a number that grows with that of the splats.
+        sphere_from: World units; the buckets divide a sphere around all splats instead, from this depth on.
+        later_in_front: Whether of two splats in a bucket the later row is in front.
+        largest_first: Rows are first sorted by volume times opacity, the largest first.
+    """
+
+    steps: int | None = None
+    sphere_from: float | None = None
+    later_in_front: bool = False
+    largest_first: bool = False
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How splats are rasterized, and which are left out. `tile` affects only the time. Viewers' own settings are in `splatting.viewers`.
+
+    A splat that is culled (by `min_variance`, `min_contribution` or `least_spread`) is not rendered, but has a gradient (`splatting.culls`).
+    """
+
+    min_alpha: float = MIN_ALPHA  # a splat of lower alpha is skipped in a pixel
+    min_transmittance: float = MIN_TRANSMITTANCE  # a pixel ends before the splat that would leave less
+    radius: float | None = None  # standard deviations at which a splat ends; None: where its alpha falls below `min_alpha`
+    tile: int = TILE  # px: pixels that share a list of splats
+    max_alpha: float = MAX_ALPHA  # alpha of a splat in a pixel is clamped to this
+    fades: bool = False  # a splat falls to 0 at `radius`: its weight w becomes (w - w_end) / (1 - w_end), where w_end is the weight at `radius`
+    max_color: float | None = None  # limit of a splat's color, in each channel
+    color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are rounded to multiples of these
+    radial: bool = False  # splats are sorted by their distance to the eye instead of by depth
+    bucketed: bool = False  # splats are sorted by PlayCanvas's buckets of depth (`splatting.buckets`),
+    even_buckets: EvenBuckets | None = None  # or by buckets that are all of one length
+    min_variance: float = 0.0  # px², after dilation: splats whose variance along their longer axis is less are culled,
+    boxed: bool = False  # or, if this is set, whose larger variance along x and y is less; `max_half_axis` then limits those too
+    min_contribution: float = 0.0  # px², after dilation: splats whose opacity · sqrt(det) is less are culled,
+    rooted: bool = False  # or, if this is set, whose sqrt(opacity · det) is less
+    least_spread: float = 0.0  # px², after dilation: minimum distance of variances from their mean; splats whose smaller one becomes 0 are culled
+    max_half_axis: float = math.inf  # px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat is shrunk
+    fits_picture: bool = False  # half-axes are also limited to the picture's shorter side
+    packing: Packing | None = None  # quantization of splats in memory
+    frozen_beyond: float = FRUSTUM_MARGIN  # where the Jacobian is frozen; infinity: nowhere
+    frame: float = math.inf  # in halves of the picture from its middle: splats whose center lies farther out along x or y are not rendered
+    picture_step: float | None = None  # the picture is rounded to multiples after each splat, back to front; the gradient ignores the rounding
+
+    def __post_init__(self) -> None:
+        check("render settings", self, OF_SETTINGS, optional=frozenset({"radius", "max_color", "color_steps", "picture_step"}))
+        if not isinstance(self.packing, Packing | None):
+            raise SettingsError(f"render settings: packing must be a Packing, or None, got {type(self.packing).__name__}")
+        if self.fades and self.radius is None:
+            raise SettingsError("`fades` needs the radius at which a splat falls to 0; give radius, such as 8**0.5")
+        if self.radial + self.bucketed + (self.even_buckets is not None) > 1:
+            raise SettingsError("`radial`, `bucketed` and `even_buckets` are different orders of splats; give only one of them")
+        if self.radius is None and (self.fits_picture or self.max_half_axis < math.inf):
+            raise SettingsError("`max_half_axis` and `fits_picture` need the radius at which a splat ends; give radius, such as 8**0.5")
+
+    @property
+    def culls(self) -> bool:
+        """Whether any splats are culled."""
+        return max(self.min_variance, self.min_contribution, self.least_spread) > 0
+
+    def max_variance(self, width: int, height: int) -> float:
+        """The largest variance (px², after dilation) of a splat in a picture of this size."""
+        longest = min(self.max_half_axis, width, height) if self.fits_picture else self.max_half_axis
+        return math.inf if self.radius is None else (longest / self.radius) ** 2
+
+    def changed(self) -> list[str]:
+        """The names of the settings that differ from the defaults."""
+        if self == USUAL:  # a quick answer, as this is asked for every image
+            return []
+        return [f.name for f in fields(self) if getattr(self, f.name) != getattr(USUAL, f.name)]
+
+    def without_color_rounding(self) -> RenderSettings:
+        """These settings without limits and rounding of colors, for images whose colors are other quantities."""
+        packing = None if self.packing is None else replace(self.packing, color=None, bands=())
+        return replace(self, max_color=None, color_steps=None, packing=packing, picture_step=None)
+
+    def finer(self, n: float) -> RenderSettings:
+        """These settings for an image with n times as many pixels along each axis: areas in px² are scaled by n²."""
+        areas = {name: getattr(self, name) * n**2 for name in ("min_variance", "min_contribution", "least_spread")}
+        return replace(self, **areas, max_half_axis=self.max_half_axis * n) if self.culls or self.max_half_axis < math.inf else self
+
+
+USUAL = RenderSettings()
