@@ -53,7 +53,7 @@ def ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
     first, count_of = means.new_tensor(scale.firsts), means.new_tensor([*scale.counts, 0])
     whole = bins.long().clamp(0, BINS)
     buckets = (first[whole] + count_of[whole] * (bins - whole)).long()
-    return _ranks_of((buckets.max() - buckets) << 3 * MORTON_BITS | _morton(means)).int()
+    return _places(((buckets.max() - buckets) << 3 * MORTON_BITS | _morton(means)).argsort(stable=True))
 
 
 @torch.no_grad()
@@ -62,20 +62,21 @@ def even_ranks(gaussians: Gaussians, camera: Camera, even: EvenBuckets) -> Tenso
     means = gaussians.means.double().nan_to_num(0.0, 0.0, 0.0)
     if not len(means):
         return torch.zeros(0, dtype=torch.int32, device=means.device)
-    depths = ((means - camera.center.to(means)) * camera.viewmat[2, :3].to(means)).sum(1)
+    depths = (means - camera.center.to(means)) @ camera.viewmat[2, :3].to(means)
     nearest, farthest = depths.aminmax() if even.sphere_from is None else _sphere(gaussians, camera, even.sphere_from)
     steps = 2 ** bucket_bits(len(means)) if even.steps is None else even.steps
     extent = (farthest - nearest).clamp_min(torch.finfo(means.dtype).tiny)
-    buckets = ((depths - nearest) * steps / extent).clamp(0, steps).long()
-    rows = torch.arange(len(buckets), device=buckets.device)
-    places = _ranks_of(-gaussians.scales.double().prod(1) * gaussians.opacities.double()) if even.largest_first else rows
-    return _ranks_of(buckets * len(rows) + (-places if even.later_in_front else places)).int()
+    buckets = ((depths - nearest) * (steps / extent)).clamp(0, steps).int()
+    rows = torch.arange(len(means), device=means.device)
+    if even.largest_first:
+        rows = (gaussians.scales.double().prod(1) * gaussians.opacities.double()).argsort(stable=True, descending=True)
+    rows = rows.flip(0) if even.later_in_front else rows  # those of a bucket, from the front
+    return _places(rows[buckets[rows].argsort(stable=True)])
 
 
-def _ranks_of(keys: Tensor) -> Tensor:
-    """The place of each key in ascending order, [N]; of equal keys the earlier comes first."""
-    order = keys.argsort(stable=True)
-    return torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
+def _places(order: Tensor) -> Tensor:
+    """The place of each row in an order of rows [N], int32."""
+    return torch.empty_like(order, dtype=torch.int32).scatter_(0, order, torch.arange(len(order), dtype=torch.int32, device=order.device))
 
 
 def _sphere(gaussians: Gaussians, camera: Camera, least: float) -> tuple[Tensor, Tensor]:
