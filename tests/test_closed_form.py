@@ -313,3 +313,11 @@ def test_the_closest_view_is_looked_for_among_more_views():
     closer = VIEW.looking_from(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]]), "closer")
     views = [closer if number == 1 else VIEW for number in range(40)]
     torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), views, 12), torch.tensor([2.0]) / FOCAL)
+
+
+def test_the_closest_view_of_what_few_views_show_is_looked_for_among_all():
+    """Of 200 views, of which every fifth is looked at, two show the splat, and the closer is not among these."""
+    closer = VIEW.looking_from(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]]), "closer")
+    away = VIEW.looking_from(torch.diag(torch.tensor([1.0, -1, -1, 1])), "away")
+    views = [VIEW, closer, *[away] * 198]
+    torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), views, 12), torch.tensor([2.0]) / FOCAL)

@@ -241,6 +241,8 @@ def test_cameras_in_one_place_have_views_from_there(places):
     assert len(views) == 50 and all(view.viewmat.isfinite().all() for view in views)
     if places == 1:
         assert all((view.center - eyes[0]).norm() < 1e-9 for view in views)
+        directions = torch.stack([view.viewmat[2, :3] for view in views])
+        assert torch.pdist(directions).min() > 0.01
 
 
 def test_no_camera_is_refused():

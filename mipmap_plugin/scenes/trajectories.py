@@ -35,6 +35,9 @@ GAP, RIG = 4.0, 4
 # Fraction of the distance to another place within which cameras are in one place but for rounding.
 SAME_PLACE = 1e-6
 
+# Of the coordinates of splats and cameras, which checkpoints store in single precision.
+ROUNDING = torch.finfo(torch.float32).eps
+
 # Candidates per generated view: keeping those that fill gaps gains 0.5 dB on lego's test views at x1/8.
 CANDIDATES = 16
 
@@ -175,8 +178,9 @@ def _reach(distances: Tensor) -> Tensor:
 
 def _places(centers: Tensor, rotations: Tensor, times: Tensor, around: Tensor) -> Tensor:
     """Features [V, 7] of views: position, in units of the size of the camera path `around` [C, 3], direction, and time."""
-    size = (around - around.mean(0)).norm(dim=1).max()
-    return torch.cat([centers / (size if size > 0 else 1.0), rotations[..., 2], times[:, None]], dim=1)
+    size, middle = (around - around.mean(0)).norm(dim=1).max(), around.mean(0)
+    rounding = ROUNDING * around.abs().max()  # of cameras in one place only directions tell
+    return torch.cat([(centers - middle) / (size if size > rounding else 1.0), rotations[..., 2], times[:, None]], dim=1)
 
 
 def _farthest(places: Tensor, taken: Tensor, count: int) -> list[int]:
