@@ -11,7 +11,8 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.moments import at_moments, evaluate_moments, follower, release, sharing_moments
+from mipmap_plugin.adaptation.following import Following, release
+from mipmap_plugin.adaptation.moments import at_moments, evaluate_moments, sharing_moments
 from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Traits
@@ -202,7 +203,7 @@ def test_a_moving_model_without_a_memory_is_not_evaluated_ahead():
     """As one of a third party: nothing of it would be kept."""
     base = SimpleNamespace(traits=Traits(moves=True), gaussians=None)
     evaluate_moments(base, at_times(3), phase=None)
-    follower(base, at_times(3), 0.5)(base)
+    Following(base, at_times(3), 0.5)(base)
 
 
 def test_photographs_stay_at_their_own_moments(tmp_path):

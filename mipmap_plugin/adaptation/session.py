@@ -16,8 +16,9 @@ from torch import Tensor
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, is_true
+from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
-from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments, follower, release
+from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
@@ -187,7 +188,7 @@ class Session:
         first, *further = [Renderer(self.backend, target) for target in targets]
         together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
         task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together, stepping)
-        task = replace(task, follow=follower(self.base, self.views, self.scale))
+        task = replace(task, follow=Following(self.base, self.views, self.scale))
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
+from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
@@ -44,7 +45,7 @@ class Task:
     further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
     render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
-    follow: Callable[[SplatModel], None] = lambda student: None  # called before each step (`moments.follower`)
+    follow: Following = field(default_factory=Following)  # called before each step
 
     def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
@@ -113,7 +114,7 @@ class Run:
         means = student.parameters()["means"]
         optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch(seconds=spent)
         with watch:
-            trial, costs = Trial.begin(student, task, config), Costs()
+            trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds)
             quality = costs.check(lambda: task.validation.quality(student))
             steering = Steering.begin(student, quality.visible)
         first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=len(means))

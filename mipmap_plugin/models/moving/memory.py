@@ -6,11 +6,12 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from time import perf_counter
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.threads import for_views, side_by_side
+from mipmap_plugin.threads import for_views, side_by_side, side_by_side_now
 
 # What a field adds to each parameter, or multiplies it by, at one moment, by name: [N, ...] each.
 Changes = dict[str, Tensor]
@@ -44,6 +45,8 @@ class Memory:
         self._evaluate, self._limit = evaluate, limit
         self._moments: OrderedDict[float, _Moment] = OrderedDict()
         self._lock = threading.Lock()
+        self._place = torch.empty(0)  # where a moment was evaluated last
+        self.seconds, self.evaluations = 0.0, 0  # that moments took, and how many there were
 
     def __call__(self, means: Tensor, time: float) -> Changes:
         """The changes at `means` [N, 3], without gradient; not to be changed in place."""
@@ -52,8 +55,8 @@ class Memory:
             for place, changes in moment.known:
                 if torch.equal(place, means):
                     return changes
-            changes = self.evaluate(means, time)
-            moment.known = [*moment.known[:1], (means.clone(), changes)]
+            changes = self._noted(means, time)
+            moment.known = [*moment.known[:1], (self._copy(means), changes)]
         self._forget()
         return changes
 
@@ -63,6 +66,27 @@ class Memory:
         chunks = means.detach().split(CHUNK if means.device.type == "cpu" else CHUNK_OF_GPU)
         parts = list(side_by_side(lambda part: self._evaluate(part, time), chunks, for_views()))
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+    def knows(self, means: Tensor, time: float) -> bool:
+        """Whether the changes at `means` [N, 3] need not be evaluated."""
+        moment = self._moments.get(time)
+        return moment is not None and any(torch.equal(place, means) for place, _ in moment.known)
+
+    def _copy(self, means: Tensor) -> Tensor:
+        """A copy of the means, which all moments share that are evaluated there."""
+        with self._lock:
+            if not torch.equal(self._place, means):
+                self._place = means.clone()
+            return self._place
+
+    def _noted(self, means: Tensor, time: float) -> Changes:
+        """`evaluate`, whose time is noted; of several moments side by side the time that passed."""
+        began = perf_counter()
+        changes = self.evaluate(means, time)
+        with self._lock:
+            self.seconds += (perf_counter() - began) / side_by_side_now()
+            self.evaluations += 1
+        return changes
 
     def keep_rows(self, means: Tensor, rows: Tensor, left: Tensor) -> None:
         """Know what is known at `means` [N, 3] also of their `rows` [M], which are `left` [M, 3]."""
