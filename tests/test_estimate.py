@@ -26,7 +26,7 @@ from mipmap_plugin.wrap import wrap_model
 
 SCALE = 1 / 4
 VIEW, TRUTH, CHECK = 0.003, 0.012, 0.05  # s: as of lego_200 on one thread
-EVALUATION = 0.02  # s, of a field at a moment
+EVALUATION = 0.03  # s, of a field at a moment
 
 
 @pytest.fixture
