@@ -41,6 +41,12 @@ class Evaluations:
             return 0.0
         return self._follow.evaluation * self._count(step, ceiling, draws + checks * self._checked)
 
+    def of_all_steps(self) -> float:
+        """Seconds that the evaluations of a whole run take, before its first step."""
+        if not self._follow.moments:
+            return 0.0
+        return self._follow.evaluation * self._count(0, 1.0, self._config.steps * self._config.views_per_step)
+
     def _count(self, step: int, ceiling: float, draws: float) -> float:
         """How many moments are evaluated by so many draws after `step`."""
         wandered = (self._squares + self._rates(step, ceiling).square().cumsum(0)).sqrt()  # px after each step

@@ -52,7 +52,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     began = run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
     with bar, ticking(bar), interruptible() as interrupted:
-        reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.watch.seconds, config)
+        reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.seconds, config)
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
@@ -66,7 +66,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             bar.update()
             if run.curve[-1].step == run.step:
                 bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
-            reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.watch.seconds, config)
+            reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.seconds, config)
             if interrupted():
                 on_interrupt(run)
         with run.watch:
@@ -77,7 +77,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
 
 
 def _budget_left(run: Run, config: AdaptConfig) -> float:
-    return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - run.watch.seconds)
+    return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - run.seconds)
 
 
 def is_checked(step: int, config: AdaptConfig) -> bool:

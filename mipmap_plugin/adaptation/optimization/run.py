@@ -107,6 +107,7 @@ class Run:
     ended_by: str = ""  # why it takes no further step; "" while it does
     by_rows: ByRows | None = None  # the student, while the backend moves it
     threads: QuickestThreads = field(default_factory=QuickestThreads)
+    reserved: float = 0.0  # seconds of a time budget for what comes after the steps
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
@@ -122,7 +123,12 @@ class Run:
 
     def progress(self, config: AdaptConfig) -> float:
         """Fraction (0..1) of the steps that is over, or of what the start left of the time budget, whichever is larger."""
-        return progress(self.step, self.watch.seconds, config, self.curve[0].seconds)
+        return progress(self.step, self.seconds, config, self.curve[0].seconds + self.reserved)
+
+    @property
+    def seconds(self) -> float:
+        """What is gone of a time budget."""
+        return self.watch.seconds + self.reserved
 
     def states(self, initial: SplatModel) -> dict[str, SplatModel]:
         """The best and the last state, where they differ from the start (the `initial` model) and from each other, by what reports call them."""

@@ -41,6 +41,7 @@ class Field(Protocol):
     changes_opacities: bool
     is_still: bool  # the field changes no splat, and need not be evaluated
     cost: str  # of one evaluation, counted
+    work: float  # of an evaluation at one splat: so many splats are drawn in its time, by the processor's kernels
 
     def changes(self, means: Tensor, time: float) -> Changes:
         """What it changes at `means` [N, 3] and `time` (0..1), without gradient: that of a mean through the field is left out."""
@@ -94,6 +95,11 @@ class MovingModel:
     def moves(self) -> bool:
         """Whether the splats depend on time; `adaptation.views` then distributes times over cameras that have none."""
         return not self.field.is_still
+
+    @property
+    def work(self) -> float:
+        """How many splats are drawn in the time that the field takes for one."""
+        return self.field.work
 
     @property
     def traits(self) -> Traits:
