@@ -36,7 +36,8 @@ class Memory:
     def __init__(self, evaluate: Callable[[Tensor, float], Changes], limit: float | None = None) -> None:
         """`evaluate`: means [N, 3] and a time -> their changes; `limit`: bytes; None: what suits the machine."""
         self._evaluate, self._limit = evaluate, limit
-        self._base = self._latest = torch.empty(0)  # means [N, 3]
+        self._base: Tensor | None = None  # means [N, 3]
+        self._latest: Tensor | None = None
         self._known: dict[tuple[bool, float], tuple[Tensor, Changes]] = {}  # by whether it is the base's, and time; with the means
         self._asked: dict[float, threading.Lock] = {}  # by time
         self._lock = threading.Lock()
@@ -88,22 +89,23 @@ class Memory:
 
     def _keep(self, means: Tensor, time: float, changes: Changes) -> None:
         """Keep what was found at `means` [N, 3], if there is room or what is of less use makes some."""
-        if not len(self._base):
-            self._base = means.clone()
-        is_base = torch.equal(self._base, means)
-        if not is_base and not torch.equal(self._latest, means):
-            self._latest = means.clone()  # which all moments share
+        base = self._base = means.clone() if self._base is None else self._base
+        place, is_base = base, torch.equal(base, means)
+        if not is_base:
+            if self._latest is None or not torch.equal(self._latest, means):
+                self._latest = means.clone()  # which all moments share
+            place = self._latest
         self._known.pop((is_base, time), None)
-        stale = [key for key, (place, _) in self._known.items() if place is not self._base and place is not self._latest]
-        base = [] if is_base else [key for key in self._known if key[0]]
+        stale = [key for key, (old, _) in self._known.items() if old is not base and old is not self._latest]
+        of_base = [] if is_base else [key for key in self._known if key[0]]
         limit = max(LIMIT, PART * memory(means.device)) if self._limit is None else self._limit
         room = limit - sum(_bytes(known) for _, known in self._known.values()) - _bytes(changes)
-        for key in (*stale, *base):
+        for key in (*stale, *of_base):
             if room >= 0:
                 break
             room += _bytes(self._known.pop(key)[1])
         if room >= 0 or not self._known:
-            self._known[is_base, time] = self._base if is_base else self._latest, changes
+            self._known[is_base, time] = place, changes
 
 
 def _bytes(changes: Changes) -> int:
