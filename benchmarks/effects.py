@@ -240,7 +240,7 @@ Scene {scene}: {len(bench.model()):,} splats at {bench.camera.width} x {bench.ca
 
 Where the scene calls for an effect, or a person asks for it, leaving it out gives another image, or the same without depth or normals
 beside it, and the ratio is what the effect costs. Where it is not called for, the image is the same but for the difference given, and the
-ratio is what is saved. (The 2e-03 is one pixel, on which one splat lies at the alpha threshold of 1/255. At scale 1, "on" optimises a base
+ratio is what is saved. (The 2e-03 is one pixel, on which one splat lies at the alpha threshold of 1/255. At scale 1, "on" optimizes a base
 that is right as it is.)
 
 {markdown(head, body)}

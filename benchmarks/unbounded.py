@@ -43,7 +43,8 @@ Made by `python benchmarks/unbounded.py DATA`, judged on views that nothing was 
 name says (of bird_272 one of 8, on which the base was not trained either), or 24 new views of an orbit where the checkpoint came without
 cameras. The protocol says by what: *N x N samples*, the base's own image averaged; *base, bicubic*, the same shrunk by Pillow's bicubic (a zoom-in
 is shrunk itself and compared with the base's image as it is); P3, photographs. What is the truth itself has no row. Of flowers at x2 the base's
-cameras are half as large, and Lanczos takes a network's place. One thread of a shared machine.
+cameras are half as large, and Lanczos takes a network's place. One thread of a shared machine, which was so busy
+at flowers x2 that its seconds are ten times those of a quiet one.
 """
 
 LANCZOS = dict(upsampler="lanczos as a network")
@@ -106,7 +107,7 @@ def split(base: Wrapped, capture: Capture) -> tuple[list[Camera], list[Camera]]:
     """The views to judge, and the cameras that are left to adapt to; none: an orbit is generated."""
     if capture.every is None:
         return choose_views([], base.model.parameters()["means"], AdaptConfig(seed=EVALUATION_SEED, extra_views=ORBIT_VIEWS))[0], []
-    cameras = sorted((replace(camera.zoomed(capture.share), split="train") for camera in base.cameras), key=lambda camera: camera.name)
+    cameras = sorted((replace(camera.zoomed(capture.share), split="train", zoom=1.0) for camera in base.cameras), key=lambda camera: camera.name)
     return cameras[:: capture.every], [camera for number, camera in enumerate(cameras) if number % capture.every]
 
 

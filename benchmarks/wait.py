@@ -81,6 +81,7 @@ def timed(checkout: Path, options: list[str], threads: int, *, cold: bool) -> di
     """Seconds of one process, until its first line, and of its phases where it reports any."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": str(threads)}
+        environment |= {"PYTHONDONTWRITEBYTECODE": ""}  # else whatever changed since the installation is compiled by every process
         environment |= {"NUMBA_CACHE_DIR": folder} if cold else {}
         output = ["--output", str(Path(folder, "adapted"))] if options[0] == "adapt" else []
         command = [sys.executable, "-c", COMMAND, *options, *output]

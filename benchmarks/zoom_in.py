@@ -35,7 +35,7 @@ transformers, realesr-animevideov3.pth is a GAN that is worse in dB than bicubic
 no splat touched. Seconds on one thread of a shared machine, those to enlarge the views among them (about 1 s a view with a transformer,
 and an empty cache).
 
-The *base* as it is has 6 to 7 dB less than `default`, and better LPIPS than many, for its needles are crisp. The setting `crispness` leads from
+The *base* as it is has 6 to 7.5 dB less than `default`, and better LPIPS than many, for its needles are crisp. The setting `crispness` leads from
 the closed form of most dB (0, `instant`) to splats as small as the base's own, which are more opaque instead of wider (1); steps that start
 there keep their crispness. 0.25, which `default` has, gains dB and LPIPS over 0 at both scales of both bases; 1 loses neither against the base
 (the shaded side), and 0.75 only LPIPS on chair at x4. Rows with networks were measured before there was the setting, and have none of it.

@@ -1,4 +1,4 @@
-"""Register your own family of checkpoints; here: splats in a NumPy archive.
+"""Register your own family of checkpoints; here: splats in a NumPy archive, whose adapted files are PLYs.
 
     python examples/register_family.py scene.npz 1/4
 
@@ -35,7 +35,8 @@ def load(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     with np.load(path) as arrays:  # an adapted model is saved as a PLY
         if missing := set(NAMES) - set(arrays.files):
             raise CheckpointError(f"{path} lacks the arrays {', '.join(sorted(missing))}; export it again")
-        return VanillaModel({name: torch.from_numpy(arrays[name]) for name in NAMES}, origin=Origin(source=Path(path)))
+        tensors = {name: torch.from_numpy(arrays[name]) for name in NAMES}
+    return VanillaModel(tensors, origin=Origin(Path(path), folder=Path(path).parent))  # whose cameras.json is read
 
 
 FAMILY = Family("npz", "splats in a NumPy archive", recognize, api_version=1, load=load, saves=".ply")

@@ -5,6 +5,11 @@
 MAX_LENGTH = 1500
 
 
+def install(extra: str) -> str:
+    """How to install an extra, in words for whoever has a clone of the repository and for whoever has none."""
+    return f"run pip install '.[{extra}]' in a clone of the repository, or pip install 'mipmap-plugin[{extra}]' elsewhere"
+
+
 class MipmapPluginError(Exception):
     """Base of all errors that the command line prints in one sentence, with exit code 2. Long messages are cut in the middle."""
 

@@ -18,7 +18,7 @@ class Gaussians:
 
     Attributes:
         means: [N, 3] world units.
-        quats: [N, 4] wxyz, any norm > 0.
+        quats: [N, 4] wxyz, of any norm; 0 is no rotation.
         scales: [N, 3] world units, standard deviations along the local axes.
         opacities: [N], 0..1.
         sh: [N, (degree + 1)**2, 3], coefficients of the colors' spherical harmonics, basis-major, as 3DGS has them; degree 0 to 4.

@@ -1,4 +1,4 @@
-"""Recipes: named sets of settings. How each number was found, and what it is worth, is in docs/recipes.md."""
+"""Recipes: named sets of settings. How each number was found, and what it is worth, is in docs/recipes_found.md."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def default(scale: float, network: bool) -> dict[str, Any]:
 
 
 def thorough(scale: float, network: bool) -> dict[str, Any]:
-    """Better quality in several times the time; at zoom-in without a network the same as `default`."""
+    """Better quality in ten to twenty times the time; at zoom-in without a network the same as `default`."""
     return THOROUGH_OUT | _zoom_out_settings(scale) if scale <= 1 else dict(THOROUGH_UPSAMPLED if network else DEFAULT_IN)
 
 
@@ -116,7 +116,7 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
         raise PluginError(f"recipe {name!r} is of type {type(function).__name__}; make it a function (scale, network) -> settings")
     try:
         settings = {**function(scale, str(overrides.get("upsampler", "bicubic")) not in INTERPOLATIONS)}
-    except Exception as error:  # third-party code may fail in any way
+    except (Exception, SystemExit) as error:  # third-party code may fail in any way
         raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
     if any(overrides.get(end) is not None for end in ENDS):
         settings |= {"most_draws": None, "least_zoom_in": 1.0}

@@ -79,7 +79,9 @@ def _modified(folder: str) -> float:
 
 def load_target(name: str, target: str) -> Any:
     """Import `"package.module:Name"`. Raises PluginError."""
-    module, _, attribute = target.partition(":")
+    module, colon, attribute = target.partition(":")
+    if not colon:
+        raise PluginError(f"{name!r} ({target}) cannot be loaded; a target is written package.module:Name")
     try:
         return getattr(importlib.import_module(module), attribute)
     except (Exception, SystemExit) as error:  # a third-party module may fail in any way; one broken plug-in must not break the others

@@ -242,7 +242,7 @@ class Wrapped:
         report, source = named(path).with_name(named(path).name + REPORT), self.model.source
         parts = parts_of(source, self.model.folder)
         model = cast(Filtered, self.model).bare() if viewer is not None and self.model.traits.filtered else self.model
-        refuse_unread(path, own_name(viewer))
+        refuse_unread(path, [own_name(name) for name in viewers_for(viewer)] if viewer else [])
         model.refuse_output(path, overwrite=overwrite, networks_move=networks_move)
         refuse_output(report, overwrite, parts, is_file=True)
         refuse_output(state_path(path), True, parts, is_file=True)

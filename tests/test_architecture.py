@@ -1,6 +1,7 @@
 """The house's own rules, read from the source: what may import what, and how large a thing may grow."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -214,3 +215,8 @@ def test_the_library_neither_prints_nor_evaluates_text(path):
     calls = [node.func for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
     forbidden = {"eval", "exec"} if room(name_of(path)) in {"cli", "commands"} else {"eval", "exec", "print"}
     assert forbidden.isdisjoint(call.id for call in calls if isinstance(call, ast.Name))
+
+
+def test_one_sentence_says_how_to_install_an_extra():
+    """It is right in a clone too, from which the README installs."""
+    assert [name_of(path) for path in MODULES if re.search(r"pip install '(mipmap-plugin|\.)\[", path.read_text(encoding="utf-8"))] == ["errors.py"]

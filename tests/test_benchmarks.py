@@ -193,6 +193,13 @@ def test_held_out_views_of_a_capture_come_in_the_order_of_names(tmp_path):
     assert [view.name for view in judged] == ["view_0", "view_4", "view_8"] and len(others) == 6
 
 
+def test_smaller_cameras_of_a_capture_are_those_of_its_base():
+    """Views of another zoom would get base images of the size of the training, so that the base were its own truth at the new scale."""
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(4), backend="reference")
+    judged, others = unbounded.split(base, unbounded.Capture("ball", (2.0,), every=2, share=0.5))
+    assert {(view.width, view.zoom) for view in (*judged, *others)} == {(base.cameras[0].width // 2, 1.0)}
+
+
 def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_draws(monkeypatch):
     monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
     base = wrap_model(tiny.model(), cameras=[], backend="reference")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, checked
 from mipmap_plugin.errors import SettingsError, ShapeError
 
 # Evaluated by hand in float64: quaternion (0.9, 0.1, -0.2, 0.3) normalized, translation (0.5, -0.25, 4).
@@ -74,6 +74,12 @@ def test_zoom_never_goes_below_one_pixel(camera):
 def test_other_sizes_of_a_view_are_checked(camera, size):
     with pytest.raises(SettingsError, match="must be"):
         camera.resized(*size)
+
+
+def test_cameras_of_a_base_are_of_its_scale_whatever_they_were_before(camera):
+    [plain, zoomed] = checked([camera, camera.zoomed(0.5)])
+    assert plain is camera
+    assert (zoomed.zoom, zoomed.size, zoomed.fx) == (1.0, camera.zoomed(0.5).size, camera.zoomed(0.5).fx)
 
 
 def test_zoom_keeps_name_split_and_time(camera):

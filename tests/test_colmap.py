@@ -97,10 +97,18 @@ def test_the_model_is_found_where_programs_leave_it(tmp_path, place):
     assert len(load_scene(tmp_path / "s").cameras) == 1
 
 
-def test_the_models_own_folder_finds_the_photographs_too(tmp_path):
-    write_text_model(tmp_path / "sparse/0", names(1))
+@pytest.mark.parametrize("place", ["sparse/0", "colmap/sparse/0", "model"])
+def test_every_folder_from_the_models_upwards_finds_the_photographs(tmp_path, place):
+    write_text_model(tmp_path / place, names(1))
     write_photographs(tmp_path / "images", names(1))
-    assert len(load_scene(tmp_path / "sparse/0").images) == len(load_scene(tmp_path / "sparse").images) == 1
+    folders = [tmp_path / place, *(tmp_path / place).relative_to(tmp_path).parents][:-1]
+    assert [len(load_scene(tmp_path / folder).images) for folder in folders] == [1] * len(folders)
+
+
+def test_photographs_that_are_nowhere_are_missed_beside_the_model(tmp_path):
+    write_text_model(tmp_path / "scene/sparse/0", names(1))
+    for folder in ("scene", "scene/sparse", "scene/sparse/0"):
+        assert f"absent from {tmp_path / 'scene/images'};" in " ".join(load_scene(tmp_path / folder).notes)
 
 
 BENT = {"SIMPLE_RADIAL": "70 32 24 0.1", "OPENCV": "70 72 32 24 0 0 0.01 0", "OPENCV_FISHEYE": "70 72 32 24 0 0 0 0"}

@@ -8,6 +8,7 @@ import torch
 
 from mipmap_plugin.adaptation.conversion import conversion
 from mipmap_plugin.adaptation.session import Session
+from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.models.base import TrainedScale
@@ -60,6 +61,14 @@ def test_a_zoom_in_starts_from_it_and_tells_so():
     assert report.notes[-1].startswith("converted at x1 before, ") and report.notes[-1].endswith(", in 3 steps")
     assert 0 < report.seconds["conversion"] < report.seconds["total"]
     assert report.curve[0].seconds > report.seconds["conversion"]
+
+
+def test_what_no_view_shows_is_told_once_and_of_the_base(monkeypatch):
+    monkeypatch.setattr(candidates, "HIDDEN", -1.0)  # each start would tell of it
+    with pytest.warns(UserWarning, match="no view shows") as said:
+        report = wrapped().adapt(2, viewer="antialiased", **BRIEF).report
+    assert ["no view shows" in str(warning.message) for warning in said].count(True) == 1
+    assert ["no view shows" in note for note in report.notes].count(True) == 1
 
 
 def test_it_brings_a_zoom_in_closer_to_the_base():

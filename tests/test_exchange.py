@@ -20,6 +20,7 @@ from ply_files import write
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.splatting.harmonics import basis
@@ -157,13 +158,24 @@ def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("viewer", ["gaussian-splats-3d", "mkkellogg"])
-def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys, viewer):
+UP_TO_2, NONE = "reads .spz up to version 2, and splat-transform writes 3 at least", "read no .spz"
+
+
+@pytest.mark.parametrize(("viewer", "why"), [("gaussian-splats-3d", UP_TO_2), ("mkkellogg", UP_TO_2), ("gsplat-js", NONE), ("drei", NONE)])
+def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys, viewer, why):
     (tmp_path / "phone.spz").write_bytes(SPZ)
     words = ["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant", "--viewer", viewer]
     assert main(words) == 2
-    assert "reads .spz up to version 2, and splat-transform writes 3 at least; give a .ply by --output" in capsys.readouterr().err
+    assert f"{why}; give a .ply by --output" in capsys.readouterr().err
     assert main([*words, "--output", str(tmp_path / "phone.ply")]) == 0
+
+
+def test_spz_for_several_viewers_is_written_with_a_warning_of_those_that_do_not_read_it(tmp_path, recwarn):
+    refuse_unread(tmp_path / "a.spz", ["spark", "three"])
+    refuse_unread(tmp_path / "a.ply", ["spark", "gaussian-splats-3d"])
+    assert not recwarn.list
+    with pytest.warns(UserWarning, match=r"GaussianSplats3D .*; antimatter15/splat, .* read no .spz; give a .ply by --output if it is for these too"):
+        refuse_unread(tmp_path / "a.spz", ["spark", "gaussian-splats-3d", "antimatter15"])
 
 
 @pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
@@ -190,6 +202,18 @@ def test_columns_that_a_format_has_no_place_for_are_told_of_and_in_the_report(tm
     assert told in json.loads((tmp_path / f"c{ending}.adaptation.json").read_text())["notes"]
     assert main(["adapt", str(tmp_path / "b.ply"), "--scale", "1", "--output", str(tmp_path / "d.ply")]) == 0
     assert json.loads((tmp_path / "d.ply.adaptation.json").read_text())["notes"] == []
+
+
+@pytest.mark.parametrize("ending", [".spz", ".compressed.ply", ".ply"])
+def test_bands_that_splat_transform_does_not_write_are_left_out_and_told_of(tmp_path, tool, ending, capsys):
+    base, made = tiny.ply(tmp_path / "a.ply", degree=4), tmp_path / f"b{ending}"
+    assert main(["adapt", str(base), "--scale", "1", "--output", str(made)]) == 0
+    told, count = "SH bands above degree 3 are dropped, which splat-transform does not write; a .ply has them", int(ending != ".ply")
+    assert capsys.readouterr().err.count(told) == json.loads(made.with_name(made.name + ".adaptation.json").read_text())["notes"].count(told) == count
+    written, rest = read_ply(made).columns, [f"f_rest_{number}" for number in range(45 if count else 72)]  # the stand-in writes what it is given
+    assert [name for name in written if name.startswith("f_rest")] == rest
+    own = load_model(base).parameters()["shN"][:, 14, 2].detach()
+    np.testing.assert_array_equal(written["f_rest_44" if count else "f_rest_62"], own)
 
 
 def test_a_format_that_is_only_read_is_saved_as_a_ply(tmp_path, tool):
@@ -297,6 +321,17 @@ def test_a_splat_transform_that_is_too_old_for_sog_is_found_before_the_work(tmp_
         tiny.model().refuse_output(tmp_path / "a.spz", overwrite=False, networks_move=False)
 
 
+def test_streamed_sog_is_read_by_a_splat_transform_that_knows_it(tmp_path, tool):
+    (tmp_path / "lod-meta.json").write_text(json.dumps({"lodLevels": 2, "filenames": ["0_0/meta.json", "1_0/meta.json"], "tree": {}}))
+    assert len(load_model(tmp_path)) == 60
+    assert tool_request(tool)[1] == str(tmp_path / "lod-meta.json")
+    (tool / "splat-transform").write_text(f"#!{sys.executable}\nimport sys\nprint('splat-transform v2.7.1 (b42b60c)', file=sys.stderr)\n")
+    assert sentence(tmp_path).endswith(
+        "lod-meta.json is Streamed SOG: splat-transform 2.7.1 is too old for it, and 3.2 or newer is needed, which needs Node.js 22; "
+        "run: npm install -g @playcanvas/splat-transform@latest"
+    )
+
+
 def seen(splats, turn):
     """Places, covariances, and colors in every direction, of splats after a turn [3, 3] of the scene."""
     axes = turn @ axes_of(splats.quats, splats.scales)
@@ -316,12 +351,13 @@ def test_spz_is_read_and_written_as_it_is_stored_by_every_version(tmp_path, tool
     still, turn = torch.eye(3), torch.diag(torch.tensor([1.0, -1.0, -1.0]) if turns else torch.ones(3))
     for found, expected in zip(seen(read.gaussians(), still), seen(stored.gaussians(), turn), strict=True):
         assert torch.allclose(found, expected, atol=1e-5)
-    if version >= "2.1":
-        read.save(tmp_path / "b.spz", provenance={})
-        written = read_ply(tmp_path / "b.spz").columns
-        assert all(np.array_equal(column, written[name]) for name, column in read_ply(tool / "answer.ply").columns.items())
     (tmp_path / "a.splat").write_bytes(RECORD * 3)
     assert torch.equal(load_model(tmp_path / "a.splat").parameters()["means"], stored.parameters()["means"])  # only SPZ was turned
+    if version >= "2.1":
+        tiny.model(degree=3).save(tool / "answer.ply", provenance={}, overwrite=True)  # with the bands that are written
+        load_model(tmp_path / "a.spz").save(tmp_path / "b.spz", provenance={})
+        written = read_ply(tmp_path / "b.spz").columns
+        assert all(np.array_equal(column, written[name]) for name, column in read_ply(tool / "answer.ply").columns.items())
 
 
 def test_an_error_of_node_is_told(tmp_path, tool):

@@ -50,7 +50,10 @@ def test_as_many_splats_as_fit_into_a_file_do_fit(tmp_path):
         splats_within(model, 3000, "file.ply", record)
 
 
-@pytest.mark.parametrize("options", [[], ["--viewer", "spark"], ["--scale", "1/3"], ["--viewer", "portable", "--recipe", "thorough"]])
+OPTIONS = [[], ["--viewer", "spark"], ["--viewer", "mip"], ["--scale", "1/3"], ["--viewer", "portable", "--recipe", "thorough"]]
+
+
+@pytest.mark.parametrize("options", OPTIONS)
 def test_a_file_is_as_large_as_it_may_be_and_no_larger(tmp_path, options):
     base, output, size = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "small.ply", 6_000
     words = ["adapt", str(base), "--bytes", str(size), "--output", str(output), "--steps", "1", "--views", "given", "--backend", "reference"]

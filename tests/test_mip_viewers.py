@@ -89,6 +89,28 @@ def test_what_is_made_for_a_viewer_is_a_checkpoint_of_3dgs(tmp_path, family, vie
     torch.testing.assert_close(loaded.render(view, viewer=viewer).image, adapted.render(view).image, atol=1e-5, rtol=0)
 
 
+def of_mip_splatting(columns):
+    """Scales and opacities as Mip-Splatting takes them from a file, whose loader requires filter_3D."""
+    scales = np.exp(np.stack([columns[f"scale_{axis}"] for axis in range(3)], 1).astype(np.float64))
+    smoothed = np.sqrt(scales**2 + columns["filter_3D"][:, None] ** 2)
+    return smoothed, np.sqrt((scales**2).prod(1) / (smoothed**2).prod(1)) / (1 + np.exp(-columns["opacity"]))
+
+
+@pytest.mark.parametrize("base", ["3dgs", "mip"])
+@pytest.mark.parametrize("name", ["made.ply", "made"])
+def test_what_is_made_for_mip_splatting_has_the_filter_that_its_loader_requires(tmp_path, base, name):
+    own = wrapped(tmp_path) if base == "mip" else wrap_model(tiny.folder(tmp_path / "base", tiny.cameras()), backend="reference")
+    adapted = own.adapt(1 / 4, viewer="mip", **BRIEF)
+    columns = read_ply(adapted.save(tmp_path / name)).columns
+    assert [*columns][-1] == "filter_3D" and not columns["filter_3D"].any()
+    splats, (scales, opacities) = adapted.model.gaussians(None).detach(), of_mip_splatting(columns)
+    np.testing.assert_allclose(scales, splats.scales, rtol=1e-5)
+    np.testing.assert_allclose(opacities, splats.opacities, rtol=1e-5)
+    again, view = wrap_model(tmp_path / name, backend="reference", background=(0.0, 0.0, 0.0)), tiny.cameras(1)[0].zoomed(1 / 4)
+    assert (again.model.family, again.trained.eps2d) == ("mip", 0.1)
+    torch.testing.assert_close(again.render(view, viewer="mip").image, adapted.render(view).image, atol=1e-5, rtol=0)
+
+
 def test_the_base_is_neither_changed_nor_overwritten(tmp_path):
     base = wrapped(tmp_path)
     before = {name: tensor.clone() for name, tensor in base.model.parameters().items()}

@@ -25,8 +25,8 @@ WRITERS = {
     "splatfacto": lambda path: torch_checkpoints.splatfacto_folder(path, torch_checkpoints.splats()),
 }
 
-# It needs splat-transform, which is no Python package; tests/test_exchange.py tests it with a stand-in.
-ELSEWHERE = {"exchange"}
+# The first needs splat-transform, which is no Python package; tests/test_exchange.py tests it with a stand-in. The second is in tests/test_zipped.py.
+ELSEWHERE = {"exchange", "zipped"}
 
 
 def suite_of(name):

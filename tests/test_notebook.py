@@ -90,6 +90,23 @@ def test_render_takes_the_scale_that_a_file_was_adapted_to(tmp_path, capsys):
     assert {image_size(path) for path in (tmp_path / "base_pictures").iterdir()} == {(32, 24)}
 
 
+def test_render_takes_the_viewer_that_a_file_was_adapted_for(tmp_path, capsys):
+    base, words = tiny.folder(tmp_path / "base", tiny.cameras(1)), ["--backend", "reference"]
+    drawn = {}
+    for viewer in ("spark", "portable"):
+        made = tmp_path / f"base_x0.25_{viewer}"
+        assert main(["adapt", str(base), "--scale", "1/4", "--recipe", "instant", "--viewer", viewer, *words]) == 0
+        for name, options in {"own": [], "spark": ["--viewer", "spark"], "mip": ["--screen-filter", "mip"]}.items():
+            assert main(["render", str(made), "--output", str(tmp_path / viewer / name), *options, *words]) == 0
+            [picture] = (tmp_path / viewer / name).iterdir()
+            drawn[viewer, name] = picture.read_bytes()
+            told = capsys.readouterr().out.splitlines()[-1].partition(f"{tmp_path / viewer / name}, ")[2]
+            own = " in spark" if (viewer, name) == ("spark", "own") else ""
+            assert told == f"at x0.25{own}, which the file was adapted to"
+    assert drawn["spark", "own"] == drawn["spark", "spark"] != drawn["spark", "mip"]
+    assert drawn["portable", "own"] != drawn["portable", "spark"]  # which is one of several that it was made for
+
+
 def test_the_scale_is_read_from_the_header_or_from_the_report(tmp_path):
     base = wrap_model(tiny.ply(tmp_path / "base.ply"), backend="reference")
     saved = base.adapt(2, recipe="instant").save(tmp_path / "a.ply")

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +14,7 @@ from running import wait_until
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.evaluation.cells import Cells
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.torch_file import load_torch
 
 
@@ -101,6 +103,18 @@ def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
         assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
         psnrs.append(json.loads((folder / "rows.json").read_text())["rows"][0]["psnr_db"])
     assert psnrs[0] != psnrs[1]
+
+
+def test_rows_of_another_truth_are_measured_again(folder, monkeypatch):
+    """As of an older version, whose protocol made another of the same photographs."""
+    monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
+    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--protocol", "P1", "--backend", "reference"]
+    rows = []
+    for truncate in (False, True, True):
+        monkeypatch.setitem(PROTOCOLS, "P1", replace(PROTOCOLS["P1"], truncate=truncate))
+        assert main([*words, "--output", str(folder / "rows.json"), "--overwrite"]) == 0
+        rows.append(json.loads((folder / "rows.json").read_text())["rows"][0])
+    assert rows[0]["psnr_db"] != rows[1]["psnr_db"] and rows[1] == rows[2]  # the last is not measured again
 
 
 def test_the_scene_is_not_replaced_by_the_rows(folder, capsys):

@@ -199,6 +199,12 @@ def test_a_zoom_out_leaves_anchors_out_and_the_report_says_how_many(folder, monk
     assert "what the anchors share has changed too: color_mlp, cov_mlp, opacity_mlp" in adapted.report.notes
 
 
+@pytest.mark.parametrize("steps", [0, 2])
+def test_the_curve_counts_splats_and_no_anchors(folder, steps):
+    report = wrap_model(load_model(folder), cameras=VIEWS, backend="reference").adapt(1 / 4, views="given", steps=steps, returns="last").report
+    assert report.curve[-1].gaussians == report.gaussians_after > len(load_model(folder).parameters()["means"])
+
+
 def test_no_number_of_splats_can_be_asked_of_anchors(folder):
     with pytest.raises(SettingsError, match="leave most_splats"):
         wrap_model(load_model(folder), cameras=VIEWS).adapt(1 / 4, most_splats=10)

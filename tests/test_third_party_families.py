@@ -13,20 +13,23 @@ import torch
 from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
-from mipmap_plugin.formats.atomic import refuse_output
 from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, detect
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family
-from mipmap_plugin.models.vanilla import Origin, VanillaModel, load_vanilla
+from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.scenes import write_cameras
 
-EXAMPLE = runpy.run_path(str(Path(__file__).parents[1] / "examples/register_family.py"))
+EXAMPLE, FILES = (runpy.run_path(str(Path(__file__).parents[1] / "examples" / name)) for name in ("register_family.py", "register_family_files.py"))
 
 
 def archive(path):
     np.savez(path, **{name: tensor.numpy() for name, tensor in tiny.model(40).parameters().items()})
     return path
+
+
+def factors(path):
+    return FILES["CholeskyModel"].from_gaussians(tiny.gaussians(40, degree=0)).save(path, provenance={})
 
 
 def custom_family(**changes):
@@ -50,43 +53,36 @@ class TestOfTheExample(ModelSuite):
         return archive(tmp_path / "scene.npz")
 
 
-class Archived(VanillaModel):
-    """Splats that are saved as the archives that they are read from."""
-
-    def save(self, path, *, provenance, overwrite=False):
-        self.refuse_output(path, overwrite=overwrite)
-        np.savez(path, **{name: tensor.detach().numpy() for name, tensor in self.parameters().items()})
-        return path
-
-    def refuse_output(self, path, *, overwrite, networks_move=False):
-        refuse_output(path, overwrite, [self.source], is_file=True)
-
-
-def load_archived(path, *, iteration=None):
-    model = EXAMPLE["load"](path)
-    return Archived(model.parameters(), model.trained, Origin(source=path))
-
-
 class TestOfAFamilyWithFilesOfItsOwn(ModelSuite):
-    family = "npz"
+    family = "cholesky"
     cameras = tuple(tiny.cameras())
     saved_as = "saved.npz"
 
     @pytest.fixture
     def checkpoint(self, tmp_path):
-        register_model("npz", replace(EXAMPLE["FAMILY"], load=load_archived, saves=None))
-        return archive(tmp_path / "scene.npz")
+        register_model("cholesky", FILES["FAMILY"])
+        return factors(tmp_path / "scene.npz")
 
 
-@pytest.mark.parametrize(("changes", "name"), [(dict(load=load_archived, saves=None), "scene_x0.25.npz"), ({}, "scene_x0.25.ply")])
-def test_an_adapted_file_keeps_the_suffix_by_which_its_family_knows_it(tmp_path, capsys, changes, name):
-    register_model("npz", replace(EXAMPLE["FAMILY"], **changes))
-    checkpoint = archive(tmp_path / "scene.npz")
+@pytest.mark.parametrize(("family", "write", "name"), [(FILES, factors, "scene_x0.25.npz"), (EXAMPLE, archive, "scene_x0.25.ply")])
+def test_an_adapted_file_keeps_the_suffix_by_which_its_family_knows_it(tmp_path, capsys, family, write, name):
+    register_model(family["FAMILY"].name, family["FAMILY"])
+    checkpoint = write(tmp_path / "scene.npz")
     write_cameras(tmp_path / "cameras.json", tiny.cameras())
     words = ["--cameras", tmp_path / "cameras.json", "--recipe", "instant", "--backend", "reference"]
     assert main(["adapt", str(checkpoint), "--scale", "1/4", *map(str, words)]) == 0, capsys.readouterr().err
     assert {file.name for file in tmp_path.iterdir()} == {"scene.npz", "cameras.json", name, f"{name}.adaptation.json"}
     assert len(load_model(tmp_path / name).parameters()["means"])
+
+
+def test_a_numpy_archive_that_nobody_claims_is_told_to_be_one(tmp_path):
+    with pytest.raises(CheckpointError, match=r"scene\.npz is a NumPy archive that no family knows; .* or register its family$"):
+        detect(archive(tmp_path / "scene.npz"))
+
+
+def test_a_file_for_a_viewer_is_a_ply(tmp_path):
+    register_model("cholesky", FILES["FAMILY"])
+    assert adapted_name(factors(tmp_path / "scene.npz"), 0.25, "spark") == "scene_x0.25_spark.ply"
 
 
 @pytest.mark.parametrize("ending", [".pt", ".npz"])

@@ -29,8 +29,10 @@ from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.health import ACTIVATED
+from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
@@ -523,8 +525,9 @@ def test_a_file_for_a_filter_that_the_tag_does_not_tell_whole_is_read_back_with_
     base = tiny.folder(job.target.with_name("base"), trained=TrainedScale("mip", 0.1))
     again = replace(job.base, checkpoint=next(base.rglob("point_cloud.ply")), cameras=base / "cameras.json")
     for asked in (replace(job, viewer="mip"), replace(job, base=again, target=job.target.with_name("again.ply"))):
-        trained = load_vanilla(adapt_in_tiles(replace(asked, settings=job.settings | {"steps": 0}), 2).file).trained
-        assert (trained.screen_filter, trained.eps2d) == ("mip", 0.1)
+        made = load_model(adapt_in_tiles(replace(asked, settings=job.settings | {"steps": 0}), 2).file)
+        assert (made.trained.screen_filter, made.trained.eps2d) == ("mip", 0.1)
+        assert isinstance(made, MipModel) == (asked.viewer == "mip")  # whose loader requires filter_3D
 
 
 def test_a_model_folder_is_written_as_one(job, tmp_path):
@@ -836,3 +839,10 @@ def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypa
 def test_commands_that_cannot_be(words, reason, capsys):
     assert main(["adapt", *words.split()]) == 2
     assert reason in capsys.readouterr().err
+
+
+def test_help_says_what_a_time_budget_is_of(capsys):
+    with pytest.raises(SystemExit):
+        main(["adapt", "--help"])
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Maximum number of seconds for each file; with --tiles for each tile instead" in said

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+import tiny
 import torch
 from ply_files import splat_columns, splat_names, write, write_model_folder, write_splats
 
@@ -21,6 +22,7 @@ from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.raw import MIN_SCALE
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.splatting.rotations import unit_quaternions
+from mipmap_plugin.wrap import wrap_model
 
 PROVENANCE = {"scale": 0.25, "settings": {"steps": 500}}
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
@@ -144,6 +146,22 @@ def test_a_model_with_hostile_cfg_args_loads_without_them(tmp_path):
 def test_header_tag_names_the_screen_filter(tmp_path, comments, screen_filter):
     model = load_vanilla(write_splats(tmp_path / "a.ply", comments=comments))
     assert model.trained.screen_filter == screen_filter
+
+
+@pytest.mark.parametrize(("name", "eps2d"), [("analytic", 0.0), ("window", 0.0), ("mip", 0.1), ("antialiased", 0.3), ("classic", 0.3)])
+@pytest.mark.parametrize("target", ["made.ply", "made"])
+def test_the_screen_filter_that_a_user_names_is_that_of_the_adapted_file(tmp_path, name, eps2d, target):
+    base = wrap_model(write_splats(tmp_path / "a.ply"), cameras=tiny.cameras(1), screen_filter=name, backend="reference")
+    base.adapt(1 / 2, recipe="instant").save(tmp_path / target)
+    again = load_vanilla(tmp_path / target)
+    assert (again.trained.screen_filter, again.trained.eps2d) == (name, eps2d)
+    assert any(f"the header says that the splats are to be drawn {name} ({eps2d:g} px²)" in note for note in again.notes)
+
+
+@pytest.mark.parametrize("record", ['{"screen_filter": [], "kernel_size": 0.1}', '{"screen_filter": "unheard", "kernel_size": 0}', "[]", "{"])
+def test_a_record_that_names_no_filter_is_passed_over(tmp_path, record):
+    model = load_vanilla(write_splats(tmp_path / "a.ply", comments=(f"mipmap_plugin {record}",)))
+    assert (model.trained.screen_filter, model.trained.eps2d) == ("classic", 0.3)
 
 
 def test_notes_describe_the_exposure(tmp_path):

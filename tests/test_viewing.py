@@ -20,9 +20,10 @@ import torch
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.cli import main
-from mipmap_plugin.commands.view import _free, has_display
+from mipmap_plugin.commands.view import _choices, _free, has_display
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.models.base import why_no_viewer
+from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.viewing import adapting
 from mipmap_plugin.viewing import page as live_page
 from mipmap_plugin.viewing.adapting import Adapter, Live, Progress, Wish
@@ -463,7 +464,14 @@ def test_without_viser_the_command_says_what_to_install(tmp_path, monkeypatch, c
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", str(tiny.ply(tmp_path / "base.ply")), "--backend", "reference", "--no-browser"]) == 2
     assert capsys.readouterr().err.strip() == f"mipmap-plugin: {NO_VISER}"
-    assert "pip install 'mipmap-plugin[view]'" in NO_VISER
+    assert "pip install 'mipmap-plugin[view]'" in NO_VISER and "pip install '.[view]'" in NO_VISER
+
+
+def test_a_viewer_is_listed_once_under_the_name_that_was_asked_for(base):
+    viewers, _ = _choices(base, "supersplat")
+    assert viewers[:2] == ["supersplat", None] and "playcanvas" not in viewers
+    assert {"classic", "spark", "aframe"} < {*viewers} and not {"inria", "kiri", "drei", "threejs"} & {*viewers}
+    assert find_viewer("drei") is find_viewer("aframe")  # whose shader it has
 
 
 @pytest.mark.parametrize(("options", "message"), [

@@ -24,6 +24,7 @@ from mipmap_plugin.limits import check_image
 from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of
 from mipmap_plugin.models.exposure import exposed
+from mipmap_plugin.models.mip import for_loader_of
 from mipmap_plugin.models.outputs import drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
@@ -85,7 +86,8 @@ class Adapted:
         """Write the checkpoint, and the report beside it as `<file>.adaptation.json`; return the checkpoint's path. Raises OutputExists."""
         refuse_output(Path(path), overwrite, parts_of(self.model.source, self.model.folder))  # whatever the family itself looks at
         with together(Path(path)), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
-            saved = contract.save(self.model, Path(path), self.report.provenance(), overwrite=overwrite)
+            model = for_loader_of(self.report.viewer, self.model, Path(path))
+            saved = contract.save(model, Path(path), self.report.provenance(), overwrite=overwrite)
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
             state.remove()
@@ -95,7 +97,8 @@ class Adapted:
 
     def report_of(self, path: Path) -> Report:
         """The report of the file at `path`, which also says what its format has no place for, and who draws it otherwise."""
-        lost = filter(None, (without_place(path, getattr(self.model, "extras", ())), self._drawn_otherwise(path)))
+        left_out = without_place(path, getattr(self.model, "extras", ()), getattr(self.model, "sh_degree", 0))
+        lost = filter(None, (left_out, self._drawn_otherwise(path)))
         return self.report.model_copy(update={"notes": [*self.report.notes, *lost]})
 
     def _drawn_otherwise(self, path: Path) -> str:

@@ -74,7 +74,7 @@ class Stages:
         session.keeps_state = True
         converted = session.run(self.resume and conversion_state(self.resume), self.observe)
         half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if _stopped(converted.report) else {}))
-        request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME))
+        request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, told=True))
         with _kept_if_interrupted(converted.states):
             adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self._further(converted.report))
         settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if _stopped(converted.report) else {})

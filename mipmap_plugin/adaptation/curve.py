@@ -27,7 +27,7 @@ class CurvePoint(BaseModel):
 
     step: int
     seconds: float
-    psnr_db: float | None
+    psnr_db: float | None = None
     validation_db: float
     gaussians: int
     taken_back: bool = False

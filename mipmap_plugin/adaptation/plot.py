@@ -6,7 +6,7 @@ import io
 from typing import Any
 
 from mipmap_plugin.adaptation.report import Report
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, install
 
 
 def plot(report: Report) -> Any:
@@ -14,7 +14,7 @@ def plot(report: Report) -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise SettingsError("plots need matplotlib: pip install 'mipmap-plugin[plot]'") from error
+        raise SettingsError(f"plots need matplotlib; {install('plot')}") from error
 
     class Shown(Figure):  # type: ignore[misc, unused-ignore]  # without matplotlib it has no types
         """A figure that a notebook shows without pyplot."""

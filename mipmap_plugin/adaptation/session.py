@@ -43,7 +43,7 @@ from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
-from mipmap_plugin.models.base import SplatModel, digest_of_parameters, effects_of
+from mipmap_plugin.models.base import SplatModel, count_of, digest_of_parameters, effects_of
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.progress import announced
 
@@ -65,7 +65,7 @@ class AdaptationRequest:
     viewer: str | None  # the viewer (or group of viewers) that the file is made for; None: what draws as the training did
     backend_note: str  # which backend was chosen, and why
     has_gradients: bool  # whether the backend has gradients for this request
-    base_in_viewer: SplatModel  # what the viewer reads of the base's own file: the base itself, where the viewer reads all of it
+    base_in_viewer: SplatModel  # what the viewer reads of the base's own file: mostly the base itself
     finer: FinerLevel | None = None  # what the run starts from instead of the base
     inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
 
@@ -134,7 +134,7 @@ class Session:
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
         initial, start = search.best()
-        self.notes = search.notes
+        self.notes = () if self.finer and self.finer.told else search.notes
         states = {AS_IT_IS: self._for_target(self._base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked_steps, self.config.model_copy(update={"steps": 0}))
@@ -167,10 +167,10 @@ class Session:
         elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:
             best = last  # a network adds detail that the base's own image does not have, so that its gain cannot be measured
         note = "" if best == last else f": {psnrs[best]:.2f} dB on validation views, {last} {psnrs[last]:.2f} dB"
-        curve = curve or [CurvePoint(step=0, seconds=self.seconds["total"], psnr_db=None, validation_db=psnrs[last], gaussians=_rows(states[last]))]
+        at_end = CurvePoint(step=0, seconds=self.seconds["total"], validation_db=psnrs[last], gaussians=count_of(states[last], self.views[0]))
         if not self.validation.choosing:
             note, psnrs = f", not validated: at this scale one pixel of the base is more than {WINDOW} px wide", {}
-        report = self._report(states[best], curve, ended_by, f"{best}{note}", psnrs)
+        report = self._report(states[best], curve or [at_end], ended_by, f"{best}{note}", psnrs)
         used_views = [*self.views, *self.validation.steering, *self.validation.choosing]
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
         return Adapted(model, report, self.backend, self.effects, self.targets, [self.state] if self.state else [], used_views)

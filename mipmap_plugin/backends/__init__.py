@@ -94,9 +94,12 @@ def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
 def _lacking(name: str, backend: Backend, needs: Sequence[Needs]) -> list[str]:
     """The reasons why a backend cannot serve all of `needs`. Raises PluginError."""
     try:
-        return list(dict.fromkeys(str(reason) for need in needs for reason in backend.lacking(need)))
-    except Exception as error:  # as in `get_backend`
+        answers: list[Any] = [backend.lacking(need) for need in needs]
+    except (Exception, SystemExit) as error:  # as in `get_backend`
         raise PluginError(f"backend {name!r} cannot say what it lacks: {type(error).__name__}: {error}") from error
+    if wrong := [answer for answer in answers if not isinstance(answer, (list, tuple))]:
+        raise PluginError(f"backend {name!r}: lacking() has to return a list of sentences; it returned a {type(wrong[0]).__name__}")
+    return list(dict.fromkeys(str(reason) for answer in answers for reason in answer))
 
 
 def note_of(name: str) -> str:

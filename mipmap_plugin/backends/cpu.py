@@ -14,12 +14,12 @@ from torch.autograd.function import once_differentiable
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import INTEGRATED, Effects, RenderSettings
-from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.errors import BackendUnavailable, install
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.buckets import ranks_for
 from mipmap_plugin.splatting.packing import packed
 
-NO_NUMBA = "it needs numba: pip install 'mipmap-plugin[cpu]'"
+NO_NUMBA = f"it needs numba; {install('cpu')}"
 
 # The position of the coefficients among the arguments of `_Draw.forward`.
 SH = 5

@@ -44,7 +44,7 @@ def normals(backend: Backend, gaussians: Gaussians, camera: Camera, effects: Eff
 
 
 def facing(gaussians: Gaussians, camera: Camera) -> Tensor:
-    """Each splat's shortest axis, oriented towards the camera: [N, 3] unit, world axes. Arbitrary where the shortest axis is not unique."""
+    """Each splat's shortest axis, oriented toward the camera: [N, 3] unit, world axes. Arbitrary where the shortest axis is not unique."""
     if gaussians.covariances is None:
         shortest = gaussians.scales.abs().argmin(1)
         axes = rotations(gaussians.quats).mT[torch.arange(len(shortest), device=shortest.device), shortest]

@@ -30,9 +30,10 @@ from mipmap_plugin.backends.external import NO_CUDA, UNTESTED, CachedCheck, fini
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import install
 from mipmap_plugin.gaussians import Gaussians
 
-NO_GSPLAT = "it needs gsplat: pip install 'mipmap-plugin[gsplat]'"
+NO_GSPLAT = f"it needs gsplat; {install('gsplat')}"
 NOT_COMPILED = "gsplat's CUDA part is not compiled and there is no nvcc to compile it with; install its wheel for your torch and CUDA"
 
 

@@ -44,7 +44,8 @@ class Guarded:
     def _checked(self, rendered: Any, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         image, wanted = getattr(rendered, "image", None), (*camera.size, 3)
         if not isinstance(rendered, Rendered) or not isinstance(image, Tensor) or tuple(image.shape) != wanted:
-            got = f"an image {list(image.shape)}" if isinstance(image, Tensor) else f"a {type(rendered).__name__}"
+            thing = image if isinstance(rendered, Rendered) else rendered
+            got = f"an image {list(image.shape)}" if isinstance(image, Tensor) else f"a {type(thing).__name__}"
             raise PluginError(f"{self._title} has to return a Rendered with an image {list(wanted)}; it returned {got}")
         if image.dtype != gaussians.means.dtype:
             raise PluginError(f"{self._title} has to return images of the splats' type {gaussians.means.dtype}; it returned {image.dtype}")

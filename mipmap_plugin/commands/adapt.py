@@ -38,7 +38,7 @@ class Changes:
     steps: int | None = None
     """Maximum number of optimizer steps."""
     time_budget_s: float | None = None
-    """Maximum number of seconds."""
+    """Maximum number of seconds for each file; with --tiles for each tile instead, one after the other without --jobs."""
     target_db: float | None = None
     """Stop at this PSNR against the pseudo truth (not against photographs)."""
     resize: ResizeFilter | None = None

@@ -109,7 +109,7 @@ class _Results:
         made_from = {"base": wrapped.model.digest, "asked": wrapped.asked, "trained": str(wrapped.trained), "scene": scene.digest()}
         cells = Cells(self._kept, asked | made_from | {"backend": wrapped.backend()[0].name, "threads": wrapped.threads})
         judge = evaluation.evaluator_of(wrapped, scene, self._protocol, self._perceptual, cells=cells)
-        gallery = evaluation_gallery(wrapped, self._protocol, len(judge.views)) if self._page else None
+        gallery = evaluation_gallery(wrapped, self._protocol, len(judge.views), recipes) if self._page else None
         judge = replace(judge, watcher=gallery)
         self._rows += evaluation.all_rows(wrapped, judge, self._scales, recipes, **settings)
         self._notes |= dict.fromkeys([*judge.notes, *evaluation.notes(wrapped, self._scales, appearance)])

@@ -13,7 +13,7 @@ from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.pages import LEVELS_PAGE, look_at, write_levels_page
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import MipmapPluginError, OutputError, SettingsError
-from mipmap_plugin.formats.splat_transform import refuse_exchange
+from mipmap_plugin.formats.splat_transform import LOD_META, refuse_exchange
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -43,10 +43,8 @@ class Exports:
         if self.canvas < 1:
             raise SettingsError(f"canvas: must be at least 1 px, got {self.canvas}")
         if self.streamed_sog or self.tiles:
-            from mipmap_plugin.levels.streamed import META
-
             refuse_exchange(output)  # where it is not installed
-            refuse_exchange(output / (META if self.streamed_sog else "tiles.spz"))  # where it is too old
+            refuse_exchange(output / (LOD_META if self.streamed_sog else "tiles.spz"))  # where it is too old
 
     def write(self, ladder: Path, contents: ZoomContents | DistanceContents) -> list[Path]:
         """Write them into the folder of a ladder; return the files that viewers open, and the page at last."""

@@ -12,7 +12,7 @@ from typing import Any
 from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import say
-from mipmap_plugin.errors import JobsFailed, SettingsError
+from mipmap_plugin.errors import JobsFailed, SettingsError, install
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, is_pattern, read_list, shard, without_outputs
@@ -167,7 +167,7 @@ def engine(many: Many, jobs: Sequence[Job], threads: int | None) -> Generator[Ou
     try:
         from mipmap_plugin.jobs.farm import on_dask
     except ModuleNotFoundError as error:
-        raise SettingsError(f"--dask needs dask.distributed ({error}); pip install 'mipmap-plugin[farm]'") from None
+        raise SettingsError(f"--dask needs dask.distributed ({error}); {install('farm')}") from None
     return on_dask(jobs, many.dask, threads, send_files=many.send_files)
 
 

@@ -37,11 +37,11 @@ def evaluation_page_path(checkpoint: Path, output: Path | None) -> Path:
     return next(path for path in free if not os.path.lexists(path))
 
 
-def evaluation_gallery(base: Wrapped, protocol: str, judged: int) -> Gallery:
+def evaluation_gallery(base: Wrapped, protocol: str, judged: int, recipes: Sequence[str]) -> Gallery:
     """What keeps the pictures of an evaluation by `judged` photographs."""
     from mipmap_plugin.pages.gallery import Gallery
 
-    return Gallery(base, f"photographs, protocol {protocol}, {judged} view{'s' if judged > 1 else ''}")
+    return Gallery(base, f"photographs, protocol {protocol}, {judged} view{'s' if judged > 1 else ''}", recipes)
 
 
 def write_evaluation_page(

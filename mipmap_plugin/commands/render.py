@@ -51,7 +51,8 @@ def render(
         view: Name of a view; may be given several times. By default all test views, or all if there are none.
         time: Moment of a moving scene, 0 to 1, in place of those of the views; given several times: each view at each moment.
         screen_filter: trained: the filter of the checkpoint's training; scaled: the training-free filter for this scale.
-        viewer: Render as this viewer does: classic, spark, playcanvas (or supersplat), gaussian-splats-3d, ... An unknown name lists all viewers.
+        viewer: Render as this viewer does: classic, spark, playcanvas (or supersplat), ... By default the one that the file was adapted for,
+            unless a screen filter is given. An unknown name lists all viewers.
         supersampling: N for N x N samples per pixel. The screen filter keeps its size: the exact picture of a zoom-out needs scaled, too.
         filter_3d: Smooth every splat to the finest detail that the cameras could resolve, as Mip-Splatting's 3D filter does.
         depth: Also write NAME_depth.npy, [height, width] float32: world units along the optical axis, 0 where there is nothing.
@@ -65,6 +66,8 @@ def render(
     wrapped = wrap(checkpoint, cameras, background, backend)
     zoom, views = _zoom(wrapped, scale), _at_times(wrapped, _named(wrapped, view), time)
     filter_name = None if screen_filter == "trained" else screen_filter
+    own_viewer = _own_viewer(wrapped) if viewer is None and filter_name is None else None
+    viewer = viewer or own_viewer
     if viewer is not None:
         wrapped.effects(zoom, filter_name, supersampling, viewer)  # check the options before any work
     outputs = [name for name, requested in {"depth": depth, "normals": normals}.items() if requested]
@@ -79,7 +82,8 @@ def render(
     for camera, picture in counted(zip(views, pictures, strict=True), len(views), "rendering", "view"):
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
     count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
-    say(f"{count} in {output}{f', at x{zoom:g}, which the file was adapted to' if scale is None and zoom != 1 else ''}")
+    taken = [f"at x{zoom:g}"] * (scale is None and zoom != 1) + [f"in {own_viewer}"] * (own_viewer is not None)
+    say(", ".join([f"{count} in {output}", *[" ".join(taken), "which the file was adapted to"] * bool(taken)]))
 
 
 def _at_times(wrapped: Wrapped, views: Sequence[Camera], times: Sequence[float]) -> list[Camera]:
@@ -98,6 +102,15 @@ def _zoom(wrapped: Wrapped, scale: float | None) -> float:
     from mipmap_plugin.models.adapted_scale import adapted_scale
 
     return scale or adapted_scale(wrapped.model.source) or 1.0
+
+
+def _own_viewer(wrapped: Wrapped) -> str | None:
+    """The viewer that the file was adapted for; None for a base, and for a file for several viewers, whose header names a filter."""
+    from mipmap_plugin.models.adapted_scale import adapted_viewer
+    from mipmap_plugin.splatting.viewers import viewers_for
+
+    viewer = adapted_viewer(wrapped.model.source)
+    return viewer if viewer and len(viewers_for(viewer)) == 1 else None
 
 
 def _refuse(wrapped: Wrapped, pictures: Sequence[Path], outputs: Sequence[str], overwrite: bool) -> None:

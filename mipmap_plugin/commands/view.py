@@ -98,10 +98,11 @@ def _choices(wrapped: Wrapped, viewer: str | None) -> tuple[list[str | None], li
     """The viewers and the recipes that the page offers, what is asked for first."""
     from mipmap_plugin.models.base import why_no_viewer
     from mipmap_plugin.recipes import RECIPES
-    from mipmap_plugin.splatting.viewers import single_viewers
+    from mipmap_plugin.splatting.viewers import own_name, single_viewers
 
     single = [] if why_no_viewer(wrapped.model) else single_viewers()
-    return list(dict.fromkeys((viewer, None, *single))), list(dict.fromkeys(("default", *RECIPES.names())))
+    others = [name for name in single if viewer is None or name != own_name(viewer)]
+    return list(dict.fromkeys((viewer, None, *others))), list(dict.fromkeys(("default", *RECIPES.names())))
 
 
 def _free(checkpoint: Path, output: Path | None) -> Callable[[float, str | None], Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -28,7 +29,9 @@ from mipmap_plugin.evaluation.measure import (
     warm_up,
 )  # fmt: skip
 from mipmap_plugin.evaluation.metrics import psnr, ssim
+from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.perceptual import Perceptual
+from mipmap_plugin.evaluation.photographs import digest_of_image
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, Protocol, TruthView, not_exposed, test_views
 from mipmap_plugin.evaluation.shots import Recorder, Shot, Watcher
 from mipmap_plugin.models.base import SplatModel, effects_of
@@ -74,8 +77,9 @@ class Evaluator:
     notes: Sequence[str] = ()  # of the scene
 
     def cell(self, key: dict[str, Any], measure: Callable[[Evaluator], Row]) -> Row:
-        """The row `key`: measured by an evaluator like this one, or kept from before an interruption."""
+        """The row `key`: measured by an evaluator like this one, or kept from before an interruption, if the truth was the same then."""
         recorder = Recorder(self.watcher)
+        key = {**key, "truth": digest_of_image(self.views[0].truth(key["scale"], self.protocol))}
         known = self.cells.find(key)
         if known is None:
             row = measure(replace(self, watcher=recorder))
@@ -206,6 +210,8 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     for name, scale in product(recipes, scales):
         make_config(name, scale, **{key: value for key, value in settings.items() if key in AdaptConfig.model_fields})
     refuse_undrawn(model, [view.camera for view in judge.views])
+    if doubt := of_another_scene(model, judge.views, scales[0], judge.protocol):
+        warnings.warn(doubt, stacklevel=2)
     for scale in scales:
         rows += training_free_rows(model, judge, scale, settings.get("upsampler", "bicubic"), viewer=viewer)
         rows += _adapted_rows(model, judge, scale, recipes, settings) if scale != 1 or viewer else []

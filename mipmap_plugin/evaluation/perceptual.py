@@ -10,14 +10,14 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
+from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, install
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.torchvision_absent import torchvision_optional
 
 # A backbone and its input: images in -1..1, as LPIPS is defined, or (01) in 0..1, as papers of this field use VGG.
 Kind = Literal["alex", "vgg", "vgg-01"]
 
-INSTALL = "install it with `pip install 'mipmap-plugin[metrics]'`"
+INSTALL = install("metrics")
 
 # torchvision's weights for ImageNet, at torchvision's own addresses.
 DOWNLOADS = {

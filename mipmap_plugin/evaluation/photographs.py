@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 
 import torch
@@ -30,6 +31,11 @@ class Photographs:
             return lambda: self._scene.image(camera, self._background)
         self._left -= kept.nbytes
         return lambda: unpacked(kept)
+
+
+def digest_of_image(image: Tensor) -> str:
+    """A hash of an image, hexadecimal."""
+    return hashlib.sha256(image.cpu().numpy().tobytes()).hexdigest()
 
 
 def packed(image: Tensor) -> Tensor:

@@ -81,6 +81,13 @@ def _made(path: Path) -> Iterator[Path]:
         yield temporary
 
 
+def staged(path: Path) -> Path:
+    """Where the file `path` is now: in the output that is being written, or in its place."""
+    staging = _open.get()
+    hidden = None if staging is None else staging.inside(absolute(path))
+    return path if hidden is None or not hidden.exists() else hidden
+
+
 @contextlib.contextmanager
 def _as_output_error(path: Path) -> Iterator[None]:
     try:

@@ -78,11 +78,11 @@ def pickle_of(path: Path) -> bytes:
     """The first bytes of a torch file's pickle, for searching only; empty if it has none. Raises CheckpointError."""
     if not zipfile.is_zipfile(path):
         return read_head(path, MAX_PICKLE)
-    with _archive(path) as archive:
-        pickles = [name for name in archive.namelist() if name.endswith("data.pkl")]
+    with archive(path) as opened:
+        pickles = [name for name in opened.namelist() if name.endswith("data.pkl")]
         if not pickles:
             return b""
-        with archive.open(pickles[0]) as file:
+        with opened.open(pickles[0]) as file:
             return file.read(MAX_PICKLE)
 
 
@@ -103,19 +103,19 @@ def _kind_of_json(head: bytes) -> str:
 
 
 @contextmanager
-def _archive(path: Path) -> Iterator[zipfile.ZipFile]:
+def archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """An open zip archive. Raises CheckpointError for any error of a damaged archive, also inside the block."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            yield archive
+        with zipfile.ZipFile(path) as opened:
+            yield opened
     except Exception as error:  # bad offsets, names, versions, checksums and streams raise different exceptions
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise CheckpointError(f"{path} is a damaged zip archive ({reason}); download or copy it again") from error
 
 
 def _kind_of_zip(path: Path) -> str:
-    with _archive(path) as archive:
-        names = archive.namelist()
+    with archive(path) as opened:
+        names = opened.namelist()
     leaves = {name.rpartition("/")[2] for name in names}
     if "data.pkl" in leaves:
         compiled = any("/code/" in name for name in names) or "constants.pkl" in leaves

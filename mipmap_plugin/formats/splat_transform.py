@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -37,11 +38,20 @@ READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRI
 # `table_options`.
 OLDEST: dict[str, tuple[int, ...]] = {".sog": (3, 0), ".json": (3, 0), ".spz": (2, 1)}
 
+# A ladder of SOGs, which viewers stream, and the oldest version of splat-transform that reads it, also as older ones wrote it: its finest level.
+LOD_META, OLDEST_FOR_STREAMED = "lod-meta.json", (3, 2)
+
 # The last version of SPZ that Spark 2.2 reads, and the first that splat-transform can write; its own choice is 4.
 SPZ_VERSION = "3"
 
+# The highest SH degree that its versions from 3.0 on read and write, though SPZ itself has room for 4.
+MOST_BANDS = 3
+
 # Viewers that do not read it, by their source: for these a PLY has to be written.
-NO_SPZ = {"gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2"}
+NO_SPZ = {
+    "gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2, and splat-transform writes 3 at least",
+    **dict.fromkeys(("antimatter15", "aframe", "gsplat-js"), "antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no .spz"),
+}
 
 # From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them
 # in the frame in which they are stored.
@@ -72,18 +82,30 @@ def refuse_exchange(path: Path) -> list[str]:
         instead = "; or give a .ply" if is_written(path) else ""  # of a file; the name of a folder may have a dot
         raise SettingsError(f"{path}: this format is written by {TOOL}, which is not installed; run: {INSTALL}{instead}")
     oldest = OLDEST.get(path.suffix.lower(), ())
-    version = _version(tool) if oldest else ()
-    if version and version < oldest:
-        node, instead = (", which needs Node.js 22", " a .spz or") if oldest >= (3, 0) else ("", "")
-        newer = f"{TOOL} {_dotted(version)} is too old for it, and {_dotted(oldest)} or newer is needed{node}"
-        raise SettingsError(f"{path}: {newer}; run: {INSTALL}@latest; or give{instead} a .ply")
+    if reason := _too_old(tool, oldest):
+        instead = " a .spz or" if oldest >= (3, 0) else ""
+        raise SettingsError(f"{path}: {reason}; or give{instead} a .ply")
     return tool
 
 
-def refuse_unread(path: Path, viewer: str | None) -> None:
-    """Raise SettingsError for an output that the viewer it is made for does not read."""
-    if viewer in NO_SPZ and _is_spz(path):
-        raise SettingsError(f"{path}: {NO_SPZ[viewer]}, and {TOOL} writes {SPZ_VERSION} at least; give a .ply by --output")
+def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
+    """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read."""
+    without = [viewer for viewer in viewers if viewer in NO_SPZ]
+    if not without or not _is_spz(path):
+        return
+    advice = f"{path}: {'; '.join(dict.fromkeys(NO_SPZ[viewer] for viewer in without))}; give a .ply by --output"
+    if len(without) == len(viewers):
+        raise SettingsError(advice)
+    warnings.warn(f"{advice} if it is for these too", stacklevel=3)
+
+
+def _too_old(tool: Sequence[str], oldest: Sequence[int]) -> str:
+    """Why a newer version of splat-transform is needed than is installed; "" if none is, or it does not say what it is."""
+    version = _version(tool) if oldest else ()
+    if not version or version >= tuple(oldest):
+        return ""
+    node = ", which needs Node.js 22" if tuple(oldest) >= (3, 0) else ""
+    return f"{TOOL} {_dotted(version)} is too old for it, and {_dotted(oldest)} or newer is needed{node}; run: {INSTALL}@latest"
 
 
 def _version(tool: Sequence[str]) -> tuple[int, ...]:
@@ -118,6 +140,8 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
     tool = find_tool()
     if tool is None:
         raise CheckpointError(f"{path} is {name}, an exchange format, which {TOOL} reads, but {TOOL} is not installed; run: {INSTALL}")
+    if reason := _too_old(tool, OLDEST_FOR_STREAMED if path.name == LOD_META else ()):
+        raise CheckpointError(f"{path} is Streamed SOG: {reason}")
     if reason := _damage(path):
         raise CheckpointError(f"{path} is damaged ({reason}); download or export it again")
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:

@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+from mipmap_plugin.screen_filters import SCREEN_FILTERS
+
 PROVENANCE = "mipmap_plugin"
 
 # Brush and splat-transform write the first, Postshot the second.
@@ -14,6 +16,9 @@ _RENDER_MODE = re.compile(r"SplatRenderMode:\s*(\w+)", re.IGNORECASE)
 _ANTIALIASED = re.compile(r"antialiased\s+([01])\b", re.IGNORECASE)
 
 _MODES = {"default": "classic", "0": "classic", "mip": "antialiased", "1": "antialiased", "2dgs": "2dgs"}
+
+# The tag of each screen filter. Filters that integrate over the pixel have none, as no other project's files name them.
+_TAGS = {"classic": "default", "antialiased": "mip", "mip": "mip", "surfel": "2dgs"}
 
 
 def render_mode(comments: Iterable[str]) -> str | None:
@@ -28,10 +33,10 @@ def render_mode(comments: Iterable[str]) -> str | None:
 def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any], eps2d: float | None = None) -> list[str]:
     """Foreign comments, followed by the two lines of this package, which replace older ones. `eps2d`: dilation of the filter, px²."""
     foreign = [text for text in comments if not _tag(text) and not text.startswith(PROVENANCE + " {")]
-    mode = {"classic": "default", "antialiased": "mip", "mip": "mip", "surfel": "2dgs"}.get(screen_filter)  # others have no tag
-    tags = [f"SplatRenderMode: {mode}"] if mode else []
-    if screen_filter == "mip" and eps2d is not None:
-        provenance = {**provenance, "kernel_size": eps2d}  # which the tag does not tell
+    tag = _TAGS.get(screen_filter)
+    tags = [f"SplatRenderMode: {tag}"] if tag else []
+    if eps2d is not None and (screen_filter == "mip" or tag is None):
+        provenance = {**provenance, "screen_filter": screen_filter, "kernel_size": eps2d}  # which the tag does not tell
     return [*foreign, *tags, f"{PROVENANCE} {json.dumps(provenance, default=str)}"]
 
 
@@ -47,11 +52,17 @@ def provenance_of(comments: Iterable[str]) -> dict[str, Any] | None:
     return None
 
 
-def kernel_size(comments: Iterable[str]) -> float | None:
-    """The dilation (px²) that the provenance of a file with the tag of compensation records; None for one that has that of 3DGS, or no record."""
+def recorded_filter(comments: Iterable[str]) -> tuple[str, float] | None:
+    """Name and dilation (px²) of the screen filter that the provenance records where no tag tells both; None without a record.
+
+    A tag that another program wrote since counts for more: with that of 3DGS there is None.
+    """
     comments = list(comments)
-    size = (provenance_of(comments) or {}).get("kernel_size") if render_mode(comments) == "antialiased" else None
-    return float(size) if isinstance(size, (int, float)) and size >= 0 else None
+    record, mode = provenance_of(comments) or {}, render_mode(comments)
+    size, name = record.get("kernel_size"), record.get("screen_filter", "mip")  # older versions record no name
+    if not isinstance(name, str) or name not in SCREEN_FILTERS or mode != _MODES.get(_TAGS.get(name, "")):
+        return None
+    return (name, float(size)) if isinstance(size, (int, float)) and size >= 0 else None
 
 
 def _tag(comment: str) -> re.Match[str] | None:

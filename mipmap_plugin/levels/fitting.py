@@ -15,6 +15,7 @@ from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, digest_of_parameters
+from mipmap_plugin.models.mip import for_loader_of, wants_filter
 from mipmap_plugin.recipes import recipe, scale_of_fraction
 from mipmap_plugin.wrap import Wrapped
 
@@ -50,7 +51,7 @@ def read_size(text: str) -> int:
 
 
 def recorded(base: Wrapped, requests: Sequence[tuple[float, str | None]], settings: Mapping[str, Any]) -> dict[str, Any]:
-    """What the header of an adapted file will record, as far as it is known before the run; of several files, the longest.
+    """What the header of an adapted file will record, as far as it is known before the run; of several files, that of the largest.
 
     `requests`: scales and viewers, at least one. `settings`: those of `Wrapped.adapt`, with the recipe's name. Raises SettingsError for one that is
     unknown or out of range.
@@ -61,7 +62,7 @@ def recorded(base: Wrapped, requests: Sequence[tuple[float, str | None]], settin
         provenance({"scale": scale, "viewer": viewer, "base": digest, "inputs": base.asked}, recipe(name, scale, **further), versions())
         for scale, viewer in requests
     ]
-    return max(records, key=lambda record: len(json.dumps(record, default=str)))
+    return max(records, key=lambda record: (wants_filter(record["viewer"]), len(json.dumps(record, default=str))))
 
 
 def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any]) -> int:
@@ -73,7 +74,8 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
     count = len(model.parameters()["means"])
     ending = next((each for each in ENDINGS if name.lower().endswith(each)), "")
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
-        own = contract.save(model, Path(folder, f"all{ending}"), record)
+        every = Path(folder, f"all{ending}")
+        own = contract.save(for_loader_of(record.get("viewer"), model, every), every, record)
         besides, all_of_them = read_header(own).body if own.suffix == ".ply" else 0, own.stat().st_size
     if own.suffix == ".ply":
         fitting = (size - besides - UNKNOWN) * count // (all_of_them - besides)

@@ -20,11 +20,12 @@ import torch
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import new_folder, write_json
+from mipmap_plugin.formats.splat_transform import LOD_META
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
 from mipmap_plugin.levels.distance.chunks import shrunk
 from mipmap_plugin.levels.manifest import read_manifest
 
-STREAMED, META, SETTINGS = "streamed", "lod-meta.json", "playcanvas.json"
+STREAMED, SETTINGS = "streamed", "playcanvas.json"
 
 SINGLE_LEVEL = "this ladder has a single level, which needs no streaming; give a smaller --coarsest"
 
@@ -99,8 +100,8 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
     if not rising:
         raise SettingsError(SINGLE_LEVEL)
     with new_folder(folder / STREAMED, overwrite) as temporary:
-        made = temporary / META
+        made = temporary / LOD_META
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         write_streamed_sog([folder / level["file"] for level in manifest["levels"]], made, extent)
         write_json(temporary / SETTINGS, viewer_settings(manifest, read_chunks(made), canvas), overwrite=False)
-    return folder / STREAMED / META
+    return folder / STREAMED / LOD_META

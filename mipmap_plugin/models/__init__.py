@@ -10,6 +10,7 @@ from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError
 from mipmap_plugin.models.detect import Checkpoint, detect
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
+from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import load_target
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
     third-party loader cannot be imported, fails, or returns an object that is not a model.
     """
     checkpoint = detect(path, iteration=iteration)
-    from mipmap_plugin.models.base import lacking
+    from mipmap_plugin.models.contract import lacking
 
     family = find_family(checkpoint.family)
     if family.load is None:
@@ -59,12 +60,14 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
         model: SplatModel = load(path, iteration=iteration)
     except (MipmapPluginError, MemoryError):
         raise
-    except Exception as error:  # third-party code may fail in any way
+    except (Exception, SystemExit) as error:  # third-party code may fail in any way
         if family in BUILT_IN:
             raise
         raise PluginError(f"family {family.name!r} cannot load {checkpoint.path}: {type(error).__name__}: {error}") from error
     if missing := lacking(model):
         raise PluginError(f"family {family.name!r} loads {type(model).__name__}, which lacks {', '.join(missing)}; see mipmap_plugin.models.base")
+    if is_third_party(model) and model.family != family.name:
+        raise PluginError(f"family {family.name!r} loads {type(model).__name__}, whose `family` is {model.family!r}; set it to {family.name!r}")
     return model
 
 

@@ -13,15 +13,15 @@ from mipmap_plugin.models.families import BUILT_IN, find_family
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
     """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder.
 
-    Exchange formats that can only be read are written as a PLY, and files of third-party families as these say (`Family.saves`). Files that
-    other projects save with torch become a folder, as those of INRIA are.
+    Exchange formats that can only be read are written as a PLY, as is a PLY in a zip archive, and files of third-party families as these say
+    (`Family.saves`), but for a viewer as a PLY. Files that other projects save with torch become a folder, as those of INRIA are.
     """
     name = checkpoint.resolve().name
-    read, written = _endings(checkpoint, name)
+    read, written = _endings(checkpoint, name, for_viewer=viewer is not None)
     return f"{name[: len(name) - len(read)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
 
 
-def _endings(checkpoint: Path, name: str) -> tuple[str, str]:
+def _endings(checkpoint: Path, name: str, *, for_viewer: bool) -> tuple[str, str]:
     """The ending of a checkpoint's name, and that of the adapted file; "" for none."""
     if not checkpoint.is_file() and checkpoint.suffix != ".ply":
         return "", ""
@@ -32,5 +32,6 @@ def _endings(checkpoint: Path, name: str) -> tuple[str, str]:
     except MipmapPluginError:  # whoever loads it says so
         return "", ""
     if family in BUILT_IN:
-        return "", ""
-    return Path(name).suffix, Path(name).suffix if family.saves is None else family.saves
+        return (Path(name).suffix, ".ply") if family.name == "zipped" else ("", "")
+    own = Path(name).suffix if family.saves is None else family.saves
+    return Path(name).suffix, ".ply" if for_viewer else own

@@ -1,8 +1,9 @@
-"""The scale that a checkpoint was adapted to, by what this package wrote into its header or beside it."""
+"""The scale and the viewer that a checkpoint was adapted to, by what this package wrote into its header or beside it."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.json_file import read_json
@@ -14,14 +15,24 @@ from mipmap_plugin.models.places import REPORT
 
 def adapted_scale(source: Path | None) -> float | None:
     """The scale that the file `source` was adapted to; None if it is a base. Raises CheckpointError for a damaged report beside it."""
+    scale = _record(source).get("scale")
+    return float(scale) if isinstance(scale, (int, float)) else None
+
+
+def adapted_viewer(source: Path | None) -> str | None:
+    """The viewer that the file `source` was adapted for; None if for none by name. Raises CheckpointError for a damaged report beside it."""
+    viewer = _record(source).get("viewer")
+    return viewer if isinstance(viewer, str) else None
+
+
+def _record(source: Path | None) -> dict[str, Any]:
     if source is None or not source.is_file():  # made in memory, gone since, or a folder of another family
-        return None
+        return {}
     report = source.with_name(source.name + REPORT)
     record = (provenance_of(read_header(source).comments) or {}) if kind_of(source) == "ply" else {}
     if "scale" not in record and report.is_file():
         record = read_json(report)
-    scale = record.get("scale") if isinstance(record, dict) else None
-    return float(scale) if isinstance(scale, (int, float)) else None
+    return record if isinstance(record, dict) else {}
 
 
 def refuse_adapted(source: Path | None) -> None:

@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effect
-from mipmap_plugin.errors import PluginError
+from mipmap_plugin.errors import PluginError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.hosts import Capture
@@ -93,7 +93,7 @@ class SplatModel(Protocol):
         trained: The screen filter and the sampling rate of the training.
         notes: Remarks for the user on how it was read, in sentences.
         source: The file that was read; None: created in memory.
-        folder: The model folder around it; None: there is none.
+        folder: The model folder around it, whose cameras.json and cfg_args are read; None: there is none.
         digest: sha256 of the file, hexadecimal; "" for a model created in memory, such as a copy.
     """
 
@@ -143,7 +143,10 @@ class SplatModel(Protocol):
         """Raise what `save` would raise for `path`, as far as it can be known before the work begins."""
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
-        """Write the model in the format that it was read from, atomically; return the file written. Raises OutputExists."""
+        """Write the model in the format that it was read from, atomically; return the file written. Raises OutputExists.
+
+        Where `path` ends in .ply and a viewer can draw the splats, write a PLY of 3DGS.
+        """
 
 
 class Rebuilt(SplatModel, Protocol):
@@ -180,31 +183,6 @@ class Filtered(SplatModel, Protocol):
         """The splats without their 3D filter, as a viewer shows the family's own file."""
 
 
-def lacking(model: Any) -> list[str]:
-    """What an object lacks to be a SplatModel: members, or the right names of its parameters; [] if nothing."""
-    required = [*_members(SplatModel)]
-    if isinstance(traits := getattr(model, "traits", None), Traits):
-        required += ["rebuild"] * traits.same_for_all_views + ["as_trained"] * traits.placed
-        required += ["thin"] * traits.thins + ["fused", "bare"] * traits.filtered
-    missing = [name for name in required if not hasattr(model, name)]
-    if "traits" not in missing and not isinstance(traits, Traits):
-        missing.append("traits of the type Traits")
-    return missing or _wrong_parameters(model.parameters())
-
-
-def _wrong_parameters(parameters: Any) -> list[str]:
-    """What `lacking` says of parameters whose names are not those of PARAMETERS."""
-    if not isinstance(parameters, dict):
-        return ["parameters() that returns a dictionary"]
-    unknown = [name for name in parameters if name not in PARAMETERS]
-    return ["the parameter 'means'"] * ("means" not in parameters) + [f"a name of PARAMETERS for {name!r}" for name in unknown]
-
-
-def _members(protocol: type) -> list[str]:
-    """The attributes and methods of a protocol."""
-    return [*protocol.__annotations__, *(name for name in vars(protocol) if not name.startswith("_"))]
-
-
 def why_no_viewer(model: SplatModel) -> str:
     """Why no viewer (`viewers`) can draw the model, a sentence without a full stop; empty if a file can be written for one."""
     traits = model.traits
@@ -217,9 +195,12 @@ def why_no_viewer(model: SplatModel) -> str:
 
 def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
     """The splats that a camera sees. Raises PluginError if a third-party family returns something else, or splats that no image can show."""
-    gaussians: Any = model.gaussians(camera)
     if not is_third_party(model):
-        return cast(Gaussians, gaussians)
+        return model.gaussians(camera)
+    try:
+        gaussians: Any = model.gaussians(camera)
+    except ShapeError as error:  # of the record that it makes
+        raise PluginError(f"family {model.family!r}: gaussians() returned splats that do not fit together: {error}") from error
     if not isinstance(gaussians, Gaussians):
         raise PluginError(f"family {model.family!r}: gaussians() has to return Gaussians; it returned a {type(gaussians).__name__}")
     tensors = {name: tensor for name, tensor in vars(gaussians).items() if isinstance(tensor, Tensor)}
@@ -230,6 +211,12 @@ def checked_splats(model: SplatModel, camera: Camera) -> Gaussians:
         outside = f"opacities from {float(least):.3g} to {float(most):.3g}"
         raise PluginError(f"family {model.family!r}: gaussians() returned {outside}, which have to lie in 0..1; activate or clamp them")
     return gaussians
+
+
+@torch.no_grad()
+def count_of(model: SplatModel, view: Camera) -> int:
+    """The number of splats that a camera sees. They are made for it only where the rows of the parameters are something else."""
+    return len(model.parameters()["means"]) if model.traits.rows == SPLATS else len(model.gaussians(view))
 
 
 def digest_of_parameters(model: SplatModel) -> str:

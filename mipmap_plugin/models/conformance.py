@@ -14,9 +14,10 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
-from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models import contract, detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
-from mipmap_plugin.models.base import PARAMETERS, Filtered, Rebuilt, SplatModel, lacking
+from mipmap_plugin.models.base import Filtered, Rebuilt, SplatModel, Thinned, why_no_viewer
+from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes.trajectories import orbit
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
@@ -52,10 +53,7 @@ class ModelSuite:
         assert detect(checkpoint).family == self.family
 
     def test_offers_what_a_model_offers(self, base: Wrapped) -> None:
-        assert lacking(base.model) == []
-        named = base.model.parameters()
-        assert "means" in named and set(named) <= set(PARAMETERS)
-        assert {len(tensor) for tensor in named.values()} == {len(named["means"])}
+        assert contract.lacking(base.model) == []
 
     def test_shows_something_finite(self, base: Wrapped) -> None:
         with torch.no_grad():
@@ -78,20 +76,38 @@ class ModelSuite:
         half = {name: tensor.detach()[: max(1, len(tensor) // 2)].clone().requires_grad_() for name, tensor in copied.parameters().items()}
         copied.replace_parameters(half)
         assert all(copied.parameters()[name] is tensor for name, tensor in half.items())
-        assert copied.row_opacities(base.cameras).shape == (len(half["means"]),)
+        assert contract.row_opacities(copied, base.cameras).shape == (len(half["means"]),)
+        assert copied.gaussians(base.cameras[0]).means.isfinite().all()
+
+    def test_rows_can_be_left_out(self, base: Wrapped) -> None:
+        copied, count = base.model.copy(), len(base.model.parameters()["means"])
+        if not copied.traits.thins:
+            return
+        cast(Thinned, copied).thin(torch.arange(count) < count // 2)
+        assert len(copied.parameters()["means"]) < count == len(base.model.parameters()["means"])
         assert copied.gaussians(base.cameras[0]).means.isfinite().all()
 
     def test_keeps_what_its_traits_promise(self, base: Wrapped) -> None:
-        view, traits = base.cameras[0], base.model.traits
-        image = base.render(view).image
+        traits = base.model.traits
         models = [cast(Filtered, base.model).fused()] if traits.filtered else []
+        models += [VanillaModel(base.model.parameters(), base.model.trained)] if traits.plain else []
         if traits.same_for_all_views:
             copied = cast(Rebuilt, base.model.copy())
             copied.rebuild(lambda gaussians: gaussians[torch.arange(len(gaussians))])
             models.append(copied)
         for model in models:
-            same = Wrapped(model, base.cameras, "reference", base.trained).render(view).image
-            assert (image - same).abs().max() <= SAME
+            _assert_looks_alike(base, base.model, model)
+
+    def test_shapes_that_stay_keep_the_picture(self, base: Wrapped) -> None:
+        copied = base.model.copy()
+        copied.reshape(lambda gaussians: (gaussians.scales, gaussians.opacities), base.cameras)
+        _assert_looks_alike(base, base.model, copied)
+
+    def test_writes_a_ply_for_viewers(self, base: Wrapped, tmp_path: Path) -> None:
+        if why_no_viewer(base.model):
+            return
+        copied = cast(Filtered, base.model).bare() if base.model.traits.filtered else base.model.copy()
+        _assert_looks_alike(base, copied, load_model(contract.save(copied, tmp_path / "viewer.ply", {})))
 
     def test_the_base_is_never_an_output(self, base: Wrapped) -> None:
         for path in filter(None, {base.model.source, base.model.folder}):
@@ -144,6 +160,11 @@ def _tensors(model: SplatModel) -> dict[str, Tensor]:
 def _assert_same(before: dict[str, Tensor], model: SplatModel) -> None:
     after = _tensors(model)
     assert before.keys() == after.keys() and all(torch.equal(tensor, after[name]) for name, tensor in before.items()), "the base has changed"
+
+
+def _assert_looks_alike(base: Wrapped, *models: SplatModel) -> None:
+    first, second = (Wrapped(model, base.cameras, "reference", base.trained).render(base.cameras[0]).image for model in models)
+    assert (first - second).abs().max() <= SAME
 
 
 def _digests(path: Path) -> dict[Path, str]:

@@ -2,16 +2,88 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from inspect import isfunction, signature
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, cast
 
+import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import PluginError
-from mipmap_plugin.models.base import CARRIED, SplatModel, checked_splats
-from mipmap_plugin.plugin_errors import is_third_party, naming
+from mipmap_plugin.formats.atomic import staged
+from mipmap_plugin.formats.magic import kind_of
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.models.base import (
+    CARRIED,
+    PARAMETERS,
+    Filtered,
+    Placed,
+    Rebuilt,
+    SplatModel,
+    Thinned,
+    TrainedScale,
+    Traits,
+    checked_splats,
+)
+from mipmap_plugin.plugin_errors import is_third_party, naming, naming_any
+
+# What a model with a trait provides beside what every model does.
+PROMISED = {"same_for_all_views": Rebuilt, "placed": Placed, "thins": Thinned, "filtered": Filtered}
+
+# The types of a model's attributes.
+TYPES: dict[str, tuple[type, ...]] = {
+    "traits": (Traits,), "family": (str,), "trained": (TrainedScale,), "notes": (list,), "source": (Path, NoneType), "folder": (Path, NoneType),
+    "digest": (str,),
+}  # fmt: skip
+
+# Types of files by the endings that third-party families may write beside their own.
+ENDINGS = {".ply": "ply", ".spz": "spz", ".sog": "sog"}
+
+
+def lacking(model: Any) -> list[str]:
+    """What an object lacks to be a SplatModel: members, types, arguments, or the right parameters; [] if nothing. Raises PluginError if it fails."""
+    traits = getattr(model, "traits", None)
+    protocols = [SplatModel, *(protocol for trait, protocol in PROMISED.items() if getattr(traits, trait, False))]
+    methods = {name: method for protocol in protocols for name, method in vars(protocol).items() if isfunction(method) and name[0] != "_"}
+    if missing := [name for name in (*TYPES, *methods) if not hasattr(model, name)]:
+        return missing
+    types = [f"{name} of the type {_names(kinds)}" for name, kinds in TYPES.items() if not isinstance(getattr(model, name), kinds)]
+    calls = [call for name, method in methods.items() if (call := _refused_call(name, method, getattr(model, name)))]
+    return types or calls or _wrong_parameters(model)
+
+
+def _names(kinds: tuple[type, ...]) -> str:
+    return " or ".join("None" if kind is NoneType else kind.__name__ for kind in kinds)
+
+
+def _refused_call(name: str, promised: Callable[..., Any], own: Any) -> str:
+    """The call of a method, such as "reshape(form, views)", if `own` does not take what is `promised`; "" if it does."""
+    parameters = list(signature(promised).parameters.values())[1:]
+    by_place = [each.name for each in parameters if each.kind is not each.KEYWORD_ONLY]
+    by_name = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY]
+    try:
+        signature(own).bind(*by_place, **dict.fromkeys(by_name))
+    except TypeError:
+        return f"{name}({', '.join([*by_place, *['*'] * bool(by_name), *by_name])})"
+    return ""
+
+
+def _wrong_parameters(model: SplatModel) -> list[str]:
+    """What `lacking` says of parameters: their names, and that each has one row for each splat or anchor."""
+    with naming_any({f"family {model.family!r}": model}):
+        parameters: Any = model.parameters()
+    if not isinstance(parameters, dict):
+        return ["parameters() that returns a dictionary"]
+    wrong = ["the parameter 'means'"] * ("means" not in parameters)
+    wrong += [f"a name of PARAMETERS for {name!r}" for name in parameters if name not in PARAMETERS]
+    if others := [name for name, tensor in parameters.items() if not isinstance(tensor, Tensor)]:
+        wrong.append(f"tensors as the parameters {', '.join(map(str, others))}")
+    if not wrong and len({len(tensor) for tensor in parameters.values()}) > 1:
+        wrong.append(f"parameters of one length: it has {', '.join(f'{len(tensor)} {name}' for name, tensor in parameters.items())}")
+    return wrong
 
 
 def refuse_broken(model: SplatModel, camera: Camera, *, steps: bool) -> None:
@@ -21,6 +93,8 @@ def refuse_broken(model: SplatModel, camera: Camera, *, steps: bool) -> None:
     family = f"family {model.family!r}"
     with naming(family):
         copied = model.copy()
+        if missing := lacking(copied):
+            raise PluginError(f"{family}: copy() returned a {type(copied).__name__}, which lacks {', '.join(missing)}")
         own, theirs = ({**each.parameters(), **each.shared_parameters()} for each in (model, copied))
     places = {tensor.untyped_storage().data_ptr() for tensor in own.values() if tensor.numel()}
     if shared := [name for name, tensor in theirs.items() if tensor.untyped_storage().data_ptr() in places]:
@@ -28,23 +102,49 @@ def refuse_broken(model: SplatModel, camera: Camera, *, steps: bool) -> None:
     fixed = [name for name, tensor in copied.parameters().items() if name != CARRIED and not (tensor.is_leaf and tensor.requires_grad)]
     if fixed:
         raise PluginError(f"{family}: copy() has to return parameters that are leaves and require gradients; {', '.join(fixed)} cannot be optimized")
-    if not steps:
-        return
-    with naming(family):
-        splats = checked_splats(copied, camera)
-    if len(splats) and not any(tensor.requires_grad for tensor in vars(splats).values() if isinstance(tensor, Tensor)):
+    if steps:
+        with naming(family):
+            _refuse_gradients(family, copied, camera)
+
+
+def _refuse_gradients(family: str, copied: SplatModel, camera: Camera) -> None:
+    """Raise PluginError if the splats of a copy have no gradients, or such that are not finite."""
+    splats = checked_splats(copied, camera)
+    tensors = [tensor for tensor in vars(splats).values() if isinstance(tensor, Tensor) and tensor.requires_grad]
+    if not tensors and len(splats):
         raise PluginError(f"{family}: gaussians() returned splats without gradients; make them of parameters() by torch's operations, not detached")
+    if tensors:
+        torch.stack([tensor.sum() for tensor in tensors]).sum().backward()
+    if wrong := [name for name, leaf in copied.parameters().items() if leaf.grad is not None and not leaf.grad.isfinite().all()]:
+        raise PluginError(f"{family}: gaussians() has gradients with NaN or infinity in {', '.join(wrong)}; a root or a norm of 0 has none, for one")
 
 
 def row_opacities(model: SplatModel, views: Sequence[Camera]) -> Tensor:
     """The model's `row_opacities`, [N]."""
     opacities: Any = model.row_opacities(views)
     rows = len(model.parameters()["means"])
-    if not isinstance(opacities, Tensor) or tuple(opacities.shape) != (rows,):
+    if not isinstance(opacities, Tensor) or tuple(opacities.shape) != (rows,) or not opacities.isfinite().all():
         got = f"a tensor {list(opacities.shape)}" if isinstance(opacities, Tensor) else f"a {type(opacities).__name__}"
-        wanted = f"{rows} numbers, one for each row of its parameters"
+        got += ", not all finite" if isinstance(opacities, Tensor) and not opacities.isfinite().all() else ""
+        wanted = f"{rows} finite numbers, one for each row of its parameters"
         raise PluginError(f"family {model.family!r}: row_opacities() has to return {wanted}; it returned {got}")
     return opacities
+
+
+def rebuild(model: SplatModel, form: Callable[[Gaussians], Gaussians]) -> None:
+    """Have the model rebuilt, and look whether it holds the splats of `form`."""
+    made: list[int] = []
+
+    def counted(gaussians: Gaussians) -> Gaussians:
+        formed = form(gaussians)
+        made.append(len(formed))
+        return formed
+
+    cast(Rebuilt, model).rebuild(counted)
+    rows = len(model.parameters()["means"])
+    if made != [rows]:
+        got = f"called it {len(made)} times" if len(made) != 1 else f"holds {rows} splats after it returned {made[0]}"
+        raise PluginError(f"family {model.family!r}: rebuild(form) has to hold the splats that `form` returns; it {got}")
 
 
 def save(model: SplatModel, path: Path, provenance: dict[str, Any], *, overwrite: bool = False) -> Path:
@@ -53,4 +153,16 @@ def save(model: SplatModel, path: Path, provenance: dict[str, Any], *, overwrite
     if not isinstance(saved, (str, Path)):
         wrong = f"save() has to return the path of the file that it wrote; it returned a {type(saved).__name__}"
         raise PluginError(f"family {model.family!r}: {wrong}, so that {path} is left without a report")
+    if is_third_party(model):
+        _refuse_unlike(f"family {model.family!r}", Path(saved))
     return Path(saved)
+
+
+def _refuse_unlike(family: str, saved: Path) -> None:
+    """Raise PluginError if no file was saved, or one that is not what its ending says."""
+    file, wanted = staged(saved), ENDINGS.get(saved.suffix.lower())
+    if not file.is_file():
+        raise PluginError(f"{family}: save() returned {saved}, where it wrote no file")
+    if wanted and (kind := kind_of(file)) != wanted:
+        mend = "write what the ending says, as VanillaModel.save does, or refuse it in refuse_output()"
+        raise PluginError(f"{family}: save() wrote a file of the type {kind} to {saved}, which other programs take for a {wanted}; {mend}")

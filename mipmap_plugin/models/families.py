@@ -8,6 +8,7 @@ from functools import partial
 from mipmap_plugin.errors import PluginError
 from mipmap_plugin.formats.splat_transform import EXCHANGE
 from mipmap_plugin.formats.tags import render_mode
+from mipmap_plugin.formats.zipped import only_ply
 from mipmap_plugin.models.anchors.companions import missing_networks
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
 from mipmap_plugin.models.places import GSPLAT, NETWORKS, SPLATFACTO, is_coarse, network_of
@@ -120,6 +121,11 @@ def exchange(files: Files) -> Match | None:
     return Match(CERTAIN, "its first bytes") if files.kind in EXCHANGE or files.compressed else None
 
 
+def zipped(files: Files) -> Match | None:
+    """Recognize a zip archive of one PLY."""
+    return Match(CERTAIN, "a zip archive of one PLY") if files.kind == "zip" and only_ply(files.path) else None
+
+
 def torch_file(*words: str, sure: float = CERTAIN, trouble: str = "") -> Recognize:
     """Recognize a torch file that contains one of these words."""
     return lambda files: Match(sure, f"holds {words[0]}", trouble.format(path=files.path)) if files.words(*words) else None
@@ -159,6 +165,7 @@ BUILT_IN = (
         "exchange", "exchange format (SPZ, SOG, KSPLAT, SPLAT, compressed PLY)", exchange,
         load=f"{LOADERS}.exchanged:load_exchanged", place=("", r"(lod-)?meta\.json"),
     ),
+    family("zipped", "PLY in a zip archive", zipped, load=f"{LOADERS}.zipped:load_zipped"),
     # Recognized in order to be refused with a clear message.
     family(
         "anygs", "Octree-AnyGS", anchors("anygs"), before=FLAT_OR_FILTERED,
@@ -227,6 +234,8 @@ def find_family(name: str) -> Family:
         raise PluginError(f"family {name!r} calls itself {record.name!r}; register it under its own name")
     if not isinstance(record.before, tuple):
         raise PluginError(f"family {name!r}: `before` must be a tuple of names, got {record.before!r}")
+    if record.saves is not None and not str(record.saves).startswith("."):
+        raise PluginError(f"family {name!r}: `saves` must be the ending of a file's name, such as .ply, got {record.saves!r}")
     if record.api_version != API_VERSION:
         raise PluginError(f"family {name!r} is written for API version {record.api_version}, but this package has API version {API_VERSION}")
     return record

@@ -10,7 +10,7 @@ from typing import Any, TypeGuard
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.atomic import new_folder
 from mipmap_plugin.formats.cfg_args import format_cfg_args, read_cfg_args_and_rest
-from mipmap_plugin.formats.tags import kernel_size, render_mode
+from mipmap_plugin.formats.tags import recorded_filter, render_mode
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 
@@ -43,12 +43,10 @@ def read_options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
 
 def trained_scale(options: dict[str, Any], comments: Sequence[str] = ()) -> TrainedScale:
     """How the checkpoint was trained, from its options and the screen filter that its header's comments name, if any."""
-    if (kernel := kernel_size(comments)) is not None:
-        options = {**options, "kernel_size": kernel}
     resolution, white = options.get("resolution"), options.get("white_background")
     if not _is_number(resolution):
         resolution = TrainedScale.resolution
-    screen_filter, eps2d = _screen_filter(options, render_mode(comments))
+    screen_filter, eps2d = recorded_filter(comments) or _screen_filter(options, render_mode(comments))
     return TrainedScale(
         screen_filter=screen_filter,
         eps2d=eps2d,

@@ -16,7 +16,8 @@ from mipmap_plugin.models import splatfacto
 from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.networks import Weights
 from mipmap_plugin.models.anchors.scaffold import scaffold_in_memory
-from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, lacking
+from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale
+from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.gsplat import model as gsplat
 from mipmap_plugin.models.health import without_invalid
 from mipmap_plugin.models.surfels import FLAT, SurfelModel, flat_trained

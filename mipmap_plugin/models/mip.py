@@ -12,19 +12,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import NEAR_PLANE, Effect
 from mipmap_plugin.errors import CheckpointError, ShapeError
+from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import CARRIED, TrainedScale, Traits
+from mipmap_plugin.models.base import CARRIED, SplatModel, TrainedScale, Traits
 from mipmap_plugin.models.columns import FILTER_3D as COLUMN
 from mipmap_plugin.models.detect import detect_as
 from mipmap_plugin.models.health import LARGEST, drop
 from mipmap_plugin.models.outputs import finite
 from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+from mipmap_plugin.splatting.viewers import find_viewer, viewers_for
 
 # Screen filter of each family, and its dilation in px² if no cfg_args gives the kernel_size.
 SCREEN_FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
@@ -169,6 +172,21 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
     splats.trained = _trained(checkpoint.family, splats.trained)
     splats.notes += NOTES[checkpoint.family]
     return MipModel(checkpoint.family, splats, filter_3d)
+
+
+def for_loader_of(viewer: str | None, model: SplatModel, path: Path) -> SplatModel:
+    """The model as the viewer that it is made for loads it from `path`.
+
+    Mip-Splatting's loader requires the column filter_3D. It is 0: the splats of a file for a viewer are smoothed as far as they have to be.
+    """
+    if not wants_filter(viewer) or is_written(path) or not isinstance(model, VanillaModel):
+        return model
+    return model.with_extras({**model.extras, COLUMN: np.zeros(len(model), dtype=np.float32)})
+
+
+def wants_filter(viewer: str | None) -> bool:
+    """Whether the viewer, or each of a group, reads the column filter_3D."""
+    return viewer is not None and all(find_viewer(name).filter_3d for name in viewers_for(viewer))
 
 
 def smooth_3d(scales: Tensor, opacities: Tensor, filter_3d: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import is_written, refuse_as_folder
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_written, refuse_as_folder
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.places import CONVERTED, REPORT, STATE
@@ -72,10 +72,14 @@ def refuse_own_filter(path: Path, trained: TrainedScale) -> None:
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
 
 
-def without_place(path: Path, extras: Iterable[str]) -> str:
-    """That the format of `path` has no place for the columns that 3DGS does not define, in a sentence; "" if it has, or if there are none."""
-    names = ", ".join(extras) if is_written(path) else ""
-    return f"the extra columns {names} are dropped, since {_ending(path)} has no place for them; a .ply has" if names else ""
+def without_place(path: Path, extras: Iterable[str], sh_degree: int = 0) -> str:
+    """What the file at `path` will not hold, in a sentence: columns that 3DGS does not define, high SH bands; "" if it holds everything."""
+    if not is_written(path):
+        return ""
+    names = ", ".join(extras)
+    lost = [f"the extra columns {names} are dropped, since {_ending(path)} has no place for them; a .ply has"] if names else []
+    lost += [f"SH bands above degree {MOST_BANDS} are dropped, which {TOOL} does not write; a .ply has them"] if sh_degree > MOST_BANDS else []
+    return "; ".join(lost)
 
 
 def drawn_otherwise(path: Path, trained: TrainedScale) -> str:

@@ -17,8 +17,8 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.ply import read_ply, write_ply
-from mipmap_plugin.formats.splat_transform import is_written, refuse_exchange, write_exchange
-from mipmap_plugin.formats.tags import render_mode, with_tags
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_written, refuse_exchange, write_exchange
+from mipmap_plugin.formats.tags import recorded_filter, render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
 from mipmap_plugin.models.columns import FILTER_3D, extra_columns, to_columns, to_parameters, whole_opacities
@@ -203,9 +203,10 @@ class VanillaModel:
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance, self.trained.eps2d)
         if is_written(path):
             refuse_own_filter(path, self.trained)
-            if lost := without_place(path, self._origin.extras):
+            if lost := without_place(path, self._origin.extras, self.sh_degree):
                 warnings.warn(lost, stacklevel=2)
-            return write_exchange(path, lambda ply: write_ply(ply, self._columns(parameters), comments), overwrite=overwrite)
+            exchanged = self._columns(parameters | {"shN": parameters["shN"][:, : (MOST_BANDS + 1) ** 2 - 1]})
+            return write_exchange(path, lambda ply: write_ply(ply, exchanged, comments), overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
         columns = {**self._columns(parameters), **self._origin.extras}
@@ -271,7 +272,8 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     ply = read_ply(path)
     parameters, extras = kind.parameters_of(ply.columns, path), extra_columns(ply.columns)
     options, notes = read_options(folder)
-    screen_filter, trained = render_mode(ply.comments), trained_scale(options, ply.comments)
+    trained = trained_scale(options, ply.comments)
+    screen_filter = trained.screen_filter if recorded_filter(ply.comments) else render_mode(ply.comments)
     origin = Origin(path, sha256(path), folder, checkpoint.iteration, ply.comments, extras, read_exposures(folder))
     model = kind(parameters, trained, origin, [*checkpoint.notes, *ply.notes, *notes])
     model.notes += [f"its opacities are whole numbers ({whole}), read as fractions of the largest"] if (whole := whole_opacities(ply.columns)) else []

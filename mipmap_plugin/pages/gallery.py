@@ -19,13 +19,16 @@ from mipmap_plugin.wrap import Wrapped
 # How rows of the base in a viewer begin (`measure.base_in_viewer`).
 IN_VIEWER = f"{BASE} in "
 
+# The recipe that a page tells of first.
+DEFAULT = "default"
+
 
 class Gallery:
     """The first view of each row of one scene, by scale, and what viewers show of one adapted file of each scale."""
 
-    def __init__(self, base: Wrapped, truth: str) -> None:
-        """`truth`: what the images are compared with, in a few words."""
-        self._base, self._truth = base, truth
+    def __init__(self, base: Wrapped, truth: str, recipes: Sequence[str] = ()) -> None:
+        """`truth`: what the images are compared with, in a few words. `recipes`: by which the base will be adapted, as far as that is known."""
+        self._base, self._truth, self._awaits_default = base, truth, DEFAULT in recipes
         self._shots: dict[float, list[Shot]] = {}
         self._adapted: set[tuple[str, float]] = set()
         self._viewers: dict[float, tuple[str, list[ViewerPictures]]] = {}  # with the row of the adapted file
@@ -37,15 +40,15 @@ class Gallery:
         self._shots.setdefault(shot.scale, []).append(shot)
 
     def adapted(self, row: str, adapted: Adapted) -> None:
-        """Keep an adaptation's report, and draw the first of each scale as viewers do, or the first of the default recipe."""
+        """Keep an adaptation's report, and draw the first of each scale as viewers do, or of the default recipe if it is to come."""
         scale = adapted.report.scale
         self._adapted.add((row, scale))
         if adapted is self._last:  # the same file in another viewer
             return
         self._last = adapted
         self.adaptations.append({"title": f"{zoom_name(scale)}, {row}", **adapted.report.model_dump()})
-        known, _ = self._viewers.get(scale, ("", ()))
-        if (not known or (is_default(row) and not is_default(known))) and scale in self._shots and not why_not(self._base):
+        is_told_of = is_default(row) or not self._awaits_default
+        if is_told_of and scale not in self._viewers and scale in self._shots and not why_not(self._base):
             seen = self._shots[scale][0]
             self._viewers[scale] = row, viewer_pictures(self._base, adapted, seen.camera.zoomed(scale), seen.truth)
 
@@ -103,7 +106,7 @@ def recipe_of(row: str) -> str:
 
 def is_default(row: str) -> bool:
     """Whether an adapted row is that of the default recipe, which a page tells of first, in whatever order recipes were asked for."""
-    return recipe_of(row) == "default"
+    return recipe_of(row) == DEFAULT
 
 
 def in_order(pictures: Sequence[Picture]) -> list[Picture]:

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 # Folders of a model, in the order in which graphdeco-inria and gsplat search them.
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".", "0")  # the last: the folder `sparse` itself was given
 
+# Photographs lie in one of so many folders, from that of the model upwards: in nerfstudio's scenes, whose model is colmap/sparse/0, in the last.
+LEVELS = 4
+
 
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """The scene of a folder with `sparse/0` and images, or of the folder of the model itself.
@@ -36,7 +39,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
     """
     path, cfg = Path(path), cfg or {}
     model = _read(path)
-    folder = _root(path) / photographs_folder(cfg)
+    folder = _photographs(path, photographs_folder(cfg))
     try:
         images = sorted(model.images.values(), key=lambda image: image.name)
     except UnicodeDecodeError as error:
@@ -73,10 +76,12 @@ def _model_folder(path: Path) -> Path | None:
     return next((place for place in places if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))), None)
 
 
-def _root(path: Path) -> Path:
-    """The folder that contains the photographs' folder, also if the model's own folder was given."""
-    here = path.absolute()
-    return next((place.parent for place in (here, here.parent) if place.name == "sparse"), path)
+def _photographs(path: Path, name: str) -> Path:
+    """The folder `name` of photographs: beside the model, or above it, whichever of these folders was given."""
+    here = (_model_folder(path) or path).absolute()
+    above = [here, *here.parents][:LEVELS]
+    usual = next((place.parent for place in above if place.name == "sparse"), path)  # if there is none
+    return next((place / name for place in above if (place / name).is_dir()), usual / name)
 
 
 def _read(path: Path) -> pycolmap.Reconstruction:

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.errors import SceneError, install
 
 if TYPE_CHECKING:
     import pycolmap
 
-INSTALL = "install it with `pip install 'mipmap-plugin[colmap]'`"
+INSTALL = install("colmap")
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def jittered(
 ) -> list[Camera]:
     """`count` training views near the given cameras, looking in similar directions.
 
-    Each has the intrinsics, size and time of one of `cameras`. It is interpolated at random towards a near camera that looks in a
+    Each has the intrinsics, size and time of one of `cameras`. It is interpolated at random toward a near camera that looks in a
     similar direction, or extrapolated a little (`BEYOND`): centers on an arc around the point that both look at, rotations on an
     arc. Then the center is moved by `amount` of the distance between the two, and the view rotated by `amount` of its field of
     view, one standard deviation each. `spread`: of `CANDIDATES` times as many views, those farthest from the cameras and from each other

@@ -150,9 +150,10 @@ BUILT_IN = (
         unlike="splats in the same of 4096 buckets of depth are not sorted; colors are the file's if the renderer's outputColorSpace is linear",
     ),
     Viewer(
-        "aframe", "aframe-gaussian-splatting", "aframe-gaussian-splatting b50238f, index.js", "classic", DILATION,
+        "aframe", "aframe-gaussian-splatting, and drei's Splat", "aframe-gaussian-splatting b50238f, index.js; drei 0d9864e, Splat.tsx", "classic",
+        DILATION,
         replace(WEBGL, frame=1.2, max_half_axis=2048.0, packing=EIGHT_BITS), sh_degree=0,
-        unlike="covariances are stored in 16 bits, quaternions in 8; not compared with its images",
+        unlike="covariances are stored in 16 bits, quaternions in 8; drei rounds colors to 8 bits of linear light; not compared with their images",
     ),
     Viewer(
         "cesium", "Cesium", "@cesium/engine 26.3.0, PrimitiveGaussianSplat shaders; cesium-wasm-utils, wasm-splats", "classic", DILATION / 16,
@@ -185,7 +186,7 @@ IN_FILES = re.compile(r"\w[\w.+-]*")
 ALIASES = {
     **dict.fromkeys(("inria", "gsplat", "nerfstudio", "kiri"), "classic"),
     **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
-    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three"},
+    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe"},
 }
 
 # What is asked for, but has no record: why, and what to take instead.
@@ -219,9 +220,9 @@ def _registered(name: str) -> Any:
     return VIEWERS.get(name)
 
 
-def own_name(name: str | None) -> str | None:
+def own_name(name: str) -> str:
     """The name of the record that people know by `name` too."""
-    return ALIASES.get(name, name) if name else name
+    return ALIASES.get(name, name)
 
 
 def viewers_for(name: str) -> tuple[str, ...]:
@@ -248,10 +249,10 @@ def find_viewer(name: str) -> Viewer:
 
 
 def single_viewers() -> list[str]:
-    """The names of all viewers, without groups of them and without those of packages that cannot be loaded."""
+    """The names of all viewers, each once, without groups of them and without those of packages that cannot be loaded."""
     found = []
     for name in VIEWERS.names():
         with contextlib.suppress(PluginError, SettingsError):
             find_viewer(name)
-            found.append(name)
-    return found
+            found.append(own_name(name))
+    return list(dict.fromkeys(found))

@@ -21,6 +21,7 @@ from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
+from mipmap_plugin.models.mip import for_loader_of
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
@@ -165,7 +166,7 @@ def _write_parts(scene: TiledScene, folder: Path, returned: str) -> list[Path]:
     splats = scene.base if returned == AS_IT_IS else open_state(scene, folder, state)
     cores = scene.cores if returned == AS_IT_IS else torch.arange(len(splats)).split([*map(len, splats.parts)])
     for file, core in zip(files, cores, strict=True):
-        scene.for_target(splats.parameters(core)).save(file, provenance={}, overwrite=True)
+        for_loader_of(scene.viewer, scene.for_target(splats.parameters(core)), file).save(file, provenance={}, overwrite=True)
     return files
 
 

@@ -8,9 +8,9 @@ import io
 import socket
 from typing import Any
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, install
 
-NO_VISER = "the live view needs viser: pip install 'mipmap-plugin[view]'"
+NO_VISER = f"the live view needs viser; {install('view')}"
 
 
 def served(host: str, port: int) -> Any:

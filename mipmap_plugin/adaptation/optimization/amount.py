@@ -15,7 +15,7 @@ from mipmap_plugin.models.base import SplatModel
 # Views and splats that are counted; more change the result by a few percent.
 VIEWS, SPLATS = 12, 1 << 16
 
-# At least this fraction of the steps is taken: it costs 1 to 3 dB of what all of them reach (docs/recipes.md), and fewer were not tried.
+# At least this fraction of the steps is taken: it costs 1 to 3 dB of what all of them reach (docs/recipes_found.md), and fewer were not tried.
 LEAST_FRACTION = 1 / 4
 
 # Splats drawn in a second of a time budget, as many as the most of `default` in its minute on two cores. Moments of a moving scene do not follow

@@ -25,6 +25,7 @@ from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.models.base import count_of
 from mipmap_plugin.progress import ticking
 from mipmap_plugin.threads import side_by_side
 
@@ -194,7 +195,7 @@ def _check(run: Run, task: Task, config: AdaptConfig) -> None:
     best_db = next((point.validation_db for point in reversed(run.curve) if point.step == steering.best_step), quality.psnr)
     point = CurvePoint(
         step=run.step, seconds=run.watch.read(), psnr_db=decibel(mean) if steps else None,
-        validation_db=best_db if harmful else quality.psnr, gaussians=len(run.student.parameters()["means"]), taken_back=harmful,
+        validation_db=best_db if harmful else quality.psnr, gaussians=count_of(run.student, task.views[0]), taken_back=harmful,
     )  # fmt: skip
     run.curve.append(point)
     run.square_error = 0.0

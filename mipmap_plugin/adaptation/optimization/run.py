@@ -24,7 +24,7 @@ from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.base import SplatModel, count_of
 
 # Number of views on which a student is compared with the base to assess a growth.
 AGREEMENT_VIEWS = 8
@@ -118,7 +118,7 @@ class Run:
             trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds)
             quality = costs.check(lambda: task.validation.quality(student))
             steering = Steering.begin(student, quality.visible)
-        first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=len(means))
+        first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=count_of(student, task.views[0]))
         return cls(student, optimizer, watch, ScreenGradients.of(means, config), steering, trial, curve=[first], costs=costs)
 
     def progress(self, config: AdaptConfig) -> float:

@@ -31,7 +31,8 @@ from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fract
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.effects import INTEGRATED, MIN_ALPHA, SURFEL
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models.base import Rebuilt, SplatModel, Thinned
+from mipmap_plugin.models.base import SplatModel, Thinned
+from mipmap_plugin.models.contract import rebuild
 
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)
@@ -183,7 +184,7 @@ class StartSearch:
             merged_weights.append(new_weights)
             return splats
 
-        cast(Rebuilt, student).rebuild(merged)
+        rebuild(student, merged)
         return merged_weights[0]
 
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -15,14 +15,14 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.disk_cache import cached, fingerprint
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
+from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, install
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
 from mipmap_plugin.torchvision_absent import torchvision_optional
 
 SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
-INSTALL = "install it with `pip install 'mipmap-plugin[sr]'`"
+INSTALL = install("sr")
 
 # Larger images are processed in tiles of this many px, with this many px of margin around each, so that memory stays small.
 TILE = 256

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import SettingsError, install
 from mipmap_plugin.evaluation.tradeoff.front import Cost, Tradeoff, files, frames, front, knee, milliseconds, seconds
 from mipmap_plugin.evaluation.tradeoff.points import Point, Spread
 from mipmap_plugin.formats.atomic import new_file
@@ -20,7 +20,7 @@ BRIEF = 0.1
 
 TITLE_WIDTH = 95  # letters
 
-NO_MATPLOTLIB = "plots need matplotlib: pip install 'mipmap-plugin[plot]', or leave them out with --no-picture"
+NO_MATPLOTLIB = f"plots need matplotlib; {install('plot')}; or leave them out with --no-picture"
 
 
 def figure_class() -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.measure import resized_base, views_seen
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.evaluation.other_scene import of_another_scene
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, TruthView, test_views
 from mipmap_plugin.scenes import Scene, jittered
 from mipmap_plugin.wrap import Wrapped
@@ -56,6 +58,8 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
     if not adapt_on:
         raise SettingsError("every camera of the checkpoint is evaluated, so that none is left to adapt to; give photographs of fewer views")
     protocol, views = PROTOCOLS["P3"], evenly(views, most)
+    if doubt := of_another_scene(model, [judged[view] for view in views], scale, protocol):
+        warnings.warn(doubt, stacklevel=2)
     truths = {view: judged[view].truth(scale, protocol) for view in views}
     label = f"real dB, protocol P3 on {len(views)} photographs"
     return GroundTruth(label, views, adapt_on, lambda view, image: psnr(protocol.as_saved(image), truths[view]), protocol.shrink_by, False)

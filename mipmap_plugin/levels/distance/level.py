@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -41,7 +40,8 @@ from mipmap_plugin.levels.distance.mixture import Mixture
 from mipmap_plugin.levels.distance.rule import DistanceRule, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, focal_of, foreground
 from mipmap_plugin.levels.request import MERGING_COSTS, LadderRequest
-from mipmap_plugin.models.base import Rebuilt, SplatModel, digest_of_parameters, effects_of
+from mipmap_plugin.models.base import SplatModel, digest_of_parameters, effects_of
+from mipmap_plugin.models.contract import rebuild
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.progress import announced
 from mipmap_plugin.recipes import recipe as make_config
@@ -228,7 +228,7 @@ class LevelRun:
             return made
 
         with torch.no_grad():
-            cast(Rebuilt, student).rebuild(form)
+            rebuild(student, form)
             made, coming = student.gaussians(scene.base.any_camera()).detach(), self.others[1]
             self.mixture = Mixture.of(scene.rule, scene.chunks, [*self.others[0], made, *coming])
         return student

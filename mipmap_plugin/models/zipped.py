@@ -1,0 +1,29 @@
+"""Splats in a PLY in a zip archive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.ply import read_header
+from mipmap_plugin.formats.tags import provenance_of
+from mipmap_plugin.formats.zipped import unpacked
+from mipmap_plugin.models.detect import detect
+from mipmap_plugin.models.families import find_family
+from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
+
+
+def load_zipped(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
+    """Load the 3DGS PLY in a zip archive that holds nothing else. Raises CheckpointError."""
+    file = detect(path, iteration=iteration).path
+    with unpacked(file) as ply:
+        try:
+            checkpoint = detect(ply)
+        except CheckpointError as error:
+            raise CheckpointError(str(error).replace(str(ply), f"the PLY in {file}")) from error
+        if checkpoint.family != "3dgs":
+            raise CheckpointError(f"{file} holds a PLY of {find_family(checkpoint.family).title}; unpack it and give that")
+        if "scale" in (provenance_of(read_header(ply).comments) or {}):
+            raise CheckpointError(f"{file} holds a file that was adapted; unpack it, so that its scale is read too")
+        return read_vanilla(replace(checkpoint, path=ply, folder=None)).with_source(file)

@@ -1,0 +1,219 @@
+"""What a family or a backend of a stranger breaks is told in a sentence that names it, most of it before any work."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import load_model, register_backend, register_model, register_recipe, wrap_model
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
+from mipmap_plugin.formats.atomic import new_file
+from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, TrainedScale, Traits
+from mipmap_plugin.models.conformance import ModelSuite
+from mipmap_plugin.models.vanilla import Origin, VanillaModel
+
+BRIEF = dict(steps=1, extra_views=2, validation_views=2)
+
+
+class Theirs(VanillaModel):
+    family = "theirs"
+
+
+def model(**members):
+    return type("Odd", (Theirs,), members)(tiny.model().parameters())
+
+
+def wrapped(**members):
+    return wrap_model(model(**members), cameras=tiny.cameras(2), backend="reference")
+
+
+def parameters(**changes):
+    return lambda self: {**VanillaModel.parameters(self), **changes}
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        (dict(reshape=lambda self, form: None), r"lacks reshape\(form, views\); see"),
+        (dict(save=lambda self, path: path), r"lacks save\(path, \*, provenance, overwrite\); see"),
+        (dict(gaussians=lambda self: None, rebuild=None), r"lacks gaussians\(camera\), rebuild\(form\); see"),
+        (dict(parameters=parameters(features=torch.zeros(7, 2))), "lacks parameters of one length: it has 60 means, .*, 7 features; see"),
+        (dict(parameters=parameters(features=[1], offsets=None)), "lacks tensors as the parameters features, offsets; see"),
+    ],
+)
+def test_what_does_not_fit_a_model_is_told_when_it_is_wrapped(members, said):
+    with pytest.raises(SettingsError, match=said):
+        wrapped(**members)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [("trained", None, "TrainedScale"), ("notes", None, "list"), ("source", "a.ply", "Path or None"), ("digest", 7, "str"), ("traits", {}, "Traits")],
+)
+def test_attributes_of_another_type_are_told_when_it_is_wrapped(name, value, kind):
+    odd = model()
+    setattr(odd, name, value)
+    with pytest.raises(SettingsError, match=f"this Odd .* lacks {name} of the type {kind}; see"):
+        wrap_model(odd)
+
+
+def test_parameters_that_fail_are_told_by_name():
+    with pytest.raises(PluginError, match="family 'theirs' failed: ZeroDivisionError"):
+        wrapped(parameters=lambda self: 1 / 0)
+
+
+def without_a_color(self, camera=None):
+    splats = VanillaModel.gaussians(self, camera)
+    return replace(splats, sh=splats.sh[1:])
+
+
+def with_a_root_of_0(self, camera=None):
+    splats = VanillaModel.gaussians(self, camera)
+    return replace(splats, means=splats.means + (splats.means - splats.means.detach()).norm(dim=1, keepdim=True).sqrt())
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        (dict(gaussians=without_a_color), r"gaussians\(\) returned splats that do not fit together: sh: expected .* got \[59, 4, 3\]"),
+        (dict(gaussians=with_a_root_of_0), r"gaussians\(\) has gradients with NaN or infinity in means;"),
+        (dict(copy=lambda self: None), r"copy\(\) returned a NoneType, which lacks traits, "),
+        (dict(row_opacities=lambda self, views=(): torch.full((60,), torch.nan)), r"row_opacities\(\) .* returned a tensor \[60\], not all finite"),
+        (dict(rebuild=lambda self, form: None), r"rebuild\(form\) has to hold the splats that `form` returns; it called it 0 times"),
+        (dict(rebuild=lambda self, form: form(self.gaussians()) and None), r"rebuild\(form\) .*; it holds 60 splats after it returned \d+"),
+    ],
+)
+def test_what_a_family_returns_wrong_is_told_by_its_name(members, said):
+    with pytest.raises(PluginError, match=f"family 'theirs': {said}"):
+        wrapped(**members).adapt(0.25, **BRIEF)
+
+
+def save_elsewhere(self, path, *, provenance, overwrite=False):
+    return Path(path).with_name("elsewhere.ply")
+
+
+def save_as_text(self, path, *, provenance, overwrite=False):
+    with new_file(path, overwrite) as temporary:
+        temporary.write_text("splats")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("save", "said"),
+    [
+        (save_elsewhere, r"save\(\) returned .*elsewhere\.ply, where it wrote no file"),
+        (save_as_text, r"save\(\) wrote a file of the type unknown to .*new\.ply, which other programs take for a ply; write what the ending says"),
+    ],
+)
+def test_a_file_that_is_not_what_it_is_called_never_appears(tmp_path, save, said):
+    adapted = wrapped(save=save).adapt(0.5, recipe="instant", merge_to=1.0)
+    with pytest.raises(PluginError, match=f"family 'theirs': {said}"):
+        adapted.save(tmp_path / "new.ply")
+    assert not list(tmp_path.iterdir())
+
+
+def registered(path, load=lambda path, iteration: model(), **changes):
+    """A file of a registered family."""
+    path.write_bytes(b"theirs")
+    family = Family("theirs", "Theirs", lambda files: Match(CERTAIN, "its name") if files.path == path else None, API_VERSION, load)
+    register_model("theirs", replace(family, **changes))
+    return path
+
+
+def test_levels_of_a_family_that_writes_no_ply_end_in_a_sentence(tmp_path, capsys):
+    own = type("Own", (Theirs,), {"save": save_as_text})
+    file = registered(tmp_path / "a.own", lambda path, iteration: own(tiny.model().parameters(), TrainedScale(), Origin(path)))
+    words = ["--viewer", "spark", "--recipe", "instant", "--backend", "reference", "--output", str(tmp_path / "levels")]
+    assert main(["levels", str(file), *words]) == 2
+    assert "family 'theirs': save() wrote a file of the type unknown to" in capsys.readouterr().err
+
+
+def test_a_model_is_called_as_its_family(tmp_path):
+    with pytest.raises(PluginError, match="family 'theirs' loads Nameless, whose `family` is '3dgs'; set it to 'theirs'"):
+        load_model(registered(tmp_path / "a.own", lambda path, iteration: type("Nameless", (VanillaModel,), {})(tiny.model().parameters())))
+
+
+def test_a_loader_that_ends_the_process_is_told_by_name(tmp_path):
+    with pytest.raises(PluginError, match=r"family 'theirs' cannot load .*: SystemExit: 0"):
+        load_model(registered(tmp_path / "a.own", lambda path, iteration: sys.exit(0)))
+
+
+def test_an_ending_without_its_dot_is_told(tmp_path):
+    file = registered(tmp_path / "a.own", saves="own")
+    with pytest.raises(CheckpointError, match=r"the family 'theirs' failed: .*`saves` must be the ending of a file's name, such as \.ply, got 'own'"):
+        load_model(file)
+
+
+def test_a_recipe_that_ends_the_process_is_told_by_name():
+    register_recipe("theirs", lambda scale, network: sys.exit(0))
+    with pytest.raises(PluginError, match=r"recipe 'theirs' failed at x0\.5: SystemExit: 0"):
+        wrapped().adapt(0.5, recipe="theirs")
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        (dict(lacking=lambda self, needs: "no"), r"lacking\(\) has to return a list of sentences; it returned a str"),
+        (
+            dict(render=lambda self, *shot: (drawn := ReferenceBackend.render(self, *shot)).replaced(image=drawn.image.detach().numpy())),
+            "has to return a Rendered with an image .*; it returned a ndarray",
+        ),
+    ],
+)
+def test_what_a_backend_returns_wrong_is_told_by_its_name(members, said):
+    register_backend("odd", type("Odd", (ReferenceBackend,), {"name": "odd", **members}))
+    with pytest.raises(PluginError, match=f"backend 'odd':? {said}"):
+        (base := wrap_model(tiny.model(), cameras=tiny.cameras(2), backend="odd")).render(base.cameras[0])
+
+
+class Faint(Theirs):
+    """It says that backends may activate its parameters, and does so otherwise."""
+
+    def gaussians(self, camera=None):
+        splats = VanillaModel.gaussians(self, camera)
+        return replace(splats, opacities=splats.opacities / 2)
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.traits = replace(self.traits, plain=True)
+
+
+class Full(Theirs):
+    """It says that rows can be left out, and keeps them."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.traits = replace(self.traits, thins=True)
+
+    def thin(self, keep):
+        pass
+
+
+class Forgetful(Theirs):
+    def reshape(self, form, views=()):
+        VanillaModel.reshape(self, lambda gaussians: (2 * form(gaussians)[0], form(gaussians)[1]), views)
+
+
+@pytest.mark.parametrize(
+    ("kind", "test"),
+    [
+        (Faint, "test_keeps_what_its_traits_promise"), (Full, "test_rows_can_be_left_out"),
+        (Forgetful, "test_shapes_that_stay_keep_the_picture"),
+    ],
+)  # fmt: skip
+def test_the_suite_sees_models_that_break_a_promise(kind, test):
+    with pytest.raises(AssertionError):
+        getattr(ModelSuite(), test)(wrap_model(kind(tiny.model().parameters()), cameras=tiny.cameras(2), backend="reference"))
+
+
+def test_the_suite_wants_a_ply_for_viewers(tmp_path):
+    with pytest.raises(PluginError, match="save"):
+        ModelSuite().test_writes_a_ply_for_viewers(wrapped(save=save_as_text), tmp_path)
+    moving = wrapped(save=save_as_text)
+    moving.model.traits = Traits(moves=True)
+    ModelSuite().test_writes_a_ply_for_viewers(moving, tmp_path)  # as no viewer draws it

@@ -1,0 +1,72 @@
+"""Photographs of another scene than the checkpoint: `evaluate` says so."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.cli import main
+from mipmap_plugin.evaluation.other_scene import of_another_scene
+from mipmap_plugin.evaluation.protocols import PROTOCOLS
+from mipmap_plugin.evaluation.tradeoff.truth import photographs
+from mipmap_plugin.scenes import load_scene
+
+DOUBT = "they may be of another scene, or their cameras in another frame; check --images"
+
+
+@pytest.fixture
+def base():
+    return wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="reference")
+
+
+def seen(base, cameras, noise=0.0):
+    """Judged views whose truth at x1 is the base's own picture, less well the more noise there is."""
+    rng = torch.Generator().manual_seed(0)
+    images = [base.render(camera).image for camera in cameras]
+    truths = [(image + noise * torch.rand(image.shape, generator=rng)).clamp(0, 1) for image in images]
+    return [SimpleNamespace(camera=camera, truth=lambda scale, protocol, own=own: own) for camera, own in zip(cameras, truths, strict=True)]
+
+
+def doubt(base, views):
+    return of_another_scene(base, views, 1.0, PROTOCOLS["P3"])
+
+
+@pytest.mark.parametrize(("seed", "told"), [(0, False), (5, True)], ids=["its own scene", "another"])
+def test_evaluate_tells_of_photographs_of_another_scene(tmp_path, capsys, seed, told):
+    base, images = tiny.folder(tmp_path / "base"), tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=seed)
+    assert main(["evaluate", str(base), "--images", str(images), "--scale", "1/2", "--backend", "reference", "--no-report"]) == 0
+    assert (DOUBT in capsys.readouterr().err) == told
+
+
+@pytest.mark.parametrize(("seed", "told"), [(0, False), (5, True)], ids=["its own scene", "another"])
+def test_a_tradeoff_tells_of_them_too(tmp_path, base, recwarn, seed, told):
+    photographs(base, load_scene(tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=seed)), 1 / 2, None)
+    assert any(DOUBT in str(warning.message) for warning in recwarn) == told
+
+
+def test_photographs_of_other_views_are_told_of(base):
+    views = seen(base, tiny.cameras(4))
+    assert not doubt(base, views)
+    swapped = [SimpleNamespace(camera=view.camera, truth=other.truth) for view, other in zip(views, views[1:] + views[:1], strict=True)]
+    assert DOUBT in doubt(base, swapped)
+
+
+def test_a_base_of_low_quality_is_not_doubted(base):
+    assert not doubt(base, seen(base, tiny.cameras(4), noise=0.1))
+
+
+def test_nothing_is_said_of_one_view_nor_of_a_camera_that_stands_still(base):
+    [view] = tiny.cameras(1)
+    still = [replace(view, name=f"at_{time}", time=time) for time in (0.0, 0.5, 1.0)]
+    for cameras in ([view], still):
+        dark = [SimpleNamespace(camera=camera, truth=lambda *_: torch.zeros(24, 32, 3)) for camera in cameras]
+        assert doubt(base, dark) == ""
+
+
+def test_photographs_of_several_sizes_are_compared(base):
+    cameras = tiny.cameras(4)
+    square = [camera.window(24, 24) if number % 2 else camera for number, camera in enumerate(cameras)]
+    assert not doubt(base, seen(base, square)) and {camera.size for camera in square} == {(24, 32), (24, 24)}

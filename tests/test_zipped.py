@@ -1,0 +1,79 @@
+"""A PLY in a zip archive: read if it is alone there, and refused in a sentence otherwise."""
+
+import zipfile
+
+import numpy as np
+import pytest
+import tiny
+from ply_files import write
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats import zipped
+from mipmap_plugin.formats.ply import read_ply
+from mipmap_plugin.models import load_model
+
+
+def archive(path, files):
+    """A zip archive of files, by their names in it."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as opened:
+        for name, content in files.items():
+            opened.writestr(name, content)
+    return path
+
+
+@pytest.fixture
+def ply(tmp_path):
+    return tiny.ply(tmp_path / "own.ply").read_bytes()
+
+
+def refused(path, sentence):
+    with pytest.raises(CheckpointError, match=sentence):
+        load_model(path)
+
+
+@pytest.mark.parametrize("name", ["scan.ply", "my scan/point_cloud.PLY", "../../etc/out.ply", "/out.ply"])
+def test_one_ply_is_read_wherever_its_name_leads(tmp_path, ply, name):
+    before = {path.name for path in tmp_path.iterdir()}
+    model = load_model(archive(tmp_path / "phone.zip", {name: ply, "__MACOSX/._scan.ply": b"x", ".DS_Store": b"x"}))
+    assert (len(model), model.source, len(model.digest)) == (60, tmp_path / "phone.zip", 64)
+    assert {path.name for path in tmp_path.iterdir()} == before | {"phone.zip"}
+
+
+def test_adapt_writes_a_ply_beside_it(tmp_path, ply):
+    archive(tmp_path / "phone.zip", {"scan.ply": ply})
+    assert main(["adapt", str(tmp_path / "phone.zip"), "--scale", "1/2", "--recipe", "instant", "--backend", "reference"]) == 0
+    assert len(load_model(tmp_path / "phone_x0.5.ply")) == 60
+
+
+@pytest.mark.parametrize("beside", ["cameras.json", "other.ply", "images/1.jpg"])
+def test_what_lies_beside_it_is_never_left_out_silently(tmp_path, ply, beside):
+    both = {"m/point_cloud.ply": ply, f"m/{beside}": b"x"}
+    refused(archive(tmp_path / "a.zip", both), "a.zip is a zip archive; unpack it and give the PLY or the folder")
+
+
+def test_what_would_fill_the_disk_is_not_unpacked(tmp_path, ply, monkeypatch):
+    rows = {name: np.zeros(20_000, np.float32) for name in read_ply(tmp_path / "own.ply").columns}
+    trap = archive(tmp_path / "trap.zip", {"a.ply": write(tmp_path / "zeros.ply", rows).read_bytes()})
+    refused(trap, "would be more than 100 times as large unpacked")
+    monkeypatch.setattr(zipped.shutil, "disk_usage", lambda _: zipped.shutil._ntuple_diskusage(1, 1, 0))
+    refused(archive(tmp_path / "a.zip", {"a.ply": ply}), r"a.zip needs 0.0 GiB unpacked, for which .* has no room")
+
+
+def test_a_damaged_archive_is_one_sentence(tmp_path, ply):
+    path = archive(tmp_path / "a.zip", {"a.ply": ply})
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    refused(path, "a.zip is a damaged zip archive")
+
+
+def test_a_ply_that_is_no_base_is_told_of_by_the_archives_name(tmp_path, ply):
+    cloud = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
+    refused(archive(tmp_path / "mesh.zip", {"a.ply": cloud}), "the PLY in .*mesh.zip is a plain point cloud")
+    columns = read_ply(tmp_path / "own.ply").columns
+    filtered = write(tmp_path / "mip.ply", {**columns, "filter_3D": np.ones(60, np.float32)}).read_bytes()
+    refused(archive(tmp_path / "mip.zip", {"a.ply": filtered}), "mip.zip holds a PLY of Mip-Splatting; unpack it")
+    made = wrap_model(tmp_path / "own.ply", backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "made.ply")
+    refused(archive(tmp_path / "made.zip", {"a.ply": made.read_bytes()}), "made.zip holds a file that was adapted; unpack it")
