@@ -38,6 +38,7 @@ class AdaptConfig(BaseModel):
 
     recipe: str = Field("default", description="The name of the recipe that these settings started from.")
     steps: int = Field(1000, ge=0, description="Maximum number of optimizer steps.")
+    most_steps: int | None = Field(None, ge=0, description="Maximum number of steps in a time budget that has room for more than `steps`.")
     most_draws: float | None = Field(None, gt=0, description="Fewer steps, a quarter of them at least, if they would draw more splats in all views.")
     time_budget_s: float | None = Field(None, gt=0, description="Stop after this many seconds.")
     target_db: float | None = Field(None, description="Stop at the first check whose PSNR against the pseudo truth (not photographs) is this high.")

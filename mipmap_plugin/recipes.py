@@ -45,9 +45,10 @@ LEAST_ZOOM_IN = 1.1
 # What a run ends by at the user's wish: then `most_draws` does not, and there are steps at any zoom.
 ENDS = ("steps", "time_budget_s", "target_db")
 
+# In a time budget with room for more, 720 steps gain 0.6 dB on lego at x1/4, and 1440 1.2 dB.
 DEFAULT_OUT = dict(
-    steps=360, most_draws=MOST_DRAWS, loss="psnr", decay=0.02, betas=(0.9, 0.95), nesterov=True, truth_oversampling=4, views_per_step=4,
-    order="spread", gathering=0.25, warm_up=0.1, extra_views=150,
+    steps=360, most_steps=2500, most_draws=MOST_DRAWS, loss="psnr", decay=0.02, betas=(0.9, 0.95), nesterov=True, truth_oversampling=4,
+    views_per_step=4, order="spread", gathering=0.25, warm_up=0.1, extra_views=150,
 )  # fmt: skip
 RATES_OUT = LearningRates(
     means=0.1, scales=0.04, quats=0.008, opacities=0.1, sh0=0.03, shN=0.04, offsets=0.1, features=0.05, networks=5e-3
@@ -119,6 +120,8 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
         raise PluginError(f"recipe {name!r} failed at x{scale:g}: {type(error).__name__}: {error}") from error
     if any(overrides.get(end) is not None for end in ENDS):
         settings |= {"most_draws": None, "least_zoom_in": 1.0}
+    if overrides.get("steps") is not None:
+        settings.pop("most_steps", None)
     try:
         config = AdaptConfig(**{"recipe": name, **settings, **overrides})
     except ValidationError as error:

@@ -1,13 +1,25 @@
 """Large scenes take fewer steps."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import tiny
 import torch
 
 from mipmap_plugin import wrap_model
-from mipmap_plugin.adaptation.optimization.amount import LEAST_FRACTION, OVERSAMPLING, affordable, as_taken, splats_in_view
+from mipmap_plugin.adaptation.optimization.amount import (
+    LEAST_FRACTION,
+    LEAST_IN_BUDGET,
+    LEAST_MOMENTS,
+    OVERSAMPLING,
+    affordable,
+    affordable_for_model,
+    affordable_moments,
+    as_taken,
+    splats_in_view,
+)  # fmt: skip
+from mipmap_plugin.models.base import Traits
 from mipmap_plugin.recipes import MOST_DRAWS, recipe
 
 
@@ -35,6 +47,24 @@ def test_settings_of_a_large_scene_are_recognized_as_those_that_were_asked_for()
         assert as_taken(other, taken) != taken
     none = recipe("default", 1 / 4, steps=600)
     assert as_taken(none, affordable(asked, 1e9)) == none
+
+
+@pytest.mark.parametrize(("count", "moments"), [(1_000, 24), (60_000, 15), (10**6, LEAST_MOMENTS)])
+def test_a_moving_scene_has_fewer_moments_before_it_has_fewer_steps(count, moments):
+    base = SimpleNamespace(traits=Traits(moves=True), work=20.0, parameters=lambda: {"means": torch.tensor([[0.0, 0.0, 2.0]]).expand(count, 3)})
+    view, asked = replace(tiny.cameras(1)[0], viewmat=torch.eye(4)), recipe("default", 1 / 4)
+    taken = affordable_for_model(asked, base, [view], near=0.2)
+    assert affordable_moments(taken, base) == moments and taken.most_draws == asked.most_draws
+    assert taken.steps == (360 if count < 10**6 else 90)
+    assert affordable_moments(recipe("default", 1 / 4, steps=7), base) == 24
+
+
+def test_a_time_budget_bounds_the_moments_of_a_moving_scene_alike_on_each_machine():
+    base = SimpleNamespace(traits=Traits(moves=True), work=20.0, parameters=lambda: {"means": torch.zeros(50_000, 3)})
+    budgets = [affordable_moments(recipe("default", 1 / 4, time_budget_s=seconds), base) for seconds in (1.0, 60.0, 600.0)]
+    assert budgets == [LEAST_IN_BUDGET, 6, 24]
+    still = SimpleNamespace(traits=Traits(), parameters=base.parameters)
+    assert affordable_moments(recipe("default", 1 / 4, time_budget_s=1.0), still) == 24
 
 
 def test_steps_that_somebody_asks_for_are_taken():

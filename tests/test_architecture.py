@@ -58,7 +58,7 @@ CONFINED = {
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
     "typing_extensions": ["wrapped.py"],
-    "viser": ["viewing/page.py"],
+    "viser": ["viewing/server.py"],
 }
 
 MAX_FILE, MAX_FUNCTION = 300, 60  # lines

@@ -1,18 +1,23 @@
 """A run with a time budget has as many steps and views as fit into it."""
 
+from types import SimpleNamespace
+
 import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.curve import Stopwatch
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, reason_to_stop
+from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization import budget
 from mipmap_plugin.adaptation.optimization.budget import SPARE, USES, Pace, within_budget
+from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Steering, no_validation
 from mipmap_plugin.recipes import recipe
 
-PACE = Pace(a_view=0.01, a_truth=0.02, a_check=0.05)
+STILL = Following()
+PACE = Pace(a_view=0.01, a_truth=0.02, a_check=0.05, a_choice=0.25)
 
 
 @pytest.fixture(autouse=True)
@@ -34,24 +39,52 @@ def a_run(seconds: float, step: int = 0) -> Run:
 def test_steps_fill_the_budget_with_their_truths_and_checks():
     config = recipe("default", 1 / 4)
     a_step = config.views_per_step * (0.01 + 0.02 / USES) + 0.05 / config.check_every
-    assert PACE.steps(config, 2.0) == int(SPARE * 2.0 / a_step)
-    assert PACE.steps(config, 0.0) == 1
+    assert PACE.steps(config, 2.0, STILL) == int(SPARE * 2.0 / a_step)
+    assert PACE.steps(config, 0.0, STILL) == 1
 
 
 def test_a_short_run_has_fewer_views():
     task, config = a_task(40), recipe("default", 1 / 4, time_budget_s=3.0)
     fewer, shorter = within_budget(a_run(2.5), task, config)
-    assert shorter.steps == PACE.steps(config, 0.5)
+    assert shorter.steps == PACE.steps(config, 0.5 - PACE.a_choice, STILL)
     assert len(fewer.views) == -(-config.views_per_step * shorter.steps // USES) < 40 and set(fewer.views) < set(task.views)
     assert shorter.warm_up_steps < config.warm_up_steps
 
 
 def test_a_run_that_goes_on_has_further_steps():
     config = recipe("default", 1 / 4, time_budget_s=3.0)
-    assert within_budget(a_run(2.5, step=100), a_task(4), config)[1].steps == 100 + PACE.steps(config, 0.5)
+    assert within_budget(a_run(2.5, step=100), a_task(4), config)[1].steps == 100 + PACE.steps(config, 0.5 - PACE.a_choice, STILL)
 
 
-NO_CHANGE = [(dict(), 0.0), (dict(time_budget_s=1e6), 0.0), (dict(time_budget_s=3.0), 4.0), (dict(time_budget_s=3.0, gathering=0.0), 0.0)]
+@pytest.mark.parametrize(("settings", "steps"), [(dict(), PACE.steps(recipe("default", 1 / 4), 39.75, STILL)), (dict(steps=400), 400)])
+def test_time_that_is_left_is_used_unless_the_steps_were_asked_for(settings, steps):
+    config = recipe("default", 1 / 4, time_budget_s=40.0, **settings)
+    assert within_budget(a_run(0.0), a_task(4), config)[1].steps == pytest.approx(steps, abs=1) and steps > recipe("default", 1 / 4).steps
+    assert within_budget(a_run(0.0), a_task(4), config.model_copy(update={"time_budget_s": 1e6}))[1].steps == max(400, config.most_steps or 0)
+
+
+def test_evaluations_of_a_field_take_their_part_of_a_budget():
+    config = recipe("default", 1 / 4)
+    follow = SimpleNamespace(moments=6, reach=0.5, rounds=0.0, unknown=6, evaluation=0.1, seconds=0.0)
+    steps = PACE.steps(config, 4.0, follow)
+
+    def seconds(steps):
+        return steps * PACE.a_step(config) + Evaluations(follow, config.model_copy(update={"steps": steps})).of_all_steps()
+
+    assert 10 < steps < PACE.steps(config, 4.0, STILL) / 1.3 and seconds(steps) <= SPARE * 4.0 < seconds(steps + 1)
+
+
+def test_time_is_kept_for_choosing_after_the_steps():
+    run, config = a_run(1.0), recipe("default", 1 / 4, time_budget_s=3.0)
+    run.curve = [CurvePoint(step=0, seconds=1.0, psnr_db=None, validation_db=20.0, gaussians=5)]
+    _, planned = within_budget(run, a_task(4), config)
+    assert run.reserved == PACE.a_choice and planned.steps == PACE.steps(config, 3.0 - 1.0 - PACE.a_choice, STILL)
+    assert run.progress(planned) == pytest.approx(0, abs=0.01)
+    run.watch.seconds = 3.0 - PACE.a_choice
+    assert run.progress(planned) == 1 and reason_to_stop(run.curve, run.seconds, planned)
+
+
+NO_CHANGE = [(dict(), 0.0), (dict(time_budget_s=1e6, steps=360), 0.0), (dict(time_budget_s=3.0), 4.0), (dict(time_budget_s=3.0, gathering=0.0), 0.0)]
 
 
 @pytest.mark.parametrize(("settings", "seconds"), NO_CHANGE)

@@ -1,25 +1,32 @@
 """The time left is told right early, by a clock on which every part of a run has a price."""
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
+import moving
 import pytest
 import tiny
-import torch
 
 from mipmap_plugin import threads
+from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.adaptation.optimization.estimate import Costs, Forecast
+from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
+from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.models import load_model
+from mipmap_plugin.models.moving import memory
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import wrap_model
 
 SCALE = 1 / 4
 VIEW, TRUTH, CHECK = 0.003, 0.012, 0.05  # s: as of lego_200 on one thread
+EVALUATION = 0.03  # s, of a field at a moment
 
 
 @pytest.fixture
@@ -34,25 +41,32 @@ def clock(monkeypatch):
     return spend
 
 
-def run_and_estimates(clock, monkeypatch, **settings):
-    """The whole run's seconds, and after each step those that have passed and those that were said to be left."""
-    config, student, views, images = recipe("default", SCALE, **settings), tiny.model(3).copy(), tiny.cameras(20, width=8, height=8), {}
+def run_and_estimates(clock, monkeypatch, base=None, **settings):
+    """The whole run's seconds for a `base`, and after each step those that have passed and those that were said to be left."""
+    views = [replace(view, time=number % 6 / 5) for number, view in enumerate(tiny.cameras(20, width=16, height=16))]
+    config, base, images = recipe("default", SCALE, **settings), base or tiny.model(3), {}
     backend, effects, told = ReferenceBackend(), Effects(1), []
 
     def truth(view):
         if view not in images:
             clock(TRUTH)
-            images[view] = torch.zeros(2, 2, 3)
+            images[view] = resize(backend.render(base.gaussians(view), view, effects).image.detach(), view.zoomed(SCALE).size, "box")
         return images[view]
 
     def render(gaussians, camera):
         clock(VIEW)
         return backend.render(gaussians, camera, effects).image
 
+    for view in views:
+        base.gaussians(view)  # `evaluate_moments`
+    evaluate = memory.Memory.evaluate
+    monkeypatch.setattr(memory.Memory, "evaluate", lambda *each: clock(EVALUATION) or evaluate(*each))
+    monkeypatch.setattr(memory, "perf_counter", time.perf_counter)
     monkeypatch.setattr(Validation, "quality", lambda self, model: clock(CHECK) or Quality(20.0, 20.0))
     monkeypatch.setattr(loop.Bar, "update", lambda bar, *_: told.append((run.watch.seconds, bar.seconds_left)))
     task = Task(views, SCALE, truth, render, False, Validation([], [], SCALE, truth, render, config.resize))
-    run = Run.start(student, task, config)
+    task = replace(task, follow=Following(base, views, SCALE))
+    run = Run.start(base.copy(), task, config)
     loop.adapt(run, task, config, on_interrupt=lambda run: None)
     return run.watch.seconds, told
 
@@ -66,10 +80,19 @@ def test_after_a_tenth_of_the_run_the_estimate_is_right_within_thirty_percent(cl
     assert told[-1][1] == pytest.approx(0, abs=1e-6)
 
 
+def test_evaluations_of_a_field_are_foretold_as_rates_fall(clock, monkeypatch, tmp_path):
+    """Most of them lie in the first half of a run."""
+    total, told = run_and_estimates(clock, monkeypatch, load_model(moving.write_deformable(tmp_path / "moving")), steps=120)
+    assert told[60][0] > 0.6 * total
+    for passed, left in told:
+        if passed > total / 10:
+            assert left == pytest.approx(total - passed, rel=0.3, abs=0.01 * total)
+
+
 def test_slow_first_steps_are_soon_forgotten():
     """Memory, caches and threads have to be found for them."""
     views, config = tiny.cameras(4), recipe("default", SCALE, steps=40, views_per_step=2, warm_up=0)
-    forecast, costs = Forecast(ViewSchedule(views, config), config, checks=[]), Costs(truths=dict.fromkeys(views, 0.0))
+    forecast, costs = Forecast(ViewSchedule(views, config), config, [], Evaluations(Following(), config)), Costs(truths=dict.fromkeys(views, 0.0))
     seconds = [5.0 + 0.1 * step for step in range(1, 41)]  # the first takes 50 times as long
     left = [forecast.left(step, spent, costs) for step, spent in enumerate(seconds, start=1)]
     assert left[0] > 100 and left[3] == pytest.approx(36 * 0.1) and left[-1] == 0

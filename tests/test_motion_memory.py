@@ -11,7 +11,8 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.moments import at_moments, evaluate_moments, follower, release, sharing_moments
+from mipmap_plugin.adaptation.following import Following, release
+from mipmap_plugin.adaptation.moments import at_moments, evaluate_moments, sharing_moments
 from mipmap_plugin.adaptation.start.candidates import StartSearch
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Traits
@@ -93,12 +94,40 @@ def test_a_model_can_be_copied_by_python_and_sent_to_other_processes(tmp_path, c
     assert torch.equal(copied(model).gaussians(moving.at(0.5)).means, before)
 
 
-def test_moments_of_no_use_are_forgotten():
-    known, asked = counted_memory(limit=3 * 2 * 10 * 3 * 4)  # places and changes of three moments
+MOMENT = 10 * 3 * 4  # bytes of ten splats
+
+
+def test_moments_that_come_in_turn_are_not_all_forgotten():
+    """Forgetting what was of use longest ago would evaluate each of them anew in each turn."""
+    known, asked = counted_memory(limit=3 * MOMENT)
     means = torch.ones(10, 3)
-    for time in (0.1, 0.2, 0.3, 0.1, 0.4, 0.1, 0.2):
+    for time in 3 * [0.1, 0.2, 0.3, 0.4]:
+        assert torch.equal(known(means, time)["means"], means * time)
+    assert [time for _, time in asked] == [0.1, 0.2, 0.3, 0.4, 0.4, 0.4]
+
+
+def test_what_is_of_no_use_makes_room_before_what_is_the_bases():
+    known, asked = counted_memory(limit=3 * MOMENT)
+    base, before, now = (torch.full((10, 3), number) for number in (1.0, 2.0, 3.0))
+    for means, time in ((base, 0.1), (before, 0.1), (before, 0.2), (now, 0.3), (now, 0.2)):
         known(means, time)
-    assert [time for _, time in asked] == [0.1, 0.2, 0.3, 0.4, 0.2]
+    asked.clear()
+    for means, time in ((base, 0.1), (now, 0.2), (now, 0.3)):
+        known(means, time)
+    assert asked == []
+    known(now, 0.1)  # the base's makes room now
+    known(now, 0.1)
+    assert len(asked) == 1 and not known.knows(base, 0.1)
+    known(base, 0.1)
+    assert all(known.knows(now, time) for time in (0.1, 0.2, 0.3))
+
+
+def test_moments_share_the_means_that_they_were_evaluated_at():
+    known, _ = counted_memory()
+    for time in (0.1, 0.2, 0.3):
+        known(torch.ones(10, 3), time)
+        known(2 * torch.ones(10, 3), time)
+    assert len({place.data_ptr() for place, _ in known._known.values()}) == 2
 
 
 def test_many_splats_are_evaluated_in_parts(monkeypatch):
@@ -202,7 +231,7 @@ def test_a_moving_model_without_a_memory_is_not_evaluated_ahead():
     """As one of a third party: nothing of it would be kept."""
     base = SimpleNamespace(traits=Traits(moves=True), gaussians=None)
     evaluate_moments(base, at_times(3), phase=None)
-    follower(base, at_times(3), 0.5)(base)
+    Following(base, at_times(3), 0.5)(base)
 
 
 def test_photographs_stay_at_their_own_moments(tmp_path):

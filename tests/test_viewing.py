@@ -30,8 +30,9 @@ from mipmap_plugin.viewing.adapting import Adapter, Live, Progress, Wish
 from mipmap_plugin.viewing.around import BASE_PIXELS, NEAR, PIXELS, views_for_screen
 from mipmap_plugin.viewing.controls import MARKS, STOPS, figures, words
 from mipmap_plugin.viewing.pace import COARSEST, MOVING_S, Pace
-from mipmap_plugin.viewing.page import NO_VISER, Page, PageSettings, _check_address
+from mipmap_plugin.viewing.page import Page, PageSettings
 from mipmap_plugin.viewing.screen import LARGEST_FOV, Sampling, by_distance, by_lens, inside, pose_of, up_of, zoomed
+from mipmap_plugin.viewing.server import NO_VISER, check_address
 from mipmap_plugin.viewing.sources import File, Levels, Request, Supersampled, of_adapted, open_source
 from mipmap_plugin.viewing.stage import AMPLIFIED, Look, Stage
 
@@ -351,9 +352,49 @@ def digest(base):
 def page(stage, base, monkeypatch, tmp_path):
     element = lambda *_, initial_value=None, **__: MagicMock(value=initial_value)  # noqa: E731
     server = MagicMock(**{f"gui.add_{kind}.side_effect": element for kind in ("dropdown", "slider", "number")})
-    monkeypatch.setattr(live_page, "_server", lambda *_: server)
+    monkeypatch.setattr(live_page, "served", lambda *_: server)
     base.cameras = [replace(view, name="r_0") for view in base.cameras]
     return Page(stage, File("base", base), PageSettings("127.0.0.1", 8080, "scene", [None], ["default"], lambda *_: tmp_path / "new.ply"))
+
+
+class TestMoving:
+    """A slider of moments, for what moves alone."""
+
+    @pytest.fixture
+    def base(self, tmp_path):
+        moments = [replace(view, time=time) for view, time in zip(tiny.cameras(4), (0.3, 0.7, None, 0.1), strict=True)]
+        return wrap_model(moving.write_deformable(tmp_path / "moving"), cameras=moments, backend="reference")
+
+    def test_the_moment_of_the_slider_is_drawn(self, page, base, screen):
+        assert page._controls.look().time == 0.3  # that of the view that is shown first
+        page._controls.time.value = 0.9
+        shown = page._stage.draw(page._controls.look(), screen).image
+        assert torch.equal(shown, base.render(replace(screen, time=0.9)).image.clamp(0, 1))
+        assert not torch.equal(shown, base.render(replace(screen, time=0.3)).image.clamp(0, 1))
+
+    def test_a_view_that_is_gone_to_brings_its_moment(self, page, monkeypatch):
+        monkeypatch.setattr(live_page, "_move", lambda *_: None)
+        for name, moment in (("r_0 (2)", 0.7), ("r_0 (3)", 0.7), ("r_0 (4)", 0.1)):  # the third has none
+            page._controls.view.value = name
+            page._go(MagicMock())
+            assert page._controls.look().time == moment
+
+    def test_the_moment_on_the_screen_is_adapted_for(self, page, base, screen, monkeypatch):
+        wishes = []
+        monkeypatch.setattr(live_page, "_view", lambda _: (pose_of(screen, 2.0), 64, 48))
+        monkeypatch.setattr(page.adapter, "start", lambda wish, then: wishes.append(wish))
+        page._controls.time.value = 0.5
+        page._adapt(MagicMock())
+        assert wishes[0].screen.time == 0.5
+        views = views_for_screen(base, wishes[0].screen, torch.zeros(3, dtype=torch.float64), 1 / 2)
+        assert {view.time for view in views[:NEAR]} == {0.5} and [view.time for view in views[NEAR:]] == [view.time for view in base.views()]
+
+    def test_a_picture_of_another_moment_is_another_one(self, screen):
+        assert adapting.alike(replace(screen, time=0.5), replace(screen, time=0.5)) and not adapting.alike(replace(screen, time=0.5), screen)
+
+
+def test_a_scene_in_which_nothing_moves_has_no_slider_of_moments(page):
+    assert page._controls.time is None and page._controls.look().time is None
 
 
 def test_every_view_can_be_gone_to_again_and_again_whatever_its_name(page, base, monkeypatch):
@@ -447,8 +488,8 @@ def test_wrong_options_are_told(tmp_path, capsys, options, message):
 
 def test_an_address_that_cannot_be_served_is_told():
     with pytest.raises(SettingsError, match="nothing can be served at"):
-        _check_address("192.0.2.1", 8080)  # an address for documentation, which no machine has
-    _check_address("127.0.0.1", 0)
+        check_address("192.0.2.1", 8080)  # an address for documentation, which no machine has
+    check_address("127.0.0.1", 0)
 
 
 def test_what_is_saved_takes_a_free_name(tmp_path):

@@ -1,4 +1,4 @@
-"""The moments of a moving scene: which ones views are adapted at, and where the field is evaluated while splats move."""
+"""The moments of a moving scene: which ones views are adapted at, and when the field is evaluated for the base."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import chain, zip_longest
-from typing import Any
 
 import torch
-from torch import Tensor
 
-from mipmap_plugin.adaptation.start.closed_form import pixel_size
+from mipmap_plugin.adaptation.following import follows
 from mipmap_plugin.adaptation.views import with_times
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -59,38 +57,7 @@ def evaluate_moments(base: SplatModel, views: Sequence[Camera], phase: Callable[
 
     Else the first truth and the first step at each moment would pay for it, and the time that is left be told wrongly.
     """
-    if _follows(base):
+    if follows(base):
         with phase("motion"):
             for view in {view.time: view for view in views}.values():
                 base.gaussians(view)
-
-
-def follower(base: SplatModel, views: Sequence[Camera], scale: float) -> Callable[[SplatModel], None]:
-    """What is called before each step: it lets a field be evaluated where splats are, once that is no longer nearly where it was evaluated last."""
-    moving: Any = base
-    if not _follows(base):
-        return lambda student: None
-    pixel = float(pixel_size(base.parameters()["means"].detach(), views).median()) / scale
-    reach = moving.reach(pixel)
-
-    def follow(student: Any) -> None:
-        student.follow(reach)
-
-    return follow
-
-
-def _follows(base: SplatModel) -> bool:
-    """Whether a model keeps what its field was evaluated to; one of a third party need not."""
-    return base.traits.moves and hasattr(base, "follow")
-
-
-def keep_rows(model: SplatModel, rows: Tensor) -> None:
-    """Tell a model that follows its splats which `rows` [M], ascending, are going to be left."""
-    if callable(keep := getattr(model, "keep_rows", None)):
-        keep(rows)
-
-
-def release(model: SplatModel) -> None:
-    """Let a field be evaluated exactly where the splats are, from now on."""
-    if getattr(model, "held", None) is not None:
-        model.held = None  # type: ignore[attr-defined]  # of a model that follows its splats

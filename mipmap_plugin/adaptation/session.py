@@ -16,9 +16,10 @@ from torch import Tensor
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, is_true
+from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
-from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments, follower, release
-from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_note, takes_steps
+from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
+from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
@@ -80,7 +81,8 @@ class Session:
         self.targets, self.has_gradients, self.backend_note = request.targets, request.has_gradients, request.backend_note
         self.effects = next(iter(self.targets.values()))
         self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
-        self.asked_steps, config = config.steps, self._affordable(fitting(config, self.base_effects), cameras)
+        asked, near = fitting(config, self.base_effects), self.effects.near_plane
+        self.asked_steps, config = config.steps, affordable_for_model(asked, self.base, cameras, near)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs = request.finer, dict(request.inputs)
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.base.parameters()["means"].device)
@@ -101,12 +103,6 @@ class Session:
         first, *further = [Renderer(self.backend, target) for target in self.extremes.values()]
         self.validation = Validation(steering, choosing, scale, truth, first, config.resize, further)
 
-    def _affordable(self, config: AdaptConfig, cameras: list[Camera]) -> AdaptConfig:
-        """The settings with no more steps than a scene of this size can have."""
-        if not self.base.traits.same_for_all_views:
-            return config
-        return affordable_for(config, self.base.parameters()["means"], cameras, self.effects.near_plane)
-
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
         means = self.base.parameters()["means"]
@@ -116,7 +112,7 @@ class Session:
         if len(shown := showing(validation, means, self.base_effects.near_plane)) > 1:  # one to steer by, and one to choose by
             validation = shown  # others are the same in every state
         if self.base.traits.moves:
-            moments = None if self._has_photographs else self.config.moments  # a photograph shows no moment but its own
+            moments = None if self._has_photographs else affordable_moments(self.config, self.base)  # a photograph shows no moment but its own
             views, validation, note = at_their_moments(views, validation, self.config.model_copy(update={"moments": moments}), note)
         return views, validation, note
 
@@ -187,7 +183,7 @@ class Session:
         first, *further = [Renderer(self.backend, target) for target in targets]
         together, stepping = views_renderer(self.backend, targets), SteppingRenderer.of(self.backend, targets)
         task = Task(self.views, self.scale, self.truth, first, self._white, self.validation, self.detail, max_splats, further, together, stepping)
-        task = replace(task, follow=follower(self.base, self.views, self.scale))
+        task = replace(task, follow=Following(self.base, self.views, self.scale))
         keeper = StateKeeper(resume, self._fingerprint())
         if not any(target.sh_degree for target in self.extremes.values()) and (unused := student.parameters().get("shN")) is not None:
             unused.requires_grad_(False)  # no viewer evaluates view-dependent color, so that these coefficients need no gradient

@@ -177,7 +177,8 @@ class Adapter:
 
 def alike(one: Camera, other: Camera) -> bool:
     """Whether two cameras give the same picture."""
-    return one.size == other.size and (one.fx, one.fy) == (other.fx, other.fy) and torch.equal(one.viewmat, other.viewmat)
+    same = one.size == other.size and (one.fx, one.fy, one.time) == (other.fx, other.fy, other.time)
+    return same and torch.equal(one.viewmat, other.viewmat)
 
 
 class Live:

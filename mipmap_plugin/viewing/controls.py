@@ -16,6 +16,9 @@ from mipmap_plugin.viewing.stage import Look, Picture
 STOPS = (-6.0, 4.0, 0.1)
 MARKS = tuple((float(stop), zoom_name(2.0**stop)) for stop in (-6, -3, 0, 2, 4))  # as many as have room on a phone
 
+# The slider of a moving scene's moments: the least and the last one, and a step.
+MOMENTS = (0.0, 1.0, 0.01)
+
 # Words for what is None in the state.
 AS_TRAINED, NOTHING = "as trained", "nothing"
 
@@ -35,8 +38,11 @@ LEAST_S, USUAL_S, MOST_S = 1.0, 30.0, 3600.0
 class Controls:
     """The elements of the panel."""
 
-    def __init__(self, gui: Any, names: Sequence[str], viewers: Sequence[str], views: Sequence[str], recipes: Sequence[str]) -> None:
-        """`gui`: viser's; `names` of what can be shown; `viewers`, the chosen one first, None as AS_TRAINED."""
+    def __init__(
+        self, gui: Any, names: Sequence[str], viewers: Sequence[str], views: Sequence[str], recipes: Sequence[str], moment: float | None = None
+    ) -> None:
+        """`gui`: viser's; `names` of what can be shown; `viewers`, the chosen one first, None as AS_TRAINED; `moment`: of a moving scene, the
+        one that is shown first."""
         self._stops = 0.0, 0.0  # of the slider: for the last picture, and where it was then
         self.figures = gui.add_markdown("drawing the first picture ...")
         with gui.add_folder("Show"):
@@ -50,6 +56,7 @@ class Controls:
             )
             self.by = gui.add_dropdown("Zoom by", (DISTANCE, LENS), initial_value=DISTANCE)
             self.view = gui.add_dropdown("Go to view", (NOWHERE, *views), initial_value=NOWHERE)
+            self.time = None if moment is None else gui.add_slider("Time", *MOMENTS, initial_value=moment, hint="moment of a moving scene, 0 to 1")
         with gui.add_folder("Adapt"):
             self.seconds = gui.add_number("Seconds", USUAL_S, min=LEAST_S, max=MOST_S, step=1.0, hint="at most")
             self.recipe = gui.add_dropdown("Recipe", recipes, initial_value=recipes[0])
@@ -66,8 +73,14 @@ class Controls:
         """What the page is set to."""
         against, viewer = self.against.value, self.viewer.value
         return Look(
-            self.source.value, None if against == NOTHING else against, None if viewer == AS_TRAINED else viewer, int(self.pixel.value)
+            self.source.value, None if against == NOTHING else against, None if viewer == AS_TRAINED else viewer, int(self.pixel.value),
+            None if self.time is None else self.time.value,
         )  # fmt: skip
+
+    def show_moment(self, moment: float | None) -> None:
+        """Set the slider of a moving scene to a moment; None: leave it."""
+        if self.time is not None and moment is not None:
+            self.time.value = moment
 
     def offer(self, names: Sequence[str], shown: str) -> None:
         """Offer other things to show, and show one of them."""

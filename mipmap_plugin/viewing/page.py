@@ -1,15 +1,11 @@
-"""The live view in a browser (extra `view`): viser serves the page, and this draws what its cameras see."""
+"""The live view in a browser: viser serves the page, and this draws what its cameras see."""
 
 from __future__ import annotations
 
-import contextlib
-import errno
-import io
-import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -17,18 +13,17 @@ from typing import Any
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import MipmapPluginError, SettingsError, install
+from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.viewing.adapting import Adapter, Live, Wish
 from mipmap_plugin.viewing.controls import AS_TRAINED, DISTANCE, NOWHERE, Controls
 from mipmap_plugin.viewing.pace import STILL_S, Pace
 from mipmap_plugin.viewing.screen import Pose, by_distance, by_lens, pose_of, up_of, zoomed
+from mipmap_plugin.viewing.server import served, without_words
 from mipmap_plugin.viewing.sources import File, of_adapted
 from mipmap_plugin.viewing.stage import Look, Stage, smaller
 
 OUT_OF_MEMORY = "out of memory; enlarge pixels, or make the window smaller"
-
-NO_VISER = f"the live view needs viser; {install('view')}"
 
 # Of JPEG, while the camera moves; pictures that stay are PNGs, whose pixels are exact.
 QUALITY = 80
@@ -75,7 +70,7 @@ class Page:
         self.adapter = Adapter(stage.base, stage.reference, self._progressed)
         self._live = stage.add(Live(self.adapter, base))
         self._views = by_name(stage.base.views())
-        self._server = _server(settings.host, settings.port)
+        self._server = served(settings.host, settings.port)
         self._prepare()
 
     @property
@@ -96,7 +91,7 @@ class Page:
     def close(self) -> None:
         """End a run that is adapting, and the server."""
         self.adapter.close()
-        with _without_words():
+        with without_words():
             self._server.stop()
 
     def _prepare(self) -> None:
@@ -106,14 +101,15 @@ class Page:
         server.gui.set_panel_label(settings.title)
         server.gui.main_panel.dock_right()  # beside the picture, not on it
         viewers = [viewer or AS_TRAINED for viewer in settings.viewers]
-        self._controls = Controls(server.gui, self._names(), viewers, list(self._views), settings.recipes)
-        first = self._pose(next(iter(self._views.values())))
+        view = next(iter(self._views.values()))
+        first, moment = self._pose(view), view.time or 0.0 if self._stage.base.model.traits.moves else None
+        self._controls = Controls(server.gui, self._names(), viewers, list(self._views), settings.recipes, moment)
         server.scene.set_up_direction(up_of(list(self._views.values())))
         camera = server.initial_camera
         camera.position, camera.look_at, camera.fov = first.position, first.look_at, first.fov
         server.on_client_connect(self._connected)
         controls = self._controls
-        for element in (controls.source, controls.against, controls.viewer, controls.pixel):
+        for element in filter(None, (controls.source, controls.against, controls.viewer, controls.pixel, controls.time)):
             element.on_update(lambda _: self._changed.set())
         controls.zoom.on_update(self._zoom)
         controls.view.on_update(self._go)
@@ -194,6 +190,7 @@ class Page:
         if event.client is not None and view is not None:
             self._slider_of = None  # the new view has a zoom of its own
             _move(event.client, self._pose(view))
+            self._controls.show_moment(view.time)
             self._controls.view.value = NOWHERE
 
     def _adapt(self, event: Any) -> None:
@@ -203,7 +200,7 @@ class Page:
         (pose, width, height), look = _view(event.client), self._controls.look()
         screen = smaller(pose.camera(width, height), 1 / look.pixel)
         zoom = self._stage.sampling.of(screen).zoom
-        wish = Wish(screen, pose.look_at, zoom, look.viewer, self._controls.seconds.value, self._controls.recipe.value)
+        wish = Wish(replace(screen, time=look.time), pose.look_at, zoom, look.viewer, self._controls.seconds.value, self._controls.recipe.value)
         try:
             self.adapter.start(wish, self._ended)
         except SettingsError:  # another browser was quicker
@@ -251,33 +248,6 @@ def by_name(views: Sequence[Camera]) -> dict[str, Camera]:
         name = view.name or f"view {number}"
         named[name if name not in named else next(each for again in count(2) if (each := f"{name} ({again})") not in named)] = view
     return named
-
-
-def _server(host: str, port: int) -> Any:
-    """viser's server at the first free port from `port` on. Raises SettingsError."""
-    try:
-        import viser
-    except ImportError as error:
-        raise SettingsError(NO_VISER) from error
-    _check_address(host, port)
-    with _without_words():
-        return viser.ViserServer(host=host, port=port, verbose=False)
-
-
-def _without_words() -> contextlib.AbstractContextManager[Any]:
-    """viser prints that it starts and stops, quiet or not; what is to be said is said by the command."""
-    return contextlib.redirect_stdout(io.StringIO())
-
-
-def _check_address(host: str, port: int) -> None:
-    """Raise SettingsError for an address that cannot be served; viser itself would wait forever. A port that is taken is no such thing."""
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.bind(address)
-    except (OSError, OverflowError, UnicodeError) as error:
-        if getattr(error, "errno", None) != errno.EADDRINUSE:
-            raise SettingsError(f"nothing can be served at {host}, port {port} ({error}); give --host 127.0.0.1 and a --port above 1023") from error
 
 
 def _view(client: Any) -> tuple[Pose, int, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ class Look:
     against: str | None = None  # name of what it is compared with: the difference is shown; None: the picture itself
     viewer: str | None = None  # as which viewer draws; None: as in its training
     pixel: int = 1  # px of the screen along each side of a pixel of the picture
+    time: float | None = None  # moment of a moving scene, 0..1; None: nothing moves
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,7 @@ class Stage:
     def draw(self, look: Look, screen: Camera, coarse: float = 1.0) -> Picture:
         """Draw what a screen shows; `coarse`: the fraction of its width and height that is drawn. Raises SettingsError, BackendUnavailable."""
         began = time.perf_counter()
-        camera = smaller(screen, 1 / look.pixel)
+        camera = smaller(replace(screen, time=look.time), 1 / look.pixel)
         zoom = self.sampling.of(camera).zoom
         drawn = smaller(camera, coarse)
         request = Request(drawn, zoom, look.viewer, drawn.height / camera.height if coarse < 1 else 1.0)

@@ -111,9 +111,9 @@ class LivePage:
         """Press a button."""
         self.page.get_by_role("button", name=button, exact=True).click()
 
-    def slide(self, steps: int) -> None:
-        """Move the slider of zooms by keys."""
-        self.page.get_by_role("slider").first.focus()
+    def slide(self, steps: int, slider: int = 0) -> None:
+        """Move a slider by keys: that of zooms, or with 1 that of moments."""
+        self.page.get_by_role("slider").nth(slider).focus()
         for _ in range(abs(steps)):
             self.page.keyboard.press("ArrowRight" if steps > 0 else "ArrowLeft")
 

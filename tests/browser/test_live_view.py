@@ -7,8 +7,12 @@ import json
 import shutil
 import signal
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import moving
 import numpy as np
 import pytest
 import torch
@@ -49,31 +53,48 @@ def others(base: Wrapped) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def page(base: Wrapped, others: list[Path]) -> Iterator[LivePage]:
-    """The page, which all tests use in turn; fails at the end if it had an error or asked for anything from elsewhere."""
+def chromium() -> Iterator[Any]:
+    """The browser."""
+    if lacking := missing():
+        pytest.skip(lacking)
     from playwright.sync_api import sync_playwright
 
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox", *FLAGS])
+        yield browser
+        browser.close()
+
+
+@contextmanager
+def opened(chromium: Any, words: list[Path]) -> Iterator[LivePage]:
+    """The page of the command with these words; fails at the end if it had an error or asked for anything from elsewhere."""
     complaints: list[str] = []
-    with serving([base.model.folder, *others]) as (_, address), sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox", *FLAGS])
+    with serving(words) as (_, address):
         tab = chromium.new_page(viewport=WINDOW)
         tab.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
         tab.on("pageerror", lambda error: complaints.append(str(error)))
         tab.on("request", lambda asked: complaints.append(asked.url) if not asked.url.startswith((address, "data:", "blob:")) else None)
         yield LivePage(tab, address)
-        chromium.close()
+        tab.close()
     assert complaints == []
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Any, base: Wrapped, others: list[Path]) -> Iterator[LivePage]:
+    """The page, which most tests use in turn."""
+    with opened(chromium, [base.model.folder, *others]) as page:
+        yield page
 
 
 def image(png: bytes) -> torch.Tensor:
     return torch.from_numpy(np.array(Image.open(io.BytesIO(png)).convert("RGB"), dtype=np.float32) / 255)
 
 
-def expected(base: Wrapped, shown: torch.Tensor, view: int) -> torch.Tensor:
-    """The base as our own backend draws it from a view, in as many pixels."""
+def expected(base: Wrapped, shown: torch.Tensor, view: int, time: float | None = None) -> torch.Tensor:
+    """The base as our own backend draws it from a view, in as many pixels, at a moment."""
     camera = base.cameras[view]
     pose = pose_of(camera, Sampling(base.model.parameters()["means"], base.cameras).of(camera).depth)
-    return base.render(pose.camera(shown.shape[1], shown.shape[0])).image
+    return base.render(replace(pose.camera(shown.shape[1], shown.shape[0]), time=time)).image
 
 
 def like(base: Wrapped, page: LivePage, view: int) -> bool:
@@ -197,6 +218,21 @@ def test_a_run_is_stopped(page: LivePage) -> None:
     page.press("Stop")
     page.wait_for("dB on views that nothing was adapted to")
     assert page.page.get_by_role("button", name="Stop", exact=True).is_disabled()
+
+
+def test_the_slider_of_a_moving_scene_shows_a_moment(chromium: Any, tmp_path: Path) -> None:
+    far = {name: tensor * (5 if name.startswith("gaussian_warp") else 1) for name, tensor in moving.deform_state().items()}
+    scene = wrap_model(moving.write_deformable(tmp_path / "moving", far))
+
+    def moment() -> float:
+        """The moment that the picture is most like."""
+        shown = image(page.picture())
+        return max((0.0, 0.5, 1.0), key=lambda time: psnr(shown, expected(scene, shown, 0, time)))
+
+    with opened(chromium, [scene.model.folder]) as page:
+        assert page.becomes(lambda: moment() == 0)
+        page.slide(50, slider=1)  # hundredths
+        assert page.becomes(lambda: moment() == 0.5)
 
 
 def test_ctrl_c_ends_it(base: Wrapped) -> None:

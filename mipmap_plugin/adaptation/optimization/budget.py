@@ -6,12 +6,15 @@ Without it a short run spends its time on the truths of views that it hardly use
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
 
 from mipmap_plugin.adaptation.curve import Stopwatch
+from mipmap_plugin.adaptation.following import Following
+from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -31,6 +34,10 @@ SPARE = 1.25
 REPEATS = 2
 
 
+# Different states of the splats of which the best is chosen after the steps: the start, the best and the last one.
+STATES = 3
+
+
 @dataclass(frozen=True)
 class Pace:
     """Seconds."""
@@ -38,22 +45,33 @@ class Pace:
     a_view: float  # of a step, for each of its views
     a_truth: float
     a_check: float
+    a_choice: float = 0.0  # among the states, after the steps
 
     @classmethod
     @torch.no_grad()
     def of(cls, student: SplatModel, task: Task) -> Pace:
         """The pace of a run over `student`. The truths that are made for it are used later."""
-        views = task.views[:REPEATS]
+        views, validation = task.views[:REPEATS], task.validation
         cameras = [view.zoomed(task.scale) for view in views]
         device = student.parameters()["means"].device
-        images = [_seconds(lambda camera: task.render(student.gaussians(camera), camera), camera, device) for camera in cameras]
+        image = min(_seconds(lambda camera: task.render(student.gaussians(camera), camera), camera, device) for camera in cameras)
         truths = [_seconds(task.truth, view, device) for view in views]
-        return cls(STEP_OVER_IMAGE * min(images), min(truths), min(images) * len(task.validation.steering))
+        moments = {view.time for view in validation.choosing} if task.follow.moments else ()
+        choice = STATES * (len(validation.choosing) * image + len(moments) * task.follow.evaluation)
+        return cls(STEP_OVER_IMAGE * image, min(truths), image * len(validation.steering), choice)
 
-    def steps(self, config: AdaptConfig, seconds: float) -> int:
-        """The number of steps that take so many seconds, with the truths and the checks that they need."""
-        a_step = config.views_per_step * (self.a_view + self.a_truth / USES) + self.a_check / config.check_every
-        return max(1, int(SPARE * seconds / a_step))
+    def a_step(self, config: AdaptConfig) -> float:
+        """With its part of the truths and the checks."""
+        return config.views_per_step * (self.a_view + self.a_truth / USES) + self.a_check / config.check_every
+
+    def steps(self, config: AdaptConfig, seconds: float, follow: Following) -> int:
+        """The number of steps that take so many seconds, with the truths, the checks and the evaluations of a field that they need."""
+
+        def needed(steps: int) -> float:
+            return steps * self.a_step(config) + Evaluations(follow, config.model_copy(update={"steps": steps})).of_all_steps()
+
+        most = max(1, int(SPARE * seconds / self.a_step(config)))
+        return max(1, bisect_right(range(1, most + 1), SPARE * seconds, key=needed)) if follow.moments else most
 
 
 def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, AdaptConfig]:
@@ -61,11 +79,14 @@ def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, Adap
 
     Only of runs that introduce their views one after the other; those of other recipes are short, or take all views from the start.
     """
-    if config.time_budget_s is None or not config.gathering or not task.views or run.watch.seconds >= config.time_budget_s:
+    if config.time_budget_s is None or not task.views or run.watch.seconds >= config.time_budget_s:
         return task, config
     with run.watch:
         pace = Pace.of(run.student, task)
-    steps = min(config.steps, run.step + pace.steps(config, config.time_budget_s - run.watch.seconds))
+    run.reserved = pace.a_choice
+    if not config.gathering:
+        return task, config
+    steps = min(max(config.steps, config.most_steps or 0), run.step + pace.steps(config, max(0.0, config.time_budget_s - run.seconds), task.follow))
     views = max(config.views_per_step, math.ceil(steps * config.views_per_step / USES))
     return replace(task, views=evenly(task.views, views)), config.model_copy(update={"steps": steps})
 

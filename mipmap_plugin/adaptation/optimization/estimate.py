@@ -16,6 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mipmap_plugin import threads
+from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -30,19 +31,20 @@ class Costs:
     truths: dict[Camera, float] = field(default_factory=dict)  # of making the truth of each view
     checks: list[float] = field(default_factory=list)  # of each comparison with the validation views
     earlier: tuple[float, float] = (0.0, 0.0)  # of truths and of checks, in the processes that a run was interrupted in
+    motion: Callable[[], float] = lambda: 0.0  # of evaluating the field of a moving scene, so far; not part of the others
 
     def truth(self, view: Camera, make: Callable[[Camera], Tensor]) -> Tensor:
         """Return the truth of a view; the first time, note how long it took."""
-        began = time.perf_counter()
+        began = time.perf_counter() - self.motion()
         image = make(view)
-        self.truths.setdefault(view, (time.perf_counter() - began) / threads.side_by_side_now())
+        self.truths.setdefault(view, (time.perf_counter() - self.motion() - began) / threads.side_by_side_now())
         return image
 
     def check(self, validate: Callable[[], Result]) -> Result:
         """Return the result of a validation, and note how long it took."""
-        began = time.perf_counter()
+        began = time.perf_counter() - self.motion()
         result = validate()
-        self.checks.append(time.perf_counter() - began)
+        self.checks.append(time.perf_counter() - self.motion() - began)
         return result
 
     def sums(self) -> tuple[float, float]:
@@ -61,21 +63,26 @@ class Forecast:
     schedule: ViewSchedule
     config: AdaptConfig
     checks: Sequence[int]  # the steps after which the run is checked, in order
+    evaluations: Evaluations  # of the field of a moving scene
     first_step: int = 0  # steps that an earlier process has done
     history: list[tuple[int, float]] = field(default_factory=list)  # draws and seconds of the views alone, before each step of this process
 
-    def left(self, step: int, seconds: float, costs: Costs) -> float:
-        """Seconds left after `step`, of which everything since the first step has taken `seconds`; infinity before there is a step."""
+    def left(self, step: int, seconds: float, costs: Costs, ceiling: float = 1.0) -> float:
+        """Seconds left after `step`, of which everything since the first step has taken `seconds`; infinity before there is a step.
+
+        `ceiling`: of the rates' factor (`Steering`).
+        """
         first, done, last = (self.schedule.draws_before(number) for number in (self.first_step, step, self.config.steps))
         if done == first:
             return math.inf
-        self.history.append((done, seconds - costs.seconds()))
+        self.history.append((done, seconds - costs.seconds() - self.evaluations.spent()))
         # Since half of the steps: the first ones take longer than all others.
         draws, spent = self.history[len(self.history) // 2 - 1] if len(self.history) > 1 else (first, 0.0)
         a_view = (self.history[-1][1] - spent) / (done - draws)
         new_views = max(0, min(self.schedule.views, last) - len(costs.truths))
         checks = len(self.checks) - bisect_right(self.checks, step)
-        return (last - done) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks)
+        motion = self.evaluations.seconds(step, ceiling, last - done, checks)
+        return (last - done) * a_view + new_views * _mean(costs.truths.values()) + checks * _mean(costs.checks) + motion
 
 
 def _mean(seconds: Any) -> float:

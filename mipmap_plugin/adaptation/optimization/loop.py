@@ -14,6 +14,7 @@ from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.estimate import BAR, Bar, Forecast
+from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.losses import gradient_of
@@ -47,10 +48,12 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     """
     order, cameras = ViewSchedule(task.views, config), {view: view.zoomed(task.scale) for view in task.views}
     checks = [step for step in range(1, config.steps + 1) if is_checked(step, config)]
-    forecast, began = Forecast(order, config, checks, run.step), run.watch.seconds - run.costs.seconds()
+    run.costs.motion = lambda: task.follow.seconds
+    forecast = Forecast(order, config, checks, Evaluations(task.follow, config, len(task.validation.steering)), run.step)
+    began = run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
     with bar, ticking(bar), interruptible() as interrupted:
-        reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.watch.seconds, config)
+        reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.seconds, config)
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
@@ -59,11 +62,12 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
                     _step(run, task, config, views, cameras)
                 if is_checked(run.step, config):
                     _check(run, task, config)
-            bar.seconds_left = min(forecast.left(run.step, run.watch.seconds - began, run.costs), _budget_left(run, config))
+            left = forecast.left(run.step, run.watch.seconds - began, run.costs, run.steering.ceiling)
+            bar.seconds_left = min(left, _budget_left(run, config))
             bar.update()
             if run.curve[-1].step == run.step:
                 bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
-            reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.watch.seconds, config)
+            reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.seconds, config)
             if interrupted():
                 on_interrupt(run)
         with run.watch:
@@ -74,7 +78,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
 
 
 def _budget_left(run: Run, config: AdaptConfig) -> float:
-    return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - run.watch.seconds)
+    return math.inf if config.time_budget_s is None else max(0.0, config.time_budget_s - run.seconds)
 
 
 def is_checked(step: int, config: AdaptConfig) -> bool:

@@ -30,13 +30,18 @@ def make_optimizer(model: SplatModel, config: AdaptConfig, pixel: float) -> Adam
 
 
 def set_rates(optimizer: Adam, config: AdaptConfig, progress: float, rate_factor: float, frozen: Collection[str] = ()) -> None:
-    """Set all learning rates for `progress` (0..1): cosine decay (Loshchilov and Hutter 2017, SGDR, equation 5) times `rate_factor`.
+    """Set all learning rates for `progress` (0..1): `decayed`, times `rate_factor`.
 
     The rates of the groups named in `frozen` are 0.
     """
-    factor = rate_factor * (config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2)
+    factor = rate_factor * decayed(config, progress)
     for group in optimizer.param_groups:
         group["lr"] = 0.0 if group["name"] in frozen else group["base_lr"] * factor
+
+
+def decayed(config: AdaptConfig, progress: float) -> float:
+    """What is left of learning rates at `progress` (0..1): cosine decay (Loshchilov and Hutter 2017, SGDR, equation 5)."""
+    return config.decay + (1 - config.decay) * (1 + math.cos(math.pi * progress)) / 2
 
 
 def restore_snapshot(model: SplatModel, optimizer: Adam, snapshot: Snapshot) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
+from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
@@ -44,7 +45,7 @@ class Task:
     further_renders: Sequence[Callable[[Gaussians, Camera], Tensor]] = ()  # `render` of further viewers that the same splats are adapted for
     render_views: ViewsRenderer | None = None  # the same in one call, if the backend can
     render_to_step: SteppingRenderer | None = None  # the same if the backend can move the splats itself
-    follow: Callable[[SplatModel], None] = lambda student: None  # called before each step (`moments.follower`)
+    follow: Following = field(default_factory=Following)  # called before each step
 
     def renderer(self, draw: int) -> Callable[[Gaussians, Camera], Tensor]:
         """The function that renders the `draw`-th view since the beginning: the viewers take turns."""
@@ -106,6 +107,7 @@ class Run:
     ended_by: str = ""  # why it takes no further step; "" while it does
     by_rows: ByRows | None = None  # the student, while the backend moves it
     threads: QuickestThreads = field(default_factory=QuickestThreads)
+    reserved: float = 0.0  # seconds of a time budget for what comes after the steps
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
@@ -113,7 +115,7 @@ class Run:
         means = student.parameters()["means"]
         optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch(seconds=spent)
         with watch:
-            trial, costs = Trial.begin(student, task, config), Costs()
+            trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds)
             quality = costs.check(lambda: task.validation.quality(student))
             steering = Steering.begin(student, quality.visible)
         first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=count_of(student, task.views[0]))
@@ -121,7 +123,12 @@ class Run:
 
     def progress(self, config: AdaptConfig) -> float:
         """Fraction (0..1) of the steps that is over, or of what the start left of the time budget, whichever is larger."""
-        return progress(self.step, self.watch.seconds, config, self.curve[0].seconds)
+        return progress(self.step, self.seconds, config, self.curve[0].seconds + self.reserved)
+
+    @property
+    def seconds(self) -> float:
+        """What is gone of a time budget."""
+        return self.watch.seconds + self.reserved
 
     def states(self, initial: SplatModel) -> dict[str, SplatModel]:
         """The best and the last state, where they differ from the start (the `initial` model) and from each other, by what reports call them."""

@@ -186,6 +186,12 @@ def _validation_views(cameras: Sequence[Camera], views: Sequence[Camera], means:
     return adapted, [view for pair in zip(random, kept, strict=False) for view in pair] + random[len(kept) :]
 
 
+def warmed_up(step: int, config: AdaptConfig) -> float:
+    """The factor of every rate after `step` steps as far as nothing does harm: it rises geometrically to 1 during the warm-up."""
+    warm_up = config.warm_up_steps
+    return FIRST_RATE_FACTOR ** (1 - step / warm_up) if step < warm_up else 1.0
+
+
 @dataclass
 class Steering:
     """The progress of a run on the steering views: its best state, and a limit on its rates."""
@@ -204,9 +210,7 @@ class Steering:
 
     def rate_factor(self, step: int, config: AdaptConfig) -> float:
         """The factor of every rate after `step` steps: it rises geometrically to 1 during the warm-up, and is at most the ceiling."""
-        warm_up = config.warm_up_steps
-        factor = FIRST_RATE_FACTOR ** (1 - step / warm_up) if step < warm_up else 1.0
-        return min(factor, self.ceiling)
+        return min(warmed_up(step, config), self.ceiling)
 
     def is_harmful(self, psnr: float, *, rising: bool = False) -> bool:
         """Whether a state with this PSNR is worse than the start or, while rates are `rising`, has lost much of what was gained."""

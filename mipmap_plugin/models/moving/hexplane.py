@@ -40,6 +40,9 @@ CHANGED = dict(zip(HEADS, ("means", "scales", "quats", "opacities", "sh"), stric
 # The two coordinates of each plane of a scale: xy, xz, xt, yz, yt, zt.
 PLANES = list(combinations(range(4), 2))
 
+# Splats drawn and differentiated in the time of one look-up with its slopes and its part of the network: 12 take 21 µs, and a splat 0.7.
+DRAWS_A_LOOK_UP = 2.5
+
 # Options that the published code describes as useless; no published model was trained with them.
 UNREAD = ("empty_voxel", "grid_pe")
 
@@ -60,7 +63,7 @@ class HexPlane:
         self.depth = len(list(takewhile(lambda layer: f"feature_out.{2 * layer}.weight" in self._weights, count())))
         self._check(where)
         self.is_still = self._is_still()
-        self.cost = self._cost()
+        self.cost, self.work = self._cost(), DRAWS_A_LOOK_UP * len(PLANES) * self.scales
 
     def moved(self, canonical: VanillaModel, changes: Changes) -> Gaussians:
         """The splats after `changes`, which apply to the raw parameters, before activation."""

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from time import perf_counter
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.threads import for_views, side_by_side
+from mipmap_plugin.limits import memory
+from mipmap_plugin.threads import for_views, side_by_side, side_by_side_now
 
 # What a field adds to each parameter, or multiplies it by, at one moment, by name: [N, ...] each.
 Changes = dict[str, Tensor]
 
-# Bytes that are kept: 500 moments of 39,000 splats, 20 of a million.
-LIMIT = 1 << 30
+# Bytes that are kept, and the part of a machine's memory that is, where it is more. A moment of a million splats takes 40 to 240 MB.
+LIMIT, PART = 1 << 30, 1 / 8
 
 # Splats that are evaluated together: their numbers stay in a processor's cache from layer to layer, which halves the time.
 CHUNK, CHUNK_OF_GPU = 4096, 1 << 16
@@ -25,37 +25,40 @@ CHUNK, CHUNK_OF_GPU = 4096, 1 << 16
 PROBED, MOMENTS = 1024, (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
-@dataclass(eq=False)
-class _Moment:
-    """What is known of one moment: of the means that it was asked for first, which are the base's, and of those since."""
-
-    known: list[tuple[Tensor, Changes]] = field(default_factory=list)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def nbytes(self) -> int:
-        return sum(tensor.nbytes for place, changes in self.known for tensor in (place, *changes.values()))
-
-
 class Memory:
-    """A field's changes by means and moment. A model and its copies share it, so that one is evaluated where another was."""
+    """A field's changes by means and moment. A model and its copies share it, so that one is evaluated where another was.
 
-    def __init__(self, evaluate: Callable[[Tensor, float], Changes], limit: int = LIMIT) -> None:
-        """`evaluate`: means [N, 3] and a time -> their changes; `limit`: bytes."""
+    Of each moment those at the first means of all, which are the base's, are kept, and those at the means that were asked for last. Where there is
+    no room for all, what was found at other means makes some, and then what was found at the base's. Nothing else is forgotten for something new:
+    all moments are asked for in turn, so that each would be forgotten before it is of use.
+    """
+
+    def __init__(self, evaluate: Callable[[Tensor, float], Changes], limit: float | None = None) -> None:
+        """`evaluate`: means [N, 3] and a time -> their changes; `limit`: bytes; None: what suits the machine."""
         self._evaluate, self._limit = evaluate, limit
-        self._moments: OrderedDict[float, _Moment] = OrderedDict()
+        self._base: Tensor | None = None  # means [N, 3]
+        self._latest: Tensor | None = None
+        self._known: dict[tuple[bool, float], tuple[Tensor, Changes]] = {}  # by whether it is the base's, and time; with the means
+        self._asked: dict[float, threading.Lock] = {}  # by time
         self._lock = threading.Lock()
+        self.seconds, self.evaluations = 0.0, 0  # that moments took, and how many there were
 
     def __call__(self, means: Tensor, time: float) -> Changes:
         """The changes at `means` [N, 3], without gradient; not to be changed in place."""
-        moment = self._moment(time)
-        with moment.lock:  # other threads may ask for the same moment
-            for place, changes in moment.known:
-                if torch.equal(place, means):
-                    return changes
+        with self._asked.setdefault(time, threading.Lock()):  # other threads may ask for the same moment
+            if (known := self._find(means, time)) is not None:
+                return known
+            began = perf_counter()
             changes = self.evaluate(means, time)
-            moment.known = [*moment.known[:1], (means.clone(), changes)]
-        self._forget()
+            with self._lock:
+                self.seconds += (perf_counter() - began) / side_by_side_now()  # of several side by side the time that passed
+                self.evaluations += 1
+                self._keep(means, time, changes)
         return changes
+
+    def knows(self, means: Tensor, time: float) -> bool:
+        """Whether the changes at `means` [N, 3] need not be evaluated."""
+        return self._find(means, time) is not None
 
     @torch.no_grad()
     def evaluate(self, means: Tensor, time: float) -> Changes:
@@ -66,13 +69,10 @@ class Memory:
 
     def keep_rows(self, means: Tensor, rows: Tensor, left: Tensor) -> None:
         """Know what is known at `means` [N, 3] also of their `rows` [M], which are `left` [M, 3]."""
-        for moment in list(self._moments.values()):
-            with moment.lock:
-                for place, changes in moment.known:
-                    if torch.equal(place, means):
-                        kept = left, {name: tensor[rows] for name, tensor in changes.items()}
-                        moment.known = [*moment.known[:1], kept]
-                        break
+        with self._lock:
+            known = {time: changes for (_, time), (place, changes) in self._known.items() if torch.equal(place, means)}
+            for time, changes in known.items():
+                self._keep(left, time, {name: tensor[rows] for name, tensor in changes.items()})
 
     @torch.no_grad()
     def slope(self, means: Tensor, distance: float) -> float:
@@ -83,22 +83,33 @@ class Memory:
         apart = [shift(self.evaluate(beside, time)) - shift(self.evaluate(some, time)) for time in MOMENTS]
         return float(torch.stack(apart).square().sum(-1).mean().sqrt()) / distance
 
-    def _moment(self, time: float) -> _Moment:
-        with self._lock:
-            moment = self._moments.setdefault(time, _Moment())
-            self._moments.move_to_end(time)
-        return moment
+    def _find(self, means: Tensor, time: float) -> Changes | None:
+        places = (self._known.get((is_base, time)) for is_base in (True, False))
+        return next((known[1] for known in places if known is not None and torch.equal(known[0], means)), None)
 
-    def _forget(self) -> None:
-        """Forget the moments that were of use longest ago, once there are too many."""
-        with self._lock:
-            sizes = [moment.nbytes() for moment in self._moments.values()]
-            total = sum(sizes)
-            for size in sizes[:-1]:
-                if total <= self._limit:
-                    return
-                self._moments.popitem(last=False)
-                total -= size
+    def _keep(self, means: Tensor, time: float, changes: Changes) -> None:
+        """Keep what was found at `means` [N, 3], if there is room or what is of less use makes some."""
+        base = self._base = means.clone() if self._base is None else self._base
+        place, is_base = base, torch.equal(base, means)
+        if not is_base:
+            if self._latest is None or not torch.equal(self._latest, means):
+                self._latest = means.clone()  # which all moments share
+            place = self._latest
+        self._known.pop((is_base, time), None)
+        stale = [key for key, (old, _) in self._known.items() if old is not base and old is not self._latest]
+        of_base = [] if is_base else [key for key in self._known if key[0]]
+        limit = max(LIMIT, PART * memory(means.device)) if self._limit is None else self._limit
+        room = limit - sum(_bytes(known) for _, known in self._known.values()) - _bytes(changes)
+        for key in (*stale, *of_base):
+            if room >= 0:
+                break
+            room += _bytes(self._known.pop(key)[1])
+        if room >= 0 or not self._known:
+            self._known[is_base, time] = place, changes
+
+
+def _bytes(changes: Changes) -> int:
+    return sum(tensor.nbytes for tensor in changes.values())
 
 
 def shift(changes: Changes) -> Tensor:

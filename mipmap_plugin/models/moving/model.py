@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -40,6 +41,7 @@ class Field(Protocol):
     changes_opacities: bool
     is_still: bool  # the field changes no splat, and need not be evaluated
     cost: str  # of one evaluation, counted
+    work: float  # of an evaluation at one splat: so many splats are drawn in its time, by the processor's kernels
 
     def changes(self, means: Tensor, time: float) -> Changes:
         """What it changes at `means` [N, 3] and `time` (0..1), without gradient: that of a mean through the field is left out."""
@@ -95,6 +97,11 @@ class MovingModel:
         return not self.field.is_still
 
     @property
+    def work(self) -> float:
+        """How many splats are drawn in the time that the field takes for one."""
+        return self.field.work
+
+    @property
     def traits(self) -> Traits:
         effect = Effect("time", self.moves, "a field moves the splats" if self.moves else "the field changes no splat", self.field.cost)
         why = "a network moves its splats, which none of the viewers supports"
@@ -118,14 +125,30 @@ class MovingModel:
         return MOTION_ERROR * pixel / max(slope, MOTION_ERROR / FARTHEST)
 
     @torch.no_grad()
-    def follow(self, reach: float) -> None:
+    def follow(self, reach: float) -> float:
         """From now on, evaluate the field at the means as they are, if many have moved farther than `reach` since it was last done.
 
         Between two such moments the splats move as the field moves the places where it was evaluated, and along its slopes if it has any.
+        Returns how much of `reach` these many have moved, 0..1.
         """
-        means = self.parameters()["means"].detach()
-        if self.held is None or float(((means - self.held).norm(dim=1) > reach).float().mean()) > MOVED_FAR:
-            self.held = means.clone()
+        means, moved = self.parameters()["means"].detach(), math.inf
+        if self.held is not None:
+            distances = (means - self.held).norm(dim=1)
+            moved = float(distances.kthvalue(max(1, round((1 - MOVED_FAR) * len(distances)))).values) / reach
+        if moved > 1:
+            self.held, moved = means.clone(), 0.0
+        return moved
+
+    def knows(self, time: float) -> bool:
+        """Whether nothing has to be evaluated for the splats at `time`, 0..1."""
+        means = self.parameters()["means"].detach() if self.held is None else self.held
+        return all(memory.knows(means, time) for memory in self._memories)
+
+    @property
+    def spent(self) -> tuple[float, float]:
+        """Seconds of all evaluations of the field so far, also of the model's copies; and of one at a moment, 0 before there was one."""
+        each = sum(memory.seconds / max(1, memory.evaluations) for memory in self._memories)
+        return sum(memory.seconds for memory in self._memories), each
 
     def keep_rows(self, rows: Tensor) -> None:
         """Take note that of the parameters only these `rows` [M], ascending, are going to be left."""

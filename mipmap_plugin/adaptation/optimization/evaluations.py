@@ -1,0 +1,63 @@
+"""How often a run evaluates the field of a moving scene: less and less often, as rates fall, so that the time so far does not tell it."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mipmap_plugin.adaptation.following import Following
+from mipmap_plugin.adaptation.optimization.optimizer import decayed
+from mipmap_plugin.adaptation.optimization.validation import warmed_up
+from mipmap_plugin.config import AdaptConfig
+
+# Splats wander: the tenth that moves farthest has come as far as the root of the sum of all squared rates, times about this (1.5 to 6).
+SPEED = 2.5
+
+
+class Evaluations:
+    """Foretells them from how far splats have moved so far by the rates that they had, and at first from what is usual.
+
+    A round lasts until splats have moved so far that every moment has to be evaluated anew, which is done when a view shows it.
+    """
+
+    def __init__(self, follow: Following, config: AdaptConfig, checked: int = 0) -> None:
+        """`checked`: the number of views that a check draws."""
+        self._follow, self._config, self._checked, self._before = follow, config, checked, follow.seconds
+        factors = [warmed_up(step, config) * decayed(config, step / config.steps) for step in range(config.steps)]
+        self._factors = torch.tensor(factors, dtype=torch.float64)
+        self._squares = 0.0  # px², the sum over all steps so far of their squared rates
+
+    def spent(self) -> float:
+        """Seconds of those since the run began."""
+        return self._follow.seconds - self._before
+
+    def seconds(self, step: int, ceiling: float, draws: int, checks: int) -> float:
+        """Seconds of those after `step`, called after each step: of steps that draw `draws` views in all, and of so many checks.
+
+        `ceiling`: of the rates' factor (`Steering`).
+        """
+        self._squares += float(self._rates(step - 1, ceiling)[0]) ** 2
+        if not self._follow.moments or step >= self._config.steps:
+            return 0.0
+        return self._follow.evaluation * self._count(step, ceiling, draws + checks * self._checked)
+
+    def of_all_steps(self) -> float:
+        """Seconds that the evaluations of a whole run take, before its first step."""
+        if not self._follow.moments:
+            return 0.0
+        return self._follow.evaluation * self._count(0, 1.0, self._config.steps * self._config.views_per_step)
+
+    def _count(self, step: int, ceiling: float, draws: float) -> float:
+        """How many moments are evaluated by so many draws after `step`."""
+        wandered = (self._squares + self._rates(step, ceiling).square().cumsum(0)).sqrt()  # px after each step
+        before, most = self._squares**0.5, self._follow.moments
+        a_round = (before + self._follow.reach / SPEED) / (self._follow.rounds + 1)  # as if one had taken what is usual
+        rounds = (self._follow.rounds % 1 + (wandered - before) / a_round).long()
+        new = torch.full((int(rounds[-1]) + 1,), float(most), dtype=torch.float64)
+        new[0] = self._follow.unknown
+        views = rounds.bincount() * draws / len(rounds)
+        return float((new * -torch.expm1(-views / most)).sum())
+
+    def _rates(self, step: int, ceiling: float) -> Tensor:
+        """Those of the means from `step` on, px."""
+        return self._config.rates.means * self._factors[step:].clamp(max=ceiling)
