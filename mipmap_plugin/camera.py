@@ -204,15 +204,22 @@ def every_nth(views: Sequence[Item], most: int) -> Sequence[Item]:
 
 
 def checked(cameras: Any, *, some: bool = False) -> list[Camera]:
-    """Cameras of the base scale as a list, of at least one if there have to be `some`. Raises SettingsError for anything else."""
+    """Cameras as a list, of at least one if there have to be `some`. Raises SettingsError for anything else."""
     found = list(cameras) if isinstance(cameras, Iterable) and not isinstance(cameras, (str, bytes)) else [cameras]
     if wrong := [each for each in found if not isinstance(each, Camera)]:
         advice = "those of a file are load_scene(path).cameras" if isinstance(wrong[0], (str, Path)) else "give a sequence of them"
         raise SettingsError(f"cameras must be of the type mipmap_plugin.Camera, got {type(wrong[0]).__name__}; {advice}")
     if some and not found:
         raise SettingsError("cameras: there are none in what was given; leave it out for those of the checkpoint or, without any, an orbit")
-    # Those that an adapted model is seen at are `zoomed`: if it is a base itself, they are of the base scale, whose zoom is 1.
-    return [camera if camera.zoom == 1 else replace(camera, zoom=1.0) for camera in found]
+    return found
+
+
+def of_base_scale(cameras: Any, *, some: bool = False) -> list[Camera]:
+    """The cameras that a base is given. Raises as `checked`.
+
+    Those that an adapted model is seen by are `zoomed`: if it is a base itself, they are of the base scale, whose zoom is 1.
+    """
+    return [camera if camera.zoom == 1 else replace(camera, zoom=1.0) for camera in checked(cameras, some=some)]
 
 
 def digest_of(cameras: Sequence[Camera]) -> str:

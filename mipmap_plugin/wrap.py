@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.views import refuse_blind
 from mipmap_plugin.backends import device_for
-from mipmap_plugin.camera import Camera, checked, digest_of
+from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_background
 from mipmap_plugin.models import load_model
@@ -59,7 +59,7 @@ def wrap_model(
         if not isinstance(screen_filter, str) or screen_filter not in USUAL_EPS2D:
             raise SettingsError(f"there is no screen filter {screen_filter!r}; choose from {', '.join(USUAL_EPS2D)}")
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
-    given = own_cameras(model) if cameras is None else cameras.cameras if isinstance(cameras, Scene) else checked(cameras)
+    given = own_cameras(model) if cameras is None else cameras.cameras if isinstance(cameras, Scene) else of_base_scale(cameras)
     wrapped = Wrapped(model, placed(model, cameras).cameras if isinstance(cameras, Scene) else given, backend, trained, threads)
     wrapped.loading_s, wrapped.asked = loading_s, asked_for(model.folder, given, color, screen_filter)
     return wrapped

@@ -28,7 +28,7 @@ from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
-from mipmap_plugin.camera import Camera, checked, digest_of
+from mipmap_plugin.camera import Camera, checked, digest_of, of_base_scale
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import DILATION, Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
@@ -186,7 +186,7 @@ class Wrapped:
         While it runs, torch's default dtype is float32, and torch may have one thread, in the whole process: torch has one of each.
         Raises SettingsError and BackendUnavailable.
         """
-        scale, cameras = check_scale(scale), None if cameras is None else checked(cameras, some=True)
+        scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
         check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         whole = not (model.traits.same_for_all_views or model.traits.thins) and settings.setdefault("merge_to", 1.0) < 1

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from mipmap_plugin.camera import Camera, checked
+from mipmap_plugin.camera import Camera, of_base_scale
 from mipmap_plugin.errors import SettingsError, ShapeError
 
 # Evaluated by hand in float64: quaternion (0.9, 0.1, -0.2, 0.3) normalized, translation (0.5, -0.25, 4).
@@ -77,7 +77,7 @@ def test_other_sizes_of_a_view_are_checked(camera, size):
 
 
 def test_cameras_of_a_base_are_of_its_scale_whatever_they_were_before(camera):
-    [plain, zoomed] = checked([camera, camera.zoomed(0.5)])
+    [plain, zoomed] = of_base_scale([camera, camera.zoomed(0.5)])
     assert plain is camera
     assert (zoomed.zoom, zoomed.size, zoomed.fx) == (1.0, camera.zoomed(0.5).size, camera.zoomed(0.5).fx)
 

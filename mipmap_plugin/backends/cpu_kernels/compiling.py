@@ -25,7 +25,7 @@ IS_KNOWN = tuple(map(int, numba.__version__.split(".")[:2])) <= KNOWN
 
 # The folders and files whose constants and functions are compiled into kernels.
 ROOT = Path(__file__).parents[2]
-SOURCES = ("backends/cpu_kernels/*.py", "splatting/*.py", "effects.py")
+SOURCES = ("backends/cpu_kernels/*.py", "splatting/*.py", "effects.py", "render_settings.py")
 
 
 def kernel(function):
