@@ -252,6 +252,20 @@ def test_while_rates_rise_those_that_led_to_the_best_state_are_the_limit(best_fa
     assert run.ceiling == ceiling
 
 
+@pytest.mark.parametrize(("rising", "ceilings"), [(True, [0.05, 0.1, 0.1, 0.2]), (False, [0.05] * 4)])
+def test_a_limit_that_was_found_before_anything_was_gained_rises_with_what_is_gained(rising, ceilings):
+    run, student, config = steering(), tiny.model(2, seed=1), recipe("default", SCALE, steps=16, warm_up=0.5)
+    run.reduce_rates(0.1, rising=rising)
+    found = [run.ceiling]
+    for step, visible in enumerate((31.0, 30.9, 32.0), 9):
+        assert run.is_rising(step, config) == rising
+        run.update_best(visible, step, student, rate_factor=run.ceiling)
+        found.append(run.ceiling)
+    assert found == pytest.approx(ceilings)
+    run.reduce_rates(run.ceiling, rising=rising)
+    assert not run.is_rising(12, config)  # a limit that was found after a gain stays
+
+
 @pytest.mark.parametrize("rows", [5, 3])
 def test_what_is_taken_back_is_held_without_the_momentum_of_what_was_done_since(rows):
     student, other = tiny.model(5).copy(), tiny.model(rows, seed=1)

@@ -182,7 +182,7 @@ def _check(run: Run, task: Task, config: AdaptConfig) -> None:
     steering, steps = run.steering, run.step - run.curve[-1].step
     quality = run.costs.check(lambda: task.validation.quality(run.student))
     growing = run.trial is not None and run.trial.before is not None  # a growth gets some steps before it is assessed
-    factor, rising = steering.rate_factor(run.step, config), run.step <= config.warm_up_steps
+    factor, rising = steering.rate_factor(run.step, config), steering.is_rising(run.step, config)
     harmful = config.returns == "best" and not growing and steering.is_harmful(quality.visible, rising=rising)
     if harmful:
         steering.reduce_rates(factor, rising=rising)

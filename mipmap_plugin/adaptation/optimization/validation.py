@@ -202,6 +202,7 @@ class Steering:
     best_step: int = 0
     best_factor: float = 1.0  # the rate factor of the step that led there
     ceiling: float = 1.0  # upper limit of the rate factor, after larger rates did harm
+    rises: bool = False  # whether the ceiling rises again with what is gained
 
     @classmethod
     def begin(cls, student: SplatModel, psnr: float) -> Steering:
@@ -212,6 +213,10 @@ class Steering:
         """The factor of every rate after `step` steps: it rises geometrically to 1 during the warm-up, and is at most the ceiling."""
         return min(warmed_up(step, config), self.ceiling)
 
+    def is_rising(self, step: int, config: AdaptConfig) -> bool:
+        """Whether the rates of the step before this one were still being tried: in the warm-up, and under a ceiling that rises."""
+        return step <= config.warm_up_steps or self.rises
+
     def is_harmful(self, psnr: float, *, rising: bool = False) -> bool:
         """Whether a state with this PSNR is worse than the start or, while rates are `rising`, has lost much of what was gained."""
         if rising:
@@ -219,12 +224,18 @@ class Steering:
         return psnr < self.start_db - HARM_DB
 
     def reduce_rates(self, rate_factor: float, *, rising: bool = False) -> None:
-        """Limit the rates to a fraction of `rate_factor`, which did harm; while they were `rising`, to those that led to the best state."""
+        """Limit the rates to a fraction of `rate_factor`, which did harm; while they were `rising`, to those that led to the best state.
+
+        The first and lowest rates may do harm before anything is gained, which tells little of those to come: this limit rises again.
+        """
+        self.rises = rising and self.best_step == 0
         lower = rising and self.best_step > 0 and self.best_factor < rate_factor
         self.ceiling = self.best_factor if lower else RATE_REDUCTION * rate_factor
 
     def update_best(self, psnr: float, step: int, student: SplatModel, rows_changed: bool = False, rate_factor: float = 1.0) -> None:
         """Keep the student's state, to which steps of `rate_factor` led, as the best one, unless it is worse."""
+        if self.rises and psnr > self.best_db + TIE_DB:
+            self.ceiling = min(1.0, self.ceiling / RATE_REDUCTION)
         if psnr >= self.best_db - TIE_DB:
             self.best_db, self.best_step, self.best_factor = max(psnr, self.best_db), step, rate_factor
             self.best = self.best.renewed(student, rows_changed)
