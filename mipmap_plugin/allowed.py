@@ -50,6 +50,12 @@ OF_SETTINGS: Mapping[str, Rule] = {
     "picture_step": ("a step above 0 and up to 1", lambda value: _number(value) and 0 < value <= 1),
 }
 
+# 24 bits, as many as float32 tells apart.
+OF_EVEN_BUCKETS: Mapping[str, Rule] = {
+    "steps": ("a whole number from 1 to 16,777,216", lambda value: type(value) is int and 1 <= value <= 1 << 24),
+    "sphere_from": SIZE,
+}
+
 OF_PACKING: Mapping[str, Rule] = {
     "opacity": STEPS,
     "color": ("a step above 0 and up to 1", lambda value: _number(value) and 0 < value <= 1),

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
-from mipmap_plugin.allowed import OF_PACKING, OF_SETTINGS, check
+from mipmap_plugin.allowed import OF_EVEN_BUCKETS, OF_PACKING, OF_SETTINGS, check
 from mipmap_plugin.errors import SettingsError
 
 # Thresholds of every 3DGS rasterizer (diff-gaussian-rasterization, forward.cu).
@@ -56,6 +56,9 @@ class EvenBuckets:
     later_in_front: bool = False
     largest_first: bool = False
 
+    def __post_init__(self) -> None:
+        check("even buckets", self, OF_EVEN_BUCKETS, optional=frozenset({"steps", "sphere_from"}))
+
 
 @dataclass(frozen=True)
 class RenderSettings:
@@ -91,6 +94,8 @@ class RenderSettings:
         check("render settings", self, OF_SETTINGS, optional=frozenset({"radius", "max_color", "color_steps", "picture_step"}))
         if not isinstance(self.packing, Packing | None):
             raise SettingsError(f"render settings: packing must be a Packing, or None, got {type(self.packing).__name__}")
+        if not isinstance(self.even_buckets, EvenBuckets | None):
+            raise SettingsError(f"render settings: even_buckets must be EvenBuckets, or None, got {type(self.even_buckets).__name__}")
         if self.fades and self.radius is None:
             raise SettingsError("`fades` needs the radius at which a splat falls to 0; give radius, such as 8**0.5")
         if self.radial + self.bucketed + (self.even_buckets is not None) > 1:

@@ -71,6 +71,7 @@ def test_evaluations_of_a_field_take_their_part_of_a_budget():
     def seconds(steps):
         return steps * PACE.a_step(config) + Evaluations(follow, config.model_copy(update={"steps": steps})).of_all_steps()
 
+    assert PACE.steps(config, 1e6, follow) == config.most_steps  # no others are counted
     assert 10 < steps < PACE.steps(config, 4.0, STILL) / 1.3 and seconds(steps) <= SPARE * 4.0 < seconds(steps + 1)
 
 

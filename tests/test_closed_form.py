@@ -9,6 +9,7 @@ import tiny
 import torch
 
 from mipmap_plugin import threads
+from mipmap_plugin.adaptation.start import closed_form as form
 from mipmap_plugin.adaptation.start.closed_form import (
     CULL_MARGIN,
     LEAST_VIEWS,
@@ -313,6 +314,15 @@ def test_the_closest_view_is_looked_for_among_more_views():
     closer = VIEW.looking_from(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]]), "closer")
     views = [closer if number == 1 else VIEW for number in range(40)]
     torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), views, 12), torch.tensor([2.0]) / FOCAL)
+
+
+def test_too_many_rare_splats_to_look_at_more_views_are_not_looked_at_twice(monkeypatch):
+    looked, finest = [], form._finest
+    monkeypatch.setattr(form, "_finest", lambda means, views, *near: looked.append(len(views)) or finest(means, views, *near))
+    monkeypatch.setattr(form, "MOST_LOOKS", 100)
+    away = VIEW.looking_from(torch.diag(torch.tensor([1.0, -1, -1, 1])), "away")
+    pixel_size(torch.tensor([[0.0, 0.0, 4.0]]).expand(10, 3), [VIEW, *[away] * 199], 12)
+    assert looked == [40]
 
 
 def test_the_closest_view_of_what_few_views_show_is_looked_for_among_all():

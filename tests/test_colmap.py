@@ -107,6 +107,7 @@ def test_every_folder_from_the_models_upwards_finds_the_photographs(tmp_path, pl
 
 def test_photographs_that_are_nowhere_are_missed_beside_the_model(tmp_path):
     write_text_model(tmp_path / "scene/sparse/0", names(1))
+    write_photographs(tmp_path / "images", names(1))  # of another scene
     for folder in ("scene", "scene/sparse", "scene/sparse/0"):
         assert f"absent from {tmp_path / 'scene/images'};" in " ".join(load_scene(tmp_path / folder).notes)
 

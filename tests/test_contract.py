@@ -15,6 +15,7 @@ from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, TrainedScale, Traits
 from mipmap_plugin.models.conformance import ModelSuite
+from mipmap_plugin.models.contract import lacking
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 
 BRIEF = dict(steps=1, extra_views=2, validation_views=2)
@@ -43,12 +44,17 @@ def parameters(**changes):
         (dict(save=lambda self, path: path), r"lacks save\(path, \*, provenance, overwrite\); see"),
         (dict(gaussians=lambda self: None, rebuild=None), r"lacks gaussians\(camera\), rebuild\(form\); see"),
         (dict(parameters=parameters(features=torch.zeros(7, 2))), "lacks parameters of one length: it has 60 means, .*, 7 features; see"),
+        (dict(parameters=parameters(carried=torch.tensor(1.0))), "lacks parameters of one length: it has 60 means, .*, single carried; see"),
         (dict(parameters=parameters(features=[1], offsets=None)), "lacks tensors as the parameters features, offsets; see"),
     ],
 )
 def test_what_does_not_fit_a_model_is_told_when_it_is_wrapped(members, said):
     with pytest.raises(SettingsError, match=said):
         wrapped(**members)
+
+
+def test_methods_of_compiled_code_need_not_tell_what_they_take():
+    assert lacking(model(shared_parameters=dict)) == []  # of which Python knows no signature
 
 
 @pytest.mark.parametrize(

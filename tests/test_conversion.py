@@ -53,6 +53,7 @@ def test_its_settings_are_those_of_the_recipe_at_the_bases_scale():
 
 
 def test_it_takes_no_more_steps_than_the_zoom_in_may():
+    assert settings_of(steps=20, time_budget_s=600.0).most_steps is None  # whatever time is left
     assert settings_of(steps=20).steps == 20 and settings_of(steps=10_000).steps == recipe("default", 2.0).conversion_steps
 
 

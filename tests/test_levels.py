@@ -402,6 +402,12 @@ def test_an_interrupted_ladder_goes_on_with_what_is_ready(tmp_path, monkeypatch)
         assert file.read_bytes() == (again / file.name).read_bytes()
 
 
+def test_levels_for_mip_splatting_start_from_finer_ones_that_are_kept(tmp_path):
+    """Whose files have the column filter_3D, which makes them checkpoints of another family."""
+    ladder = make_levels(wrapped(), request("mip", coarsest=1 / 2, steps=0), resume=tmp_path / "kept")
+    assert [len(level.adapted.model) for level in ladder.levels][1:] and (ladder.save(tmp_path / "ladder") / MANIFEST).is_file()
+
+
 def test_an_interrupted_command_says_that_finished_levels_are_kept(tmp_path, monkeypatch, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
     words = ["levels", str(base), "--viewer", "antialiased", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2", "--recipe", "instant"]

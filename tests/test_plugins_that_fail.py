@@ -19,7 +19,7 @@ from mipmap_plugin.models import API_VERSION, CERTAIN, Family, Match, detect
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.plugin_errors import naming_any
 from mipmap_plugin.recipes import default
-from mipmap_plugin.render_settings import Packing, RenderSettings
+from mipmap_plugin.render_settings import EvenBuckets, Packing, RenderSettings
 from mipmap_plugin.splatting.viewers import Viewer, single_viewers
 
 
@@ -293,7 +293,7 @@ def test_names_are_parts_of_file_names(name):
         {"min_alpha": 0.0}, {"min_alpha": 2.0}, {"min_alpha": "x"}, {"min_alpha": float("nan")}, {"min_transmittance": 2.0}, {"radius": 0},
         {"radius": -3.0}, {"tile": 0}, {"tile": 3.5}, {"tile": 100_000}, {"max_alpha": 0.0}, {"max_color": -1.0}, {"color_steps": (0.1, 0.1)},
         {"color_steps": [0.1, 0.1, 0.1]}, {"min_variance": -1.0}, {"max_half_axis": 0.0, "radius": 3.0}, {"frame": -1.0}, {"picture_step": -1.0},
-        {"packing": "yes"},
+        {"packing": "yes"}, {"even_buckets": True},
     ],
 )  # fmt: skip
 def test_render_settings_out_of_range_are_refused(wrong):
@@ -308,6 +308,12 @@ def test_render_settings_out_of_range_are_refused(wrong):
 def test_packings_out_of_range_are_refused(wrong):
     with pytest.raises(SettingsError, match=f"packing: {next(iter(wrong))} must be"):
         Packing(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"steps": 0}, {"steps": 2.5}, {"steps": 1 << 40}, {"sphere_from": float("nan")}])
+def test_buckets_out_of_range_are_refused(wrong):
+    with pytest.raises(SettingsError, match=f"even buckets: {next(iter(wrong))} must be"):
+        EvenBuckets(**wrong)
 
 
 @pytest.mark.parametrize(

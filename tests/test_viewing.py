@@ -18,6 +18,7 @@ import tiny
 import torch
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation.moments import at_moments
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.cli import main
 from mipmap_plugin.commands.view import _choices, _free, has_display
@@ -388,6 +389,13 @@ class TestMoving:
         assert wishes[0].screen.time == 0.5
         views = views_for_screen(base, wishes[0].screen, torch.zeros(3, dtype=torch.float64), 1 / 2)
         assert {view.time for view in views[:NEAR]} == {0.5} and [view.time for view in views[NEAR:]] == [view.time for view in base.views()]
+
+    @pytest.mark.parametrize("most", [2, 6])
+    def test_it_stays_one_of_the_moments_however_few_there_are(self, base, screen, most):
+        base.cameras = [replace(view, time=number / 39) for number, view in enumerate(tiny.cameras(40))]
+        views = views_for_screen(base, replace(screen, time=0.51), torch.zeros(3, dtype=torch.float64), 1 / 2)
+        taken = at_moments([*views, *base.cameras[:5]], most)
+        assert {view.time for view in taken[:NEAR]} == {0.51} and len({view.time for view in taken}) == most
 
     def test_a_picture_of_another_moment_is_another_one(self, screen):
         assert adapting.alike(replace(screen, time=0.5), replace(screen, time=0.5)) and not adapting.alike(replace(screen, time=0.5), screen)

@@ -69,10 +69,19 @@ def test_a_damaged_archive_is_one_sentence(tmp_path, ply):
     refused(path, "a.zip is a damaged zip archive")
 
 
+def test_what_is_doubtful_is_told_by_the_archives_name(tmp_path, ply):
+    columns = read_ply(tmp_path / "own.ply").columns
+    columns["x"][3] = np.nan
+    with pytest.warns(UserWarning, match="^the PLY in .*one.zip: 1 of 60 splats was dropped"):
+        load_model(archive(tmp_path / "one.zip", {"a.ply": write(tmp_path / "one.ply", columns).read_bytes()}))
+
+
 def test_a_ply_that_is_no_base_is_told_of_by_the_archives_name(tmp_path, ply):
     cloud = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n"
     refused(archive(tmp_path / "mesh.zip", {"a.ply": cloud}), "the PLY in .*mesh.zip is a plain point cloud")
     columns = read_ply(tmp_path / "own.ply").columns
+    no_number = write(tmp_path / "nan.ply", {**columns, "x": np.full(60, np.nan, np.float32)}).read_bytes()
+    refused(archive(tmp_path / "nan.zip", {"a.ply": no_number}), "^the PLY in .*nan.zip: none of its 60 splats is finite")
     filtered = write(tmp_path / "mip.ply", {**columns, "filter_3D": np.ones(60, np.float32)}).read_bytes()
     refused(archive(tmp_path / "mip.zip", {"a.ply": filtered}), "mip.zip holds a PLY of Mip-Splatting; unpack it")
     made = wrap_model(tmp_path / "own.ply", backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "made.ply")

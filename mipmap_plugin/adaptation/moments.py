@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -18,14 +19,19 @@ from mipmap_plugin.models.base import SplatModel
 # Moments at which the states are compared in the end: the field is evaluated anew at each, for each state.
 CHOOSING = 8
 
+# A time that more than this fraction of the views have is always one of the moments: the live view adapts a third of them to what it shows.
+MANY = 1 / 4
+
 
 def at_moments(views: Sequence[Camera], most: int | None) -> list[Camera]:
-    """The views, each at the nearest of at most so many of their own times, evenly chosen among these."""
-    times = sorted({view.time or 0.0 for view in views})
-    if most is None or len(times) <= most:
+    """The views, each at the nearest of at most so many of their own times: those of many views, and others evenly chosen."""
+    counts = Counter(view.time or 0.0 for view in views)
+    if most is None or len(counts) <= most:
         return list(views)
-    chosen = [times[round(number * (len(times) - 1) / max(1, most - 1))] for number in range(most)]
-    nearest = {time: min(chosen, key=lambda moment: abs(moment - time)) for time in times}
+    chosen = [time for time, count in counts.most_common(most) if count > MANY * len(views)]
+    others, left = sorted(counts.keys() - set(chosen)), most - len(chosen)
+    chosen += [others[round(number * (len(others) - 1) / max(1, left - 1))] for number in range(left)]
+    nearest = {time: min(chosen, key=lambda moment: abs(moment - time)) for time in counts}
     return [replace(view, time=nearest[view.time or 0.0]) for view in views]
 
 

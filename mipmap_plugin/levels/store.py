@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
@@ -19,7 +19,7 @@ from mipmap_plugin.formats.atomic import json_text, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
-from mipmap_plugin.models.base import digest_of_parameters
+from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_parameters
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.wrap import Wrapped, state_path
 
@@ -62,9 +62,11 @@ class LevelStore:
             report = Report.model_validate(read_json(file.with_name(file.name + REPORT)))
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # what there is to say of its splats was said of the base's
-                model = load_model(file).to(self._base.model.parameters()["means"].device)
+                read = load_model(file)
         except (ValueError, MipmapPluginError) as error:
             raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({error}); delete its folder to start anew") from error
+        plain: SplatModel = cast(Filtered, read).bare() if read.traits.filtered else read  # the filter of a file for Mip-Splatting is 0
+        model = plain.to(self._base.model.parameters()["means"].device)
         model.trained = _trained(self._base, self._target)
         backend, _ = self._base.backend(viewer=report.viewer)
         return Adapted(model, report, backend, self._target, {str(report.viewer): self._target}, cameras=self._base.views())

@@ -68,6 +68,8 @@ def _refused_call(name: str, promised: Callable[..., Any], own: Any) -> str:
         signature(own).bind(*by_place, **dict.fromkeys(by_name))
     except TypeError:
         return f"{name}({', '.join([*by_place, *['*'] * bool(by_name), *by_name])})"
+    except ValueError:  # compiled code does not tell what it takes
+        pass
     return ""
 
 
@@ -81,8 +83,9 @@ def _wrong_parameters(model: SplatModel) -> list[str]:
     wrong += [f"a name of PARAMETERS for {name!r}" for name in parameters if name not in PARAMETERS]
     if others := [name for name, tensor in parameters.items() if not isinstance(tensor, Tensor)]:
         wrong.append(f"tensors as the parameters {', '.join(map(str, others))}")
-    if not wrong and len({len(tensor) for tensor in parameters.values()}) > 1:
-        wrong.append(f"parameters of one length: it has {', '.join(f'{len(tensor)} {name}' for name, tensor in parameters.items())}")
+    rows = {name: len(tensor) if tensor.ndim else "single" for name, tensor in parameters.items()} if not wrong else {}
+    if len({*rows.values()}) > 1:
+        wrong.append(f"parameters of one length: it has {', '.join(f'{count} {name}' for name, count in rows.items())}")
     return wrong
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,13 +18,26 @@ from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 def load_zipped(path: str | Path, *, iteration: int | None = None) -> VanillaModel:
     """Load the 3DGS PLY in a zip archive that holds nothing else. Raises CheckpointError."""
     file = detect(path, iteration=iteration).path
-    with unpacked(file) as ply:
+    with unpacked(file) as ply, warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always")
         try:
-            checkpoint = detect(ply)
+            model = _load(ply, file)
         except CheckpointError as error:
-            raise CheckpointError(str(error).replace(str(ply), f"the PLY in {file}")) from error
-        if checkpoint.family != "3dgs":
-            raise CheckpointError(f"{file} holds a PLY of {find_family(checkpoint.family).title}; unpack it and give that")
-        if "scale" in (provenance_of(read_header(ply).comments) or {}):
-            raise CheckpointError(f"{file} holds a file that was adapted; unpack it, so that its scale is read too")
-        return read_vanilla(replace(checkpoint, path=ply, folder=None)).with_source(file)
+            raise CheckpointError(_told(error, ply, file)) from error
+    for doubt in doubts:
+        warnings.warn(_told(doubt.message, ply, file), doubt.category, stacklevel=2)
+    return model.with_source(file)
+
+
+def _load(ply: Path, file: Path) -> VanillaModel:
+    checkpoint = detect(ply)
+    if checkpoint.family != "3dgs":
+        raise CheckpointError(f"{file} holds a PLY of {find_family(checkpoint.family).title}; unpack it and give that")
+    if "scale" in (provenance_of(read_header(ply).comments) or {}):
+        raise CheckpointError(f"{file} holds a file that was adapted; unpack it, so that its scale is read too")
+    return read_vanilla(replace(checkpoint, folder=None))
+
+
+def _told(words: object, ply: Path, file: Path) -> str:
+    """What is said of the temporary PLY, as said of that in the archive."""
+    return str(words).replace(str(ply), f"the PLY in {file}")

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 # Folders of a model, in the order in which graphdeco-inria and gsplat search them.
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", ".", "0")  # the last: the folder `sparse` itself was given
 
-# Photographs lie in one of so many folders, from that of the model upwards: in nerfstudio's scenes, whose model is colmap/sparse/0, in the last.
-LEVELS = 4
+# Folders between a model and the folder of photographs, which is beside the highest: nerfstudio has all of them.
+BETWEEN = ("0", "sparse", "colmap")
 
 
 def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
@@ -78,8 +78,9 @@ def _model_folder(path: Path) -> Path | None:
 
 def _photographs(path: Path, name: str) -> Path:
     """The folder `name` of photographs: beside the model, or above it, whichever of these folders was given."""
-    here = (_model_folder(path) or path).absolute()
-    above = [here, *here.parents][:LEVELS]
+    above = [here := (_model_folder(path) or path).absolute(), here.parent]
+    while above[-1].name in BETWEEN:
+        above.append(above[-1].parent)
     usual = next((place.parent for place in above if place.name == "sparse"), path)  # if there is none
     return next((place / name for place in above if (place / name).is_dir()), usual / name)
 

@@ -65,13 +65,18 @@ class Pace:
         return config.views_per_step * (self.a_view + self.a_truth / USES) + self.a_check / config.check_every
 
     def steps(self, config: AdaptConfig, seconds: float, follow: Following) -> int:
-        """The number of steps that take so many seconds, with the truths, the checks and the evaluations of a field that they need."""
+        """The number of steps that take so many seconds, with the truths, the checks and the evaluations of a field that they need; at most all."""
 
         def needed(steps: int) -> float:
             return steps * self.a_step(config) + Evaluations(follow, config.model_copy(update={"steps": steps})).of_all_steps()
 
-        most = max(1, int(SPARE * seconds / self.a_step(config)))
+        most = max(1, min(most_of(config), int(SPARE * seconds / self.a_step(config))))
         return max(1, bisect_right(range(1, most + 1), SPARE * seconds, key=needed)) if follow.moments else most
+
+
+def most_of(config: AdaptConfig) -> int:
+    """The number of steps in a time budget that has room for them."""
+    return max(config.steps, config.most_steps or 0)
 
 
 def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, AdaptConfig]:
@@ -86,7 +91,7 @@ def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, Adap
     run.reserved = pace.a_choice
     if not config.gathering:
         return task, config
-    steps = min(max(config.steps, config.most_steps or 0), run.step + pace.steps(config, max(0.0, config.time_budget_s - run.seconds), task.follow))
+    steps = min(most_of(config), run.step + pace.steps(config, max(0.0, config.time_budget_s - run.seconds), task.follow))
     views = max(config.views_per_step, math.ceil(steps * config.views_per_step / USES))
     return replace(task, views=evenly(task.views, views)), config.model_copy(update={"steps": steps})
 

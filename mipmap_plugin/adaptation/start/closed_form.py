@@ -190,9 +190,9 @@ def pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None)
     some = every_nth(views, _closest_of(means, views, count))
     finest, seeing = _finest(means, some)
     rare = (seeing < RARE * len(some)).nonzero()[:, 0]
-    if len(some) < len(views) and len(rare):
-        further, _ = _finest(means[rare], every_nth(views, max(len(some), MOST_LOOKS // len(rare))))
-        finest[rare] = torch.minimum(finest[rare], further)
+    further = every_nth(views, max(len(some), MOST_LOOKS // max(1, len(rare))))
+    if len(rare) and len(further) > len(some):
+        finest[rare] = torch.minimum(finest[rare], _finest(means[rare], further)[0])
     unseen = finest.isinf()
     return finest.masked_scatter(unseen, _nearest(means[unseen], some)) if unseen.any() else finest
 
