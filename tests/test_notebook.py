@@ -84,7 +84,7 @@ def test_render_takes_the_scale_that_a_file_was_adapted_to(tmp_path, capsys):
         assert main(["render", str(tmp_path / "base_x0.25"), "--output", str(tmp_path / name), *options, *words]) == 0
         assert {image_size(path) for path in (tmp_path / name).iterdir()} == {size}
     own, asked = capsys.readouterr().out.splitlines()[-2:]
-    assert own == f"2 pictures in {tmp_path / 'own'}, at x0.25, which the file was adapted to"
+    assert own == f"2 pictures in {tmp_path / 'own'}, at x0.25, which the file was adapted for"
     assert asked == f"2 pictures in {tmp_path / 'asked'}"
     assert main(["render", str(base), "--output", str(tmp_path / "base_pictures"), *words]) == 0
     assert {image_size(path) for path in (tmp_path / "base_pictures").iterdir()} == {(32, 24)}
@@ -102,7 +102,7 @@ def test_render_takes_the_viewer_that_a_file_was_adapted_for(tmp_path, capsys):
             drawn[viewer, name] = picture.read_bytes()
             told = capsys.readouterr().out.splitlines()[-1].partition(f"{tmp_path / viewer / name}, ")[2]
             own = " in spark" if (viewer, name) == ("spark", "own") else ""
-            assert told == f"at x0.25{own}, which the file was adapted to"
+            assert told == f"at x0.25{own}, which the file was adapted for"
     assert drawn["spark", "own"] == drawn["spark", "spark"] != drawn["spark", "mip"]
     assert drawn["portable", "own"] != drawn["portable", "spark"]  # which is one of several that it was made for
 

@@ -83,7 +83,7 @@ def render(
         _write(picture, wrapped.render(camera.zoomed(zoom), zoom, filter_name, supersampling, **options), outputs, overwrite)
     count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
     taken = [f"at x{zoom:g}"] * (scale is None and zoom != 1) + [f"in {own_viewer}"] * (own_viewer is not None)
-    say(", ".join([f"{count} in {output}", *[" ".join(taken), "which the file was adapted to"] * bool(taken)]))
+    say(", ".join([f"{count} in {output}", *[" ".join(taken), "which the file was adapted for"] * bool(taken)]))
 
 
 def _at_times(wrapped: Wrapped, views: Sequence[Camera], times: Sequence[float]) -> list[Camera]:
