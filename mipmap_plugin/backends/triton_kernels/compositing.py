@@ -9,11 +9,11 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from mipmap_plugin import effects
+from mipmap_plugin import render_settings
 from mipmap_plugin.backends.triton_kernels import views
 from mipmap_plugin.backends.triton_kernels.records import RECORD
 
-MAX_ALPHA = tl.constexpr(effects.MAX_ALPHA)
+MAX_ALPHA = tl.constexpr(render_settings.MAX_ALPHA)
 MIN_ALPHA, MIN_TRANSMITTANCE = views.MIN_ALPHA, views.MIN_TRANSMITTANCE
 RED, GREEN, BLUE = views.RED, views.GREEN, views.BLUE
 
