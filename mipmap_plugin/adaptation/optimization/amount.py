@@ -41,13 +41,13 @@ def splats_in_view(means: torch.Tensor, views: Sequence[Camera], near: float) ->
 
 def affordable_moments(config: AdaptConfig, base: SplatModel) -> int | None:
     """The number of moments that a moving scene can be adapted at: all that the settings have, or what fits into the time of a run."""
+    if config.moments is None or not base.traits.moves:
+        return config.moments
     if config.time_budget_s is not None:
         draws, least = FOR_MOMENTS_IN_BUDGET * DRAWS_A_SECOND * config.time_budget_s, LEAST_IN_BUDGET
     elif config.most_draws is not None:
         draws, least = FOR_MOMENTS * config.most_draws, LEAST_MOMENTS
     else:
-        return config.moments
-    if config.moments is None or not base.traits.moves:
         return config.moments
     return min(config.moments, max(least, int(draws / max(1.0, ROUNDS * _evaluation(base)))))
 

@@ -33,7 +33,6 @@ SPARE = 1.25
 # Measured so many times, of which the shortest counts.
 REPEATS = 2
 
-
 # Different states of the splats of which the best is chosen after the steps: the start, the best and the last one.
 STATES = 3
 
