@@ -256,13 +256,3 @@ def test_opacities_follow_the_views_in_which_a_splat_is_large():
 def test_an_area_beyond_the_type_leaves_the_opacity_as_it_is():
     large = disc(4e10, 4e10).to(dtype=torch.float32)
     assert closed_form(large, [VIEW], 1 / 4, Effects(0), Effects(0))[1].isfinite().all()
-
-
-def test_zoom_in_widens_for_the_mean_of_the_views_and_zoom_out_narrows_for_the_closest():
-    """Depths of 4 and 2: a variance of c px² is c/400 in the closest view, and c/340 for both (`mean_pixel_size`)."""
-    closer = VIEW.looking_from(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]]), "closer")
-    for scale, pixel in ((2, 1 / 340), (1 / 2, 1 / 400)):
-        splat = disc(5, 5)
-        scales, _ = closed_form(splat, [VIEW, closer], scale, Effects(0), Effects(0))
-        change = (DILATION - (1 / 12 if scale > 1 else 0)) * (1 - 1 / scale**2)
-        torch.testing.assert_close(scales[:, :2].square(), splat.scales[:, :2].square() + change * pixel)

@@ -9,6 +9,8 @@ import torch
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.closed_form import closed_form
+from mipmap_plugin.adaptation.start.pixel_size import mean_pixel_size, pixel_size
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
@@ -61,6 +63,14 @@ def test_crispness_reaches_the_start():
     plain, crisp = (adapted(scale=4, crispness=each, returns="last").model.parameters() for each in (0.0, 1.0))
     torch.testing.assert_close(crisp["scales"], tiny.model(COUNT).parameters()["scales"], atol=1e-5, rtol=0)
     assert (crisp["opacities"] >= plain["opacities"]).all() and (crisp["scales"] < plain["scales"]).any()
+
+
+@pytest.mark.parametrize(("scale", "steps", "size"), [(2, 0, mean_pixel_size), (2, 1, pixel_size), (1 / 2, 0, pixel_size)])
+def test_a_zoom_in_without_steps_is_formed_for_the_mean_of_the_views(scale, steps, size, monkeypatch):
+    forms = []
+    monkeypatch.setattr(start, "closed_form", lambda *arguments: forms.append(arguments[-1]) or closed_form(*arguments))
+    adapted(scale=scale, steps=steps, extra_views=0)
+    assert torch.equal(forms[0].pixel, size(tiny.model(COUNT).parameters()["means"], tiny.cameras()))
 
 
 def test_the_base_is_where_a_run_starts_without_a_closed_form():

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights, may_show, weighed, whole_weights
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices, is_for_the_mean
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
-from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, pixel_size, views_for
+from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, mean_pixel_size, pixel_size, views_for
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
@@ -187,8 +187,10 @@ class StartSearch:
         while rounds and not self._clock.allows("weights", rounds):
             rounds -= 1
         area_power = 1.0 if rounds else AREA_POWER
-        pixel = self._pixel_size(gaussians.means)
-        settings = FormSettings(area_power, problem.config.crispness, self._count, pixel, matched=weights is not None and rounds > 0)
+        pixel = formed_for = self._pixel_size(gaussians.means)
+        if is_for_the_mean(problem.scale, problem.config.steps):
+            formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._count)
+        settings = FormSettings(area_power, problem.config.crispness, self._count, formed_for, matched=weights is not None and rounds > 0)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:
             return scales, opacities
