@@ -38,7 +38,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike
+from mipmap_plugin.adaptation.views import choose_views, orbit_of, over_band, refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -288,6 +288,7 @@ class Session:
             curve=curve,
             versions=versions(),
             inputs=self.inputs,
+            orbit=orbit_of(self.base),
             notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
         )
 
