@@ -37,9 +37,10 @@ def inspect(
     """
     with announced(f"reading {checkpoint.name}"), uncollected():
         from mipmap_plugin.models import detect, load_model
+        from mipmap_plugin.models.zipped_folder import told
 
         found = detect(checkpoint, iteration=iteration)
-        known = {"file": str(found.path), "family": found.family}
+        known = {"file": told(found.path), "family": found.family}
         if not json:
             print_facts(known, json)  # before torch is imported
         from mipmap_plugin.wrap import wrap_model
