@@ -1,6 +1,7 @@
 """A PLY or a model folder in a zip archive: read if it is alone there, and refused in a sentence otherwise."""
 
 import errno
+import tempfile
 import zipfile
 
 import numpy as np
@@ -159,3 +160,14 @@ def test_what_is_wrong_inside_is_told_by_the_archives_name(tmp_path, folder):
         load_model(packed(tmp_path / "a.zip", folder))
     splats.write_bytes(b"ply")
     refused(packed(tmp_path / "b.zip", folder), "^[^;]*b.zip has no whole checkpoint: [^;]*b.zip/point_cloud/")
+
+
+def test_workers_leave_nothing_unpacked(tmp_path, folder, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    for name in ("a", "b"):
+        packed(tmp_path / f"{name}.zip", folder)
+    assert main(["adapt", str(tmp_path / "*.zip"), "--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--jobs", "2"]) == 0
+    assert len(list((tmp_path / "temporary").glob("mipmap-plugin-*"))) == 2  # of this process, which has not ended
+    assert (tmp_path / "a_x0.5").is_dir() and (tmp_path / "b_x0.5").is_dir()

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.magic import archive
 from mipmap_plugin.formats.zipped import copied, only_ply, refuse_large
-from mipmap_plugin.models.outputs import PARTS
+from mipmap_plugin.models.places import PARTS
 
 # The file by which a model folder is known, after the name of the folder.
 SPLATS = re.compile(r"(?:(.*)/)?(?:point_cloud/(?:coarse_)?iteration_\d+/point_cloud\.ply|ckpts/ckpt_\w+\.pt|nerfstudio_models/step-\d+\.ckpt)")
