@@ -16,6 +16,7 @@ from mipmap_plugin.models.zipped_folder import opened, told_of_archives
 
 # Suffixes of files of splats besides PLY, and of photographs.
 EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat"), (".jpg", ".jpeg", ".png")
+OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)
@@ -114,6 +115,9 @@ def _most_certain(files: Files, claims: dict[str, tuple[Family, Match]], notes: 
 
 def _why_not(files: Files) -> str:
     path, kind = files.path, files.kind
+    if path.suffix.lower() not in OWN_SUFFIXES and path.with_name(path.name + REPORT).is_file():
+        remedy = "install the package that adds that family (`mipmap-plugin list families` shows which are found)"
+        return f"{path} was adapted from a checkpoint of a family that is not installed here; {remedy}"
     if files.header:
         if len(missing := OF_SPLATS - files.columns) < len(OF_SPLATS) / 2:
             return f"{path} is no whole 3DGS checkpoint: it lacks the columns {', '.join(sorted(missing))}; export it again with them"
