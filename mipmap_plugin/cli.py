@@ -28,7 +28,7 @@ from mipmap_plugin.garbage import leave_at_exit
 from mipmap_plugin.limits import is_out_of_memory
 
 DESCRIPTION = (
-    "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors and JSON only, "
+    "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors, warnings and JSON only, "
     "and --log FILE, to append all that is said, with further details, to a file."
 )
 

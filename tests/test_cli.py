@@ -527,6 +527,14 @@ def test_list_says_where_names_come_from_and_what_is_wrong_with_one(run, tmp_pat
     assert listed["recipes"]["of packages"] == {"brief": "stranger:brief of stranger 1.0"}
 
 
+@pytest.mark.parametrize("words", [["render"], ["tradeoff", "--scale", "1/2"]])
+def test_a_file_where_pictures_are_to_go_is_named(run, tmp_path, words):
+    (tmp_path / "taken").write_text("precious")
+    command, *options = words
+    said = f"{tmp_path / 'taken'} is a file, not a folder; choose another path"
+    refused(run(command, tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "taken", *options), said)
+
+
 def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path, monkeypatch):
     base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / "new.ply"
     output.write_text("precious")
