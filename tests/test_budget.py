@@ -63,6 +63,8 @@ def test_what_was_planned_and_taken_is_told():
     run, config = a_run(1.0, step=5), recipe("default", 1 / 4, time_budget_s=3.0)
     assert plan_note(run, config) == ""
     run.planned = 8
+    assert plan_note(run, config) == ""
+    run.ended_by = "time budget of 3 s"
     assert plan_note(run, config) == " (after 5 of 8 steps, planned for the time budget in place of 360)"
     run.step = 8
     assert plan_note(run, config) == " (planned for the time budget in place of 360)"

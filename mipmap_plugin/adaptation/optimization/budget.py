@@ -99,8 +99,9 @@ def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, Adap
 
 
 def plan_note(run: Run, config: AdaptConfig) -> str:
-    """Which steps were planned for a time budget, in brackets; empty if they are those of the settings, or if none was taken."""
-    if not run.step or run.planned in (0, config.steps):
+    """Which steps were planned for a time budget, in brackets; empty if they are those of the settings, or if something else ended the run."""
+    planned = run.step >= run.planned or run.ended_by.startswith("time budget")
+    if not run.step or not planned or run.planned in (0, config.steps):
         return ""
     taken = "" if run.step >= run.planned else f"after {run.step} of {run.planned} steps, "
     return f" ({taken}planned for the time budget in place of {config.steps})"
