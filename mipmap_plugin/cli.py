@@ -18,6 +18,7 @@ from mipmap_plugin.commands.demo import demo
 from mipmap_plugin.commands.evaluate import evaluate
 from mipmap_plugin.commands.inspect import inspect
 from mipmap_plugin.commands.levels import levels
+from mipmap_plugin.commands.list import list_
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
@@ -27,13 +28,15 @@ from mipmap_plugin.garbage import leave_at_exit
 from mipmap_plugin.limits import is_out_of_memory
 
 DESCRIPTION = (
-    "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors and JSON only, "
+    "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors, warnings and JSON only, "
     "and --log FILE, to append all that is said, with further details, to a file."
 )
 
 app = tyro.extras.SubcommandApp()
-for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends, demo):
+for command in (inspect, adapt, levels, render, view, evaluate, tradeoff, backends):
     app.command(command)
+app.command(name="list")(list_)
+app.command(demo)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -56,8 +56,20 @@ class Registry:
         target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target
 
+    def packages(self) -> dict[str, str]:
+        """The targets of installed packages by name, with the package: "package.module:Name of my-package 1.0"."""
+        return {point.name: f"{point.value}{_package(point)}" for point in entry_points(group=self.group)}
+
+    def is_taken(self, name: str) -> bool:
+        """Whether what an installed package has under a name is not taken, for it is registered here."""
+        return name in self._targets
+
     def _installed(self) -> Mapping[str, str]:
         return _points(entry_points, self.group, tuple((folder, _modified(folder)) for folder in sys.path))
+
+
+def _package(point: EntryPoint) -> str:
+    return f" of {point.dist.name} {point.dist.version}" if point.dist else ""
 
 
 @lru_cache(maxsize=64)

@@ -25,7 +25,7 @@ from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.photographs import placed as placed
 from mipmap_plugin.adaptation.target.portable import settings_for_several
-from mipmap_plugin.adaptation.views import choose_views
+from mipmap_plugin.adaptation.views import choose_views, orbit_of
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import Camera, checked, digest_of, of_base_scale
@@ -277,8 +277,8 @@ class Wrapped:
 
     @usual_modes()
     def views(self) -> list[Camera]:
-        """The checkpoint's cameras, or a generated orbit if it came without any."""
-        return self.cameras or choose_views([], self.model.parameters()["means"], AdaptConfig())[0]
+        """The checkpoint's cameras, or a generated orbit, for an adapted file that of its base, if it came without any."""
+        return self.cameras or choose_views([], orbit_of(self.model), AdaptConfig())[0]
 
     def place(self, scene: Scene) -> Scene:
         """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""

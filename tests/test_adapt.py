@@ -15,6 +15,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.report import PeakMemory
@@ -240,6 +241,19 @@ def test_a_resumed_run_tells_the_seconds_of_both_processes(tmp_path, ctrl_c, mon
     assert first >= 200 and resumed.seconds["pseudo truth"] >= first + 100
 
 
+def test_a_resumed_run_goes_on_as_planned(tmp_path, ctrl_c, monkeypatch):
+    """Of a time budget, also where the machine has become slower."""
+    settings, paces = {**BRIEF, "time_budget_s": 1e6}, iter([Pace(1.0, 1.0, 1.0, 0.5), Pace(1e6, 1.0, 1.0)])
+    monkeypatch.setattr(Pace, "of", classmethod(lambda *_: next(paces)))
+    ctrl_c(5)
+    with pytest.raises(Interrupted):
+        wrapped().adapt(1 / 4, resume=tmp_path / "state", **settings)
+    saved = load_torch(tmp_path / "state")
+    assert (saved["planned"], saved["reserved"]) == (BRIEF["steps"], 0.5)
+    resumed = wrapped().adapt(1 / 4, resume=tmp_path / "state", **settings).report
+    assert resumed.ended_by == f"{BRIEF['steps']} steps" and resumed.curve[-1].step == BRIEF["steps"]
+
+
 def test_a_resumed_run_merges_as_the_whole_one_did(tmp_path, ctrl_c):
     merging = {**BRIEF, "merge_to": 0.5, "merging_costs": 9.0}
     whole = wrapped().adapt(1 / 4, **merging)
@@ -328,7 +342,23 @@ def test_adapting_in_a_thread():
 
 
 def test_the_time_budget_ends_the_run():
-    assert wrapped().adapt(1 / 4, time_budget_s=1e-6, **BRIEF).report.ended_by == "time budget of 1e-06 s, all of which the start took"
+    with pytest.warns(UserWarning, match="time budget of 1e-06 s left no time"):
+        report = wrapped().adapt(1 / 4, time_budget_s=1e-6, **BRIEF).report
+    assert report.ended_by == "time budget of 1e-06 s, all of which the start took"
+    [note] = report.notes
+    assert re.fullmatch(r"the time budget of 1e-06 s left no time for steps after the start; give \d+ s or more to have some", note)
+
+
+def test_the_choice_that_is_reserved_for_is_not_told_as_the_start(monkeypatch):
+    monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(1.0, 1.0, 1.0, 1e6)))
+    report = wrapped().adapt(1 / 4, time_budget_s=1e4, **BRIEF).report
+    assert report.ended_by == "time budget of 10000 s, all of which the start and the choice of a state take"
+
+
+def test_steps_that_were_planned_for_a_time_budget_are_told(monkeypatch):
+    monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(1e4, 0.0, 0.0)))
+    report = wrapped().adapt(1 / 4, time_budget_s=1e4, **BRIEF).report
+    assert report.ended_by == "1 steps (planned for the time budget in place of 7)" and report.settings.steps == 7
 
 
 def test_the_knee_ends_the_run():

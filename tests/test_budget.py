@@ -9,7 +9,7 @@ import torch
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, reason_to_stop
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization import budget
-from mipmap_plugin.adaptation.optimization.budget import SPARE, USES, Pace, within_budget
+from mipmap_plugin.adaptation.optimization.budget import SPARE, USES, Pace, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task
@@ -51,9 +51,23 @@ def test_a_short_run_has_fewer_views():
     assert shorter.warm_up_steps < config.warm_up_steps
 
 
-def test_a_run_that_goes_on_has_further_steps():
-    config = recipe("default", 1 / 4, time_budget_s=3.0)
-    assert within_budget(a_run(2.5, step=100), a_task(4), config)[1].steps == 100 + PACE.steps(config, 0.5 - PACE.a_choice, STILL)
+def test_a_run_that_goes_on_keeps_its_plan():
+    run, config = a_run(1.0), recipe("default", 1 / 4, time_budget_s=3.0)
+    task, planned = within_budget(run, a_task(40), config)
+    run.step, run.watch.seconds = 3, 2.5
+    again, same = within_budget(run, a_task(40), config)
+    assert same == planned and [view.name for view in again.views] == [view.name for view in task.views]
+
+
+def test_what_was_planned_and_taken_is_told():
+    run, config = a_run(1.0, step=5), recipe("default", 1 / 4, time_budget_s=3.0)
+    assert plan_note(run, config) == ""
+    run.planned = 8
+    assert plan_note(run, config) == ""
+    run.ended_by = "time budget of 3 s"
+    assert plan_note(run, config) == " (after 5 of 8 steps, planned for the time budget in place of 360)"
+    run.step = 8
+    assert plan_note(run, config) == " (planned for the time budget in place of 360)"
 
 
 @pytest.mark.parametrize(("settings", "steps"), [(dict(), PACE.steps(recipe("default", 1 / 4), 39.75, STILL)), (dict(steps=400), 400)])

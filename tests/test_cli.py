@@ -509,6 +509,32 @@ def test_a_broken_plugin_breaks_only_itself(run, tmp_path, monkeypatch):
     refused(run("adapt", tiny.ply(tmp_path / "a.ply"), "--scale", "4", "--backend", "broken"), "'broken'", "cannot be loaded")
 
 
+def test_list_says_where_names_come_from_and_what_is_wrong_with_one(run, tmp_path, monkeypatch):
+    place = tmp_path / "stranger-1.0.dist-info"
+    place.mkdir()
+    (place / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    groups = ["viewers]\nspark = stranger:SPARK\nkiosk = stranger:KIOSK\n", "recipes]\nbrief = stranger:brief\n", "models]\nnpz = nobody:FAMILY\n"]
+    (place / "entry_points.txt").write_text("\n".join(f"[mipmap_plugin.{group}" for group in groups))
+    (tmp_path / "stranger.py").write_text("brief = lambda scale, network: dict(steps=3)\nKIOSK = ('spark', 'unity')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    code, out, err = run("list")
+    assert (code, err) == (0, "")
+    assert "recipes:      default, instant, paper, thorough\n              brief: stranger:brief of stranger 1.0\n" in out
+    assert "kiosk: stranger:KIOSK of stranger 1.0\n" in out
+    assert "spark: stranger:SPARK of stranger 1.0, not used: the name is taken by a built-in one; choose another\n" in out
+    assert "npz: nobody:FAMILY of stranger 1.0, not used: 'npz' (nobody:FAMILY) cannot be loaded: ModuleNotFoundError" in out
+    listed = json.loads(run("list", "recipes", "--json")[1])
+    assert listed["recipes"]["of packages"] == {"brief": "stranger:brief of stranger 1.0"}
+
+
+@pytest.mark.parametrize("words", [["render"], ["tradeoff", "--scale", "1/2"]])
+def test_a_file_where_pictures_are_to_go_is_named(run, tmp_path, words):
+    (tmp_path / "taken").write_text("precious")
+    command, *options = words
+    said = f"{tmp_path / 'taken'} is a file, not a folder; choose another path"
+    refused(run(command, tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "taken", *options), said)
+
+
 def test_a_full_disk_ends_in_one_sentence_and_leaves_the_old_file(run, tmp_path, monkeypatch):
     base, output = tiny.ply(tmp_path / "base.ply"), tmp_path / "new.ply"
     output.write_text("precious")

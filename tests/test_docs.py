@@ -44,7 +44,7 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 SNIPPET = re.compile(r'^--8<-- "([^":]+)(?::(\w+))?"$', re.MULTILINE)
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 
-COMMANDS = {each.__name__: each for each in vars(cli).values() if getattr(each, "__module__", "").startswith("mipmap_plugin.commands.")}
+COMMANDS = {each.__name__.rstrip("_"): each for each in vars(cli).values() if getattr(each, "__module__", "").startswith("mipmap_plugin.commands.")}
 OTHER_PROGRAMS = {"pip", "python", "pytest", "ruff", "mypy", "npm", "mkdocs", "dask", "sbatch"}
 OPTIONS_OF_OTHERS = {"--train_test_exp", "--antialiasing", "--resources"}  # INRIA's; dask's
 
@@ -186,7 +186,7 @@ def test_a_wrong_command_is_found(parse):
 
 
 def test_there_are_commands_to_check():
-    assert len(COMMANDS) == 9 and {shlex.split(call.text)[1] for call in CALLS} >= set(COMMANDS)
+    assert len(COMMANDS) == 10 and {shlex.split(call.text)[1] for call in CALLS} >= set(COMMANDS)
 
 
 def options() -> set[str]:

@@ -49,6 +49,9 @@ def test_the_commands_that_list_know_of_it(scene, capsys):
     assert "splats:       40" in capsys.readouterr().out
     assert cli.main(["backends"]) == 0
     assert "careful" in capsys.readouterr().out
+    assert cli.main(["list"]) == 0
+    listed = capsys.readouterr().out
+    assert all(f"{point.name}: {point.value}\n" in listed for point in POINTS)
 
 
 @pytest.mark.parametrize("module", ["register_family", "register_family_files"])

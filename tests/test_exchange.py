@@ -159,9 +159,11 @@ def test_adapt_reads_and_writes_spz(tmp_path, tool, capsys):
 
 
 UP_TO_2, NONE = "reads .spz up to version 2, and splat-transform writes 3 at least", "read no .spz"
+WITH_FILTER = "reads PLYs only, with a column filter_3D that .spz has no place for"
+UNREAD = [("gaussian-splats-3d", UP_TO_2), ("mkkellogg", UP_TO_2), ("gsplat-js", NONE), ("drei", NONE), ("mip", WITH_FILTER)]
 
 
-@pytest.mark.parametrize(("viewer", "why"), [("gaussian-splats-3d", UP_TO_2), ("mkkellogg", UP_TO_2), ("gsplat-js", NONE), ("drei", NONE)])
+@pytest.mark.parametrize(("viewer", "why"), UNREAD)
 def test_spz_is_not_written_for_a_viewer_that_does_not_read_it(tmp_path, tool, capsys, viewer, why):
     (tmp_path / "phone.spz").write_bytes(SPZ)
     words = ["adapt", str(tmp_path / "phone.spz"), "--scale", "1/4", "--recipe", "instant", "--viewer", viewer]

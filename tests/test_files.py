@@ -96,7 +96,7 @@ def test_a_disk_without_room_or_leave_is_refused_before_any_work(tmp_path, monke
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
     with pytest.raises(OutputError, match=r"a\.ply cannot be written: its disk has .* bytes free, and the base takes 1,000,000,000,000,000"):
         refuse_unwritable(tmp_path / "a.ply", room=10**15)
-    with pytest.raises(OutputError, match=r"a\.ply cannot be written: .*file is not a folder"):
+    with pytest.raises(OutputError, match=r"a\.ply cannot be written: .*file is a file, not a folder"):
         refuse_unwritable(tmp_path / "file/a.ply")
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(OutputError, match=r"a\.ply cannot be written: no permission"):

@@ -55,6 +55,17 @@ def test_oddities_are_counted_and_kept(name, value, sentence):
     assert not health.invalid.any()
 
 
+@pytest.mark.parametrize(("name", "value"), [("opacities", -6.0), ("scales", -math.inf), ("scales", -40.0)])
+@pytest.mark.parametrize("share", [0.5, 0.68])
+def test_a_file_most_of_which_shows_nothing_is_told_in_the_verdict(tmp_path, capsys, name, value, share):
+    model = healthy()
+    model.parameters()[name][: int(share * 200)] = value
+    told = "68% of its splats show nothing, for their opacity is below 1/255 or their size is 0" if share > 0.5 else ""
+    assert examine(model).mostly_unseen() == told
+    assert main(["inspect", str(model.save(tmp_path / "a.ply", provenance={})), "--no-viewers"]) == 0
+    assert (f"verdict:      sound, but {told}; next: " in capsys.readouterr().out) == bool(told)
+
+
 def test_surfels_have_no_third_axis_and_are_no_sheets_for_it():
     surfels = healthy()
     surfels.parameters()["scales"][:, 2] = -30.0

@@ -9,18 +9,21 @@ from contextlib import contextmanager
 
 import pytest
 import tiny
+import torch
 
 from mipmap_plugin import cli
 from mipmap_plugin.commands.ladders import _below
 from mipmap_plugin.errors import OutputError, OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks
+from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.streamed import EXTENT, distances, nearer, progression, viewer_settings, write_streamed
 from mipmap_plugin.levels.tiles import SCREEN_ERROR, bounding_box, errors, tileset, write_tile, write_tiles
+from mipmap_plugin.models import load_model
 
-# A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file of no bytes. Of an SPZ
-# it writes the header: 60 splats of degree 1.
+# A stand-in for splat-transform: it lists no GPU, writes its arguments to the output, with two chunks, and fails for a file that says that it is
+# broken, or has SH degree 4. Of an SPZ it writes the header: 60 splats of degree 1.
 STAND_IN = """#!{python}
 import gzip, json, pathlib, struct, sys
 if sys.argv[1:] == ["--list-gpus"]:
@@ -29,8 +32,9 @@ if sys.argv[1:] == ["--version"]:
     sys.exit(print("3.7.0"))
 *words, target = sys.argv[1:]
 print("splat-transform v3.7.0\\n    ▸ [1/2] 0_0\\n    ▸ [2/2] 1_0", file=sys.stderr)
-if any(word.endswith(".ply") and not pathlib.Path(word).stat().st_size for word in words):
-    sys.exit("Invalid header")
+contents = [pathlib.Path(word).read_bytes() for word in words if word.endswith(".ply")]
+if any(b"comment broken" in content or b" f_rest_45" in content for content in contents):
+    sys.exit("readPly: unrecognized")
 if target.endswith(".spz"):
     sys.exit(pathlib.Path(target).write_bytes(gzip.compress(struct.pack("<IIIBBBB", 0x5053474E, 3, 60, 1, 12, 0, 0))) and None)
 counts = lambda count: {{"0": {{"count": count}}, "2": {{"count": 1}}}}
@@ -205,6 +209,24 @@ def test_a_tile_is_a_glb_of_spz(ladder, tool, tmp_path):
     assert not list(tmp_path.glob("*.spz"))
 
 
+@pytest.mark.parametrize("write", [write_tiles, write_streamed])
+def test_bands_that_splat_transform_does_not_read_are_left_out_with_a_warning(ladder, tool, write):
+    (level := ladder / LADDER["levels"][0]["file"]).unlink()
+    tiny.ply(level, degree=4)
+    with pytest.warns(UserWarning, match="SH bands above degree 3 are dropped from what viewers stream"):
+        assert write(ladder).is_file()
+    assert load_model(level).sh_degree == 4
+
+
+def test_what_it_reads_is_a_level_without_these_bands(tmp_path):
+    whole, level = tiny.ply(tmp_path / "whole.ply", degree=4), tiny.ply(tmp_path / "level.ply", degree=3)
+    assert readable(level, tmp_path / "copy.ply") == level
+    with pytest.warns(UserWarning):
+        copy = load_model(readable(whole, tmp_path / "copy.ply")).parameters()
+    for name, tensor in load_model(whole).parameters().items():
+        assert torch.equal(copy[name], tensor[:, :15] if name == "shN" else tensor)
+
+
 def test_cesium_is_told_in_the_tileset_that_tiles_are_splats():
     assert tileset(LADDER, [0.0] * 12)["extensions"]["3DTILES_content_gltf"]["extensionsRequired"] == [
         "KHR_gaussian_splatting",
@@ -213,7 +235,8 @@ def test_cesium_is_told_in_the_tileset_that_tiles_are_splats():
 
 
 def test_a_failed_conversion_leaves_nothing(ladder, tool):
-    (ladder / "level_2.ply").write_bytes(b"")
+    level = ladder / "level_2.ply"
+    level.write_bytes(level.read_bytes().replace(b"end_header", b"comment broken\nend_header"))
     with pytest.raises(OutputError, match="splat-transform does not write it"):
         write_streamed(ladder)
     assert not (ladder / "streamed").exists()

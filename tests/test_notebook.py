@@ -107,6 +107,15 @@ def test_render_takes_the_viewer_that_a_file_was_adapted_for(tmp_path, capsys):
     assert drawn["portable", "own"] != drawn["portable", "spark"]  # which is one of several that it was made for
 
 
+def test_a_file_for_a_viewer_of_a_package_that_is_absent_says_so(tmp_path, capsys):
+    file = tiny.model().save(tmp_path / "a.ply", provenance={"scale": 1.0, "viewer": "kiosk"})
+    words = ["render", str(file), "--output", str(tmp_path / "out"), "--view", "orbit_0003", "--backend", "cpu"]
+    assert main(words) == 2
+    told = "a.ply was adapted for the viewer 'kiosk', which is not installed here; install the package that adds it, or give another one (--viewer)"
+    assert told in capsys.readouterr().err
+    assert main([*words, "--viewer", "spark"]) == 0
+
+
 def test_the_scale_is_read_from_the_header_or_from_the_report(tmp_path):
     base = wrap_model(tiny.ply(tmp_path / "base.ply"), backend="reference")
     saved = base.adapt(2, recipe="instant").save(tmp_path / "a.ply")

@@ -129,6 +129,17 @@ def family(**methods):
     return wrap_model(model, cameras=tiny.cameras(2), backend="reference")
 
 
+def with_nan(method):
+    """A method of a family that leaves a NaN."""
+
+    def failing(self, *arguments):
+        getattr(VanillaModel, method)(self, *arguments)
+        with torch.no_grad():
+            self.parameters()["scales"][3] = torch.nan
+
+    return {method: failing}
+
+
 def moving_itself(self, camera=None):
     with torch.no_grad():
         self.parameters()["means"].add_(0.01)
@@ -176,6 +187,8 @@ def frozen(self):
         (dict(copy=frozen), r"family 'theirs': copy\(\) has to return parameters that are leaves and require gradients; means, .* cannot"),
         (dict(gaussians=detached), r"family 'theirs': gaussians\(\) returned splats without gradients"),
         (dict(gaussians=opaque), r"family 'theirs': gaussians\(\) returned opacities from 1\.03 to 2\.84, which have to lie in 0\.\.1"),
+        (with_nan("reshape"), r"family 'theirs': reshape\(form, views\) left NaN in scales; keep what it divides by"),
+        (with_nan("rebuild"), r"family 'theirs': rebuild\(form\) left NaN in scales"),
         (dict(row_opacities=lambda self, views=(): torch.ones(3)), r"row_opacities\(\) has to return 60 finite num.*; it returned a tensor \[3\]"),
         (dict(row_opacities=lambda self, views=(): None), r"row_opacities\(\) has to return 60 finite numbers.*; it returned a NoneType"),
         (dict(__module__="__main__", rebuild=lambda self, form: {}["zz"]), "family 'theirs' failed: KeyError: 'zz'"),  # of a script; a copy's method

@@ -111,7 +111,7 @@ def test_an_unknown_upsampler_is_refused_before_anything_is_rendered():
 
 def chosen(views, cameras=None, **settings):
     cameras = tiny.cameras(4) + tiny.cameras(2, seed=5, split="test") if cameras is None else cameras
-    return choose_views(cameras, tiny.gaussians(), AdaptConfig(views=views, **settings)), cameras
+    return choose_views(cameras, tiny.gaussians().means, AdaptConfig(views=views, **settings)), cameras
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,13 @@ def test_a_numpy_archive_that_nobody_claims_is_told_to_be_one(tmp_path):
         detect(archive(tmp_path / "scene.npz"))
 
 
+def test_an_adapted_file_of_a_family_that_is_absent_says_so(tmp_path):
+    np.savez(tmp_path / "scene_x0.25.npz", means=np.zeros((1, 3)))
+    (tmp_path / "scene_x0.25.npz.adaptation.json").write_text("{}")
+    with pytest.raises(CheckpointError, match="npz was adapted from a checkpoint of a family that is not installed here; install the package"):
+        detect(tmp_path / "scene_x0.25.npz")
+
+
 def test_a_file_for_a_viewer_is_a_ply(tmp_path):
     register_model("cholesky", FILES["FAMILY"])
     assert adapted_name(factors(tmp_path / "scene.npz"), 0.25, "spark") == "scene_x0.25_spark.ply"

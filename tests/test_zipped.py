@@ -1,10 +1,13 @@
-"""A PLY in a zip archive: read if it is alone there, and refused in a sentence otherwise."""
+"""A PLY or a model folder in a zip archive: read if it is alone there, and refused in a sentence otherwise."""
 
+import errno
+import tempfile
 import zipfile
 
 import numpy as np
 import pytest
 import tiny
+import torch
 from ply_files import write
 
 from mipmap_plugin import wrap_model
@@ -12,7 +15,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats import zipped
 from mipmap_plugin.formats.ply import read_ply
-from mipmap_plugin.models import load_model
+from mipmap_plugin.models import detect, load_model, zipped_folder
 
 
 def archive(path, files):
@@ -86,3 +89,85 @@ def test_a_ply_that_is_no_base_is_told_of_by_the_archives_name(tmp_path, ply):
     refused(archive(tmp_path / "mip.zip", {"a.ply": filtered}), "mip.zip holds a PLY of Mip-Splatting; unpack it")
     made = wrap_model(tmp_path / "own.ply", backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "made.ply")
     refused(archive(tmp_path / "made.zip", {"a.ply": made.read_bytes()}), "made.zip holds a file that was adapted; unpack it")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tiny.folder(tmp_path / "trained" / "model")
+
+
+def packed(path, folder, top="my model", beside=None):
+    """A zip archive of a model folder, which is called `top` in it."""
+    files = {f"{top}/{file.relative_to(folder)}" if top else str(file.relative_to(folder)): file for file in folder.rglob("*") if file.is_file()}
+    return archive(path, {name: file.read_bytes() for name, file in files.items()} | (beside or {}))
+
+
+@pytest.mark.parametrize("top", ["my model", "", "../../up", "deep/er"])
+def test_a_model_folder_is_read_with_its_cameras(tmp_path, folder, top):
+    base, before = wrap_model(packed(tmp_path / "a.zip", folder, top), backend="reference"), {*tmp_path.rglob("*")}
+    assert torch.equal(base.model.parameters()["means"], load_model(folder).parameters()["means"])
+    assert [view.name for view in base.cameras] == [view.name for view in tiny.cameras()]
+    assert {*tmp_path.rglob("*")} == before and detect(tmp_path / "a.zip").path == base.model.source
+
+
+def test_what_is_adapted_from_it_is_a_folder_beside_it(tmp_path, folder):
+    packed(tmp_path / "a.zip", folder)
+    words = ["adapt", str(tmp_path / "a.zip"), "--scale", "1/2", "--recipe", "instant", "--backend", "reference"]
+    assert main(words) == 0 and len(load_model(tmp_path / "a_x0.5")) == 60
+    assert (tmp_path / "a_x0.5" / "cameras.json").is_file()
+
+
+def test_it_is_unpacked_once_and_without_its_pictures(tmp_path, folder, monkeypatch):
+    path = packed(tmp_path / "a.zip", folder, beside={"my model/test/ours_7000/1.png": b"x", "my model/point_cloud/more.txt": b"x"})
+    place = zipped_folder.opened(path)
+    assert not (place / "test").exists() and (place / "point_cloud" / "more.txt").exists()
+    monkeypatch.setattr(zipped_folder, "copied", None)
+    assert zipped_folder.opened(path) == place and len(load_model(path)) == 60
+
+
+@pytest.mark.parametrize("name", ["point_cloud/../../x", "..", "c:x", "point_cloud/..\\x"])
+def test_a_name_that_leads_out_of_the_folder_is_refused(tmp_path, folder, name):
+    path = packed(tmp_path / "a.zip", folder, beside={f"my model/{name}": b"x"})
+    refused(path, "a.zip holds the name .* which leads out of its folder; do not open it")
+    assert not list(tmp_path.rglob("x"))
+
+
+def test_a_folder_that_would_fill_the_disk_is_not_unpacked(tmp_path, folder):
+    refused(packed(tmp_path / "a.zip", folder, beside={"my model/zeros": bytes(10**7)}), "would be more than 100 times as large unpacked")
+
+
+def test_of_several_folders_one_has_to_be_given(tmp_path, folder):
+    ply = next(folder.rglob("point_cloud.ply")).read_bytes()
+    other = {"other/point_cloud/iteration_7/point_cloud.ply": ply}
+    refused(packed(tmp_path / "a.zip", folder, beside=other), r"a.zip holds 2 model folders \(my model, other\); unpack it")
+
+
+def test_a_full_disk_is_not_told_as_a_damaged_archive(tmp_path, folder, ply, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(zipped.shutil, "copyfileobj", full)
+    for path in (packed(tmp_path / "a.zip", folder), archive(tmp_path / "b.zip", {"a.ply": ply})):
+        refused(path, f"{path.name} cannot be unpacked in .* \\(No space left on device\\); make room there")
+
+
+def test_what_is_wrong_inside_is_told_by_the_archives_name(tmp_path, folder):
+    [splats] = folder.rglob("point_cloud.ply")
+    columns = read_ply(splats).columns
+    columns["x"][3] = np.nan
+    write(splats, columns)
+    with pytest.warns(UserWarning, match="a.zip/point_cloud/.*1 of 60 splats was dropped"):
+        load_model(packed(tmp_path / "a.zip", folder))
+    splats.write_bytes(b"ply")
+    refused(packed(tmp_path / "b.zip", folder), "^[^;]*b.zip has no whole checkpoint: [^;]*b.zip/point_cloud/")
+
+
+def test_workers_leave_nothing_unpacked(tmp_path, folder, monkeypatch):
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    for name in ("a", "b"):
+        packed(tmp_path / f"{name}.zip", folder)
+    assert main(["adapt", str(tmp_path / "*.zip"), "--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--jobs", "2"]) == 0
+    assert len(list((tmp_path / "temporary").glob("mipmap-plugin-*"))) == 2  # of this process, which has not ended
+    assert (tmp_path / "a_x0.5").is_dir() and (tmp_path / "b_x0.5").is_dir()

@@ -79,7 +79,7 @@ class Stages:
             adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self._further(converted.report))
         settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if _stopped(converted.report) else {})
         its_own, given = (f"budget of {each.time_budget_s or 0:g} s" for each in (half, config))
-        ended_by = adapted.report.ended_by.replace(its_own, given).replace("which the start took", "which the conversion and the start took")
+        ended_by = adapted.report.ended_by.replace(its_own, given).replace("all of which the start", "all of which the conversion and the start")
         report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings), "ended_by": ended_by})
         return replace(adapted, report=_joined(converted.report, report), states=[*converted.states, *adapted.states])
 

@@ -76,10 +76,14 @@ def psnr_as_shown(image: torch.Tensor, truth: torch.Tensor) -> float:
     return decibel(float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()))
 
 
-def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig) -> str | None:
-    """Why a run ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue."""
+def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig, reserved: float = 0.0) -> str | None:
+    """Why a run ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue.
+
+    `reserved`: those of the seconds that are kept for what comes after the steps.
+    """
     if config.time_budget_s is not None and seconds >= config.time_budget_s:
-        return f"time budget of {config.time_budget_s:g} s" + (", all of which the start took" if not curve[-1].step else "")
+        took = "the start took" if seconds - reserved >= config.time_budget_s else "the start and the choice of a state take"
+        return f"time budget of {config.time_budget_s:g} s" + (f", all of which {took}" if not curve[-1].step else "")
     psnrs = [point.psnr_db for point in curve if point.psnr_db is not None]
     if config.target_db is not None and psnrs and psnrs[-1] >= config.target_db:
         return f"target of {config.target_db:g} dB against the pseudo truth"

@@ -13,6 +13,7 @@ from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, enlarges
 from mipmap_plugin.models.base import SPLATS, SplatModel
+from mipmap_plugin.scenes.trajectories import Orbit
 
 # The name of the base among a run's states.
 AS_IT_IS = "the base as it is"
@@ -43,6 +44,7 @@ class Report(BaseModel):
         versions: Of this package and of torch.
         notes: What became of the model on the way, such as columns of the base's file that the new splats do not have, in sentences.
         inputs: What was given beside the checkpoint: hashes of cameras and photographs, background, screen filter.
+        orbit: What views without cameras go around, the same for the file as for its base.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -68,6 +70,7 @@ class Report(BaseModel):
     versions: dict[str, str]
     notes: list[str] = []
     inputs: dict[str, str] = {}
+    orbit: Orbit | None = None
 
     def psnr_before(self) -> float | None:
         """PSNR (dB) of the base on views that nothing was adapted to; None if it was not measured."""
@@ -88,11 +91,12 @@ class Report(BaseModel):
 
     def provenance(self) -> dict[str, Any]:
         """Return what the file's header records: viewer, base, scale, inputs, settings, versions. Nothing in it depends on the clock."""
-        return provenance({"scale": self.scale, "viewer": self.viewer, "base": self.base, "inputs": self.inputs}, self.settings, self.versions)
+        made_from = self.model_dump(include={"scale", "viewer", "base", "inputs", "orbit"})
+        return provenance(made_from, self.settings, self.versions)
 
 
 def provenance(made_from: Mapping[str, Any], settings: AdaptConfig, versions: Mapping[str, str]) -> dict[str, Any]:
-    """What a file's header records. `made_from`: its scale, viewer, base and inputs."""
+    """What a file's header records. `made_from`: its scale, viewer, base, inputs and orbit."""
     return {**made_from, "settings": settings.model_dump(), "versions": dict(versions)}
 
 

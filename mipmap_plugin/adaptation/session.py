@@ -20,7 +20,7 @@ from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, takes_steps
-from mipmap_plugin.adaptation.optimization.budget import within_budget
+from mipmap_plugin.adaptation.optimization.budget import no_steps_note, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
@@ -38,7 +38,7 @@ from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.target.portable import extreme_targets, median_target
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, over_band, refuse_blind, remarks, showing, too_unlike
+from mipmap_plugin.adaptation.views import choose_views, orbit_of, over_band, refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -211,7 +211,8 @@ class Session:
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + checks
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
-        return run, run.ended_by + fewer_note(self.asked_steps, self.config) + growth_note(run)
+        self.notes = [*self.notes, *filter(None, [no_steps_note(run, self.config)])]
+        return run, run.ended_by + (plan_note(run, self.config) or fewer_note(self.asked_steps, self.config)) + growth_note(run)
 
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
@@ -288,6 +289,7 @@ class Session:
             curve=curve,
             versions=versions(),
             inputs=self.inputs,
+            orbit=orbit_of(self.base),
             notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
         )
 

@@ -15,13 +15,13 @@ from mipmap_plugin.adaptation.spreading import places, spread
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import derived_seed
+from mipmap_plugin.models.adapted_scale import adapted_orbit
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.render_settings import MIN_ALPHA
-from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, jittered, orbit
+from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, Orbit, jittered
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
 ORBIT_PIXELS = 800
@@ -132,15 +132,25 @@ def extent(views: Sequence[Camera]) -> float:
     return radius if radius > 0 else 1.0
 
 
-def choose_views(cameras: Sequence[Camera], means: Tensor | Gaussians, config: AdaptConfig) -> tuple[list[Camera], str]:
-    """Return the base-scale cameras to adapt to, and a description of them. `means` [N, 3]: the points that an orbit surrounds.
+def orbit_of(model: SplatModel) -> Orbit:
+    """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places."""
+    recorded = adapted_orbit(model.source)
+    if recorded is None:
+        return Orbit.around(model.parameters()["means"])
+    center, up, distance = recorded
+    return Orbit((center[0], center[1], center[2]), (up[0], up[1], up[2]), distance)
+
+
+def choose_views(cameras: Sequence[Camera], around: Tensor | Orbit, config: AdaptConfig) -> tuple[list[Camera], str]:
+    """Return the base-scale cameras to adapt to, and a description of them. `around`: what an orbit surrounds, such as means [N, 3].
 
     Raises SettingsError when the policy finds no cameras.
     """
     generator = torch.Generator().manual_seed(config.seed)
     if config.views == "orbit" or not cameras:
         pixels = math.ceil(2 * math.tan(ORBIT_FOV / 2) * cameras[0].fx) if cameras else ORBIT_PIXELS  # the cameras' own focal length
-        views = orbit(means, (pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
+        found = around if isinstance(around, Orbit) else Orbit.around(around)
+        views = found.views((pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
         reason = "as requested" if cameras else "the checkpoint came without cameras"
         return views, f"{len(views)} views of a generated orbit at {pixels} px ({reason})"
     if config.views == "given":

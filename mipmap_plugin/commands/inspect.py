@@ -37,9 +37,10 @@ def inspect(
     """
     with announced(f"reading {checkpoint.name}"), uncollected():
         from mipmap_plugin.models import detect, load_model
+        from mipmap_plugin.models.zipped_folder import told
 
         found = detect(checkpoint, iteration=iteration)
-        known = {"file": str(found.path), "family": found.family}
+        known = {"file": told(found.path), "family": found.family}
         if not json:
             print_facts(known, json)  # before torch is imported
         from mipmap_plugin.wrap import wrap_model
@@ -72,7 +73,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
         told = [*health.sentences(), *lost, *filter(None, [too_unlike(wrapped.views())])]
     return {
-        "verdict": _verdict(wrapped, checkpoint, told, bool(lost) or health.spoilt()),
+        "verdict": _verdict(wrapped, checkpoint, told, bool(lost) or health.spoilt(), health.mostly_unseen()),
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
@@ -88,8 +89,8 @@ def _differences(wrapped: Wrapped) -> str:
     return viewer_differences(wrapped)
 
 
-def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: bool) -> str:
-    """Whether the checkpoint is sound, and what to do with it. `health`: remarks; `spoilt`: one says that it is not."""
+def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: bool, unseen: str) -> str:
+    """Whether the checkpoint is sound, and what to do with it. `health`: remarks; `spoilt`: one says that it is not; `unseen`: that most is."""
     from mipmap_plugin.models.adapted_scale import adapted_scale
     from mipmap_plugin.models.health import DROPPED
 
@@ -103,7 +104,7 @@ def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: 
     if scale not in (None, 1.0):
         advice = f"mipmap-plugin render {place}, at x{scale:g}, which it was adapted to and looks right at"
     remarks = len(health)
-    noted = f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""
+    noted = f", but {unseen}" if unseen else f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""
     if spoilt:
         return "doubtful: read health before you adapt it"
     return f"sound{noted}; next: {advice}"

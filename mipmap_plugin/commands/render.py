@@ -105,11 +105,17 @@ def _zoom(wrapped: Wrapped, scale: float | None) -> float:
 
 
 def _own_viewer(wrapped: Wrapped) -> str | None:
-    """The viewer that the file was adapted for; None for a base, and for a file for several viewers, whose header names a filter."""
+    """The viewer that the file was adapted for; None for a base, and for a file for several viewers, whose header names a filter.
+
+    Raises SettingsError for one that is not known here: it is of a package.
+    """
     from mipmap_plugin.models.adapted_scale import adapted_viewer
-    from mipmap_plugin.splatting.viewers import viewers_for
+    from mipmap_plugin.splatting.viewers import VIEWERS, viewers_for
 
     viewer = adapted_viewer(wrapped.model.source)
+    if viewer and viewer not in VIEWERS.names():
+        remedy = "install the package that adds it, or give another one (--viewer) or a screen filter (--screen-filter)"
+        raise SettingsError(f"{wrapped.model.source} was adapted for the viewer {viewer!r}, which is not installed here; {remedy}")
     return viewer if viewer and len(viewers_for(viewer)) == 1 else None
 
 

@@ -108,6 +108,8 @@ def archive(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as opened:
             yield opened
+    except CheckpointError:
+        raise
     except Exception as error:  # bad offsets, names, versions, checksums and streams raise different exceptions
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise CheckpointError(f"{path} is a damaged zip archive ({reason}); download or copy it again") from error

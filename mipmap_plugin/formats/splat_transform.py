@@ -47,10 +47,12 @@ SPZ_VERSION = "3"
 # The highest SH degree that its versions from 3.0 on read and write, though SPZ itself has room for 4.
 MOST_BANDS = 3
 
-# Viewers that do not read it, by their source: for these a PLY has to be written.
+# Viewers that do not read it, by their source: for these a PLY has to be written. "classic" and "antialiased" are names for whatever draws as 3DGS
+# does, and some of that reads it.
 NO_SPZ = {
     "gaussian-splats-3d": "GaussianSplats3D 0.4.7 reads .spz up to version 2, and splat-transform writes 3 at least",
     **dict.fromkeys(("antimatter15", "aframe", "gsplat-js"), "antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no .spz"),
+    "mip": "Mip-Splatting reads PLYs only, with a column filter_3D that .spz has no place for",
 }
 
 # From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them

@@ -1,13 +1,14 @@
-"""A PLY in a zip archive, as phones and web pages hand it out. A model folder in an archive has to be unpacked: more is read of it than its PLY."""
+"""A PLY in a zip archive, as phones and web pages hand it out, and what is unpacked of any archive: no more than its disk has room for."""
 
 from __future__ import annotations
 
+import errno
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from zipfile import ZipInfo
+from zipfile import ZipFile, ZipInfo
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.magic import archive
@@ -15,6 +16,9 @@ from mipmap_plugin.formats.magic import archive
 # How many times as large as its archive a PLY may be. Those of captures are less than twice as large, and one without view-dependent color, whose
 # columns are zeros, ten times; an archive that fills a disk has thousands.
 MOST_TIMES = 100
+
+# Errors of a write for which a disk, or what one user may have of it, has no room.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def only_ply(path: Path) -> ZipInfo | None:
@@ -31,13 +35,34 @@ def unpacked(path: Path) -> Iterator[Path]:
     entry = only_ply(path)
     if entry is None:
         raise CheckpointError(f"{path} is no zip archive of one PLY; unpack it and give the PLY or the folder in it")
-    if entry.file_size > MOST_TIMES * path.stat().st_size:
-        raise CheckpointError(f"{path} would be more than {MOST_TIMES} times as large unpacked, which no file of splats is; do not open it")
     with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
-        if entry.file_size > shutil.disk_usage(folder).free:
-            needed = f"{entry.file_size / 2**30:,.1f} GiB"
-            raise CheckpointError(f"{path} needs {needed} unpacked, for which {tempfile.gettempdir()} has no room; unpack it elsewhere")
-        ply = Path(folder, "unpacked.ply")
-        with archive(path) as opened, opened.open(entry) as packed, ply.open("xb") as out:
-            shutil.copyfileobj(packed, out)  # no more bytes than the entry's file_size, and checks its checksum
+        refuse_large(path, entry.file_size, Path(folder))
+        with archive(path) as opened:
+            ply = copied(path, opened, entry, Path(folder, "unpacked.ply"))
         yield ply
+
+
+def refuse_large(path: Path, size: int, folder: Path) -> None:
+    """Raise CheckpointError if `size` bytes of an archive are more than an honest one holds, or than there is room for in `folder`."""
+    if size > MOST_TIMES * path.stat().st_size:
+        raise CheckpointError(f"{path} would be more than {MOST_TIMES} times as large unpacked, which no file of splats is; do not open it")
+    if size > shutil.disk_usage(folder).free:
+        needed = f"{size / 2**30:,.1f} GiB"
+        raise CheckpointError(f"{path} needs {needed} unpacked, for which {tempfile.gettempdir()} has no room; unpack it elsewhere")
+
+
+def copied(path: Path, opened: ZipFile, entry: ZipInfo, file: Path) -> Path:
+    """Unpack one entry of the archive at `path`, whatever it is called there, to the new file `file`; return that.
+
+    Raises CheckpointError where the disk is full.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with opened.open(entry) as packed, file.open("xb") as out:
+            shutil.copyfileobj(packed, out)  # no more bytes than the entry's file_size, and checks its checksum
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        place = tempfile.gettempdir()
+        raise CheckpointError(f"{path} cannot be unpacked in {place} ({error.strerror}); make room there, or unpack it elsewhere") from error
+    return file

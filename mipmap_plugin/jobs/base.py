@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.garbage import uncollected
 
 if TYPE_CHECKING:
@@ -36,6 +37,15 @@ class Base:
         else:
             cameras = tuple(model_cameras(folder, read_options(folder)[0]))
         return asked_for(folder, cameras, COLORS[self.background], self.screen_filter)
+
+    def unpacked(self) -> Base:
+        """The same checkpoint, for another process: this one removes what it unpacked when it ends, but a worker that is killed does not."""
+        from mipmap_plugin.models.zipped_folder import opened
+
+        try:
+            return replace(self, checkpoint=opened(self.checkpoint))
+        except (CheckpointError, OSError):  # whoever loads it says so
+            return self
 
     def load(self, threads: int | None = None) -> Wrapped:
         """Load and wrap the checkpoint. Raises CheckpointError, SceneError, SettingsError, BackendUnavailable."""

@@ -10,9 +10,11 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import IO, cast
 
 from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.models.zipped_folder import told
 
 # Where libraries look for the number of threads that they may start.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -86,11 +88,13 @@ class Worker:
 
 def do(job: Job, worker: Worker, watch: Callable[[], None] = lambda: None, attempts: int = ATTEMPTS) -> Outcome:
     """Do a job in a worker; if that dies, in a new one, up to `attempts` times. `watch` is called while the job runs."""
+    sent = replace(job, base=job.base.unpacked())
     for attempt in range(1, attempts + 1):
         try:
-            worker.begin(job)
+            worker.begin(sent)
             watch()
-            return worker.outcome()
+            outcome = worker.outcome()
+            return replace(outcome, job=job, reason=told(outcome.reason))
         except WorkerDied as death:
             if worker.stopped:
                 return Outcome(job, "interrupted", reason="interrupted")

@@ -6,10 +6,12 @@ import json
 import re
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.report import provenance, versions
+from mipmap_plugin.adaptation.views import orbit_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
@@ -58,10 +60,8 @@ def recorded(base: Wrapped, requests: Sequence[tuple[float, str | None]], settin
     """
     further = {**settings, "most_splats": len(base.model.parameters()["means"])}
     name, digest = further.pop("recipe"), base.model.digest or digest_of_parameters(base.model)
-    records = [
-        provenance({"scale": scale, "viewer": viewer, "base": digest, "inputs": base.asked}, recipe(name, scale, **further), versions())
-        for scale, viewer in requests
-    ]
+    made_from = {"base": digest, "inputs": base.asked, "orbit": asdict(orbit_of(base.model))}
+    records = [provenance({"scale": scale, "viewer": viewer, **made_from}, recipe(name, scale, **further), versions()) for scale, viewer in requests]
     return max(records, key=lambda record: (wants_filter(record["viewer"]), len(json.dumps(record, default=str))))
 
 

@@ -14,6 +14,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -23,6 +24,7 @@ from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.splat_transform import LOD_META
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
 from mipmap_plugin.levels.distance.chunks import shrunk
+from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import read_manifest
 
 STREAMED, SETTINGS = "streamed", "playcanvas.json"
@@ -99,9 +101,10 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
     rising = distances(manifest, canvas)
     if not rising:
         raise SettingsError(SINGLE_LEVEL)
-    with new_folder(folder / STREAMED, overwrite) as temporary:
+    with new_folder(folder / STREAMED, overwrite) as temporary, TemporaryDirectory(prefix="mipmap-plugin-") as copies:
         made = temporary / LOD_META
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
-        write_streamed_sog([folder / level["file"] for level in manifest["levels"]], made, extent)
+        files = [level["file"] for level in manifest["levels"]]
+        write_streamed_sog([readable(folder / file, Path(copies, file)) for file in files], made, extent)
         write_json(temporary / SETTINGS, viewer_settings(manifest, read_chunks(made), canvas), overwrite=False)
     return folder / STREAMED / LOD_META

@@ -16,6 +16,7 @@ import shutil
 import struct
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.splat_transform import write_exchange
+from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import read_manifest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
@@ -87,7 +89,8 @@ def _bounds(model: SplatModel, reach: float) -> tuple[Tensor, Tensor]:
 def write_tile(ply: Path, tile: Path) -> None:
     """Write a GLB of the splats of a PLY. Raises SettingsError without splat-transform, OutputError."""
     compressed = tile.with_suffix(".spz")
-    write_exchange(compressed, partial(shutil.copyfile, ply), overwrite=False)
+    with TemporaryDirectory(prefix="mipmap-plugin-") as folder:
+        write_exchange(compressed, partial(shutil.copyfile, readable(ply, Path(folder, ply.name))), overwrite=False)
     low, high = _bounds(load_model(ply), 0.0)
     tile.write_bytes(glb(compressed.read_bytes(), low.tolist(), high.tolist()))
     compressed.unlink()

@@ -10,6 +10,7 @@ from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError
 from mipmap_plugin.models.detect import Checkpoint, detect
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
+from mipmap_plugin.models.zipped_folder import opened, told_of_archives
 from mipmap_plugin.plugin_errors import is_third_party
 from mipmap_plugin.registry import load_target
 
@@ -50,6 +51,9 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
     third-party loader cannot be imported, fails, or returns an object that is not a model.
     """
     checkpoint = detect(path, iteration=iteration)
+    if (folder := opened(Path(path))) != Path(path):
+        with told_of_archives():
+            return load_model(folder, iteration=iteration)
     from mipmap_plugin.models.contract import lacking
 
     family = find_family(checkpoint.family)

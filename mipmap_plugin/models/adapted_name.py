@@ -8,6 +8,7 @@ from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.formats.splat_transform import READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
+from mipmap_plugin.models.zipped_folder import opened
 
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
@@ -31,6 +32,8 @@ def _endings(checkpoint: Path, name: str, *, for_viewer: bool) -> tuple[str, str
         family = find_family(detect(checkpoint).family)
     except MipmapPluginError:  # whoever loads it says so
         return "", ""
+    if opened(checkpoint) != checkpoint:  # a folder in a zip archive
+        return Path(name).suffix, ""
     if family in BUILT_IN:
         return (Path(name).suffix, ".ply") if family.name == "zipped" else ("", "")
     own = Path(name).suffix if family.saves is None else family.saves

@@ -1,4 +1,4 @@
-"""The scale and the viewer that a checkpoint was adapted to, by what this package wrote into its header or beside it."""
+"""The scale and the viewer that a checkpoint was adapted to, and its base's orbit, by what this package wrote into its header or beside it."""
 
 from __future__ import annotations
 
@@ -23,6 +23,17 @@ def adapted_viewer(source: Path | None) -> str | None:
     """The viewer that the file `source` was adapted for; None if for none by name. Raises CheckpointError for a damaged report beside it."""
     viewer = _record(source).get("viewer")
     return viewer if isinstance(viewer, str) else None
+
+
+def adapted_orbit(source: Path | None) -> tuple[list[float], list[float], float] | None:
+    """Center, up and distance of the orbit around the base of the file `source`; None if it is a base, or of an older version.
+
+    Raises CheckpointError for a damaged report beside it.
+    """
+    match _record(source).get("orbit"):
+        case {"center": [float(), float(), float()] as center, "up": [float(), float(), float()] as up, "distance": float() as distance}:
+            return center, up, distance
+    return None
 
 
 def _record(source: Path | None) -> dict[str, Any]:

@@ -148,6 +148,19 @@ def rebuild(model: SplatModel, form: Callable[[Gaussians], Gaussians]) -> None:
     if made != [rows]:
         got = f"called it {len(made)} times" if len(made) != 1 else f"holds {rows} splats after it returned {made[0]}"
         raise PluginError(f"family {model.family!r}: rebuild(form) has to hold the splats that `form` returns; it {got}")
+    _refuse_not_finite(model, "rebuild(form)")
+
+
+def reshape(model: SplatModel, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera]) -> None:
+    """Have the splats reshaped, and look whether their parameters are numbers."""
+    model.reshape(form, views)
+    _refuse_not_finite(model, "reshape(form, views)")
+
+
+def _refuse_not_finite(model: SplatModel, call: str) -> None:
+    """Raise PluginError if a third-party family left a NaN. An infinity may be the logit of 1, or the logarithm of 0."""
+    if is_third_party(model) and (wrong := [name for name, tensor in model.parameters().items() if tensor.isnan().any()]):
+        raise PluginError(f"family {model.family!r}: {call} left NaN in {', '.join(wrong)}; keep what it divides by, or takes a root of, above 0")
 
 
 def save(model: SplatModel, path: Path, provenance: dict[str, Any], *, overwrite: bool = False) -> Path:

@@ -12,9 +12,11 @@ from mipmap_plugin.formats.atomic import settled
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import OF_SPLATS, Family, Files, Match
 from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.zipped_folder import opened, told_of_archives
 
 # Suffixes of files of splats besides PLY, and of photographs.
 EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat"), (".jpg", ".jpeg", ".png")
+OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
 # The families of this package.
 OWN = frozenset(family.name for family in BUILT_IN)
@@ -35,7 +37,7 @@ class Checkpoint:
 
 
 def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
-    """Find the splats at `path`, a file or a model folder, and their family.
+    """Find the splats at `path`, a file, a model folder or a zip archive of one, and their family.
 
     In a folder, the newest `iteration_<N>` whose PLY is complete is used, or `iteration`.
     Raises CheckpointError for a path that is missing, damaged, or not a checkpoint.
@@ -45,6 +47,9 @@ def detect(path: str | Path, *, iteration: int | None = None) -> Checkpoint:
     path = settled(Path(path))
     if path.is_dir():
         return _detect_folder(path, iteration)
+    if (folder := opened(path)) != path:
+        with told_of_archives():
+            return _detect_folder(folder, iteration)
     if iteration is not None and path.exists():
         raise CheckpointError(f"{path} is a file and has no iterations; give its model folder to choose iteration {iteration}")
     return _recognize(path)[0]
@@ -110,6 +115,9 @@ def _most_certain(files: Files, claims: dict[str, tuple[Family, Match]], notes: 
 
 def _why_not(files: Files) -> str:
     path, kind = files.path, files.kind
+    if path.suffix.lower() not in OWN_SUFFIXES and path.with_name(path.name + REPORT).is_file():
+        remedy = "install the package that adds that family (`mipmap-plugin list families` shows which are found)"
+        return f"{path} was adapted from a checkpoint of a family that is not installed here; {remedy}"
     if files.header:
         if len(missing := OF_SPLATS - files.columns) < len(OF_SPLATS) / 2:
             return f"{path} is no whole 3DGS checkpoint: it lacks the columns {', '.join(sorted(missing))}; export it again with them"

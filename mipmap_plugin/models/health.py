@@ -89,6 +89,8 @@ class Health:
     huge: int  # longest axis above `extent`: one standard deviation covers the whole scene
     tiny: int  # shortest axis below TINY_SHARE · extent
     invisible: int  # opacity below MIN_VISIBLE
+    sizeless: int  # longest axis below TINY_SHARE · extent
+    unseen: int  # invisible or sizeless
     rounded: int  # steps between the numbers that hold its place are above COARSE_STEP of its size, and seen in an image of the whole scene
     step: float  # world units: the median of these steps, of the `rounded` splats; 0 without any
     scales_look_linear: bool  # stored scales should be log lengths, but all are positive and most below 1, as lengths are
@@ -102,6 +104,7 @@ class Health:
             (self.zero_quaternions, "have a zero quaternion and are drawn unrotated"),
             (self.huge, f"are longer than the scene ({units(self.extent, 3)} units)"),
             (self.tiny, f"have an axis below {TINY_SHARE:g} of the scene: sheets or needles"),
+            (self.sizeless, "have no size: drawn as a dot where splats are dilated without compensation, and nowhere else"),
             (self.invisible, "have an opacity below 1/255 and are never drawn"),
         ]
         remarks = [*self.non_finite(), *(f"{count:,} of {self.splats:,} splats {what}" for count, what in counts if count)]
@@ -110,6 +113,12 @@ class Health:
     def spoilt(self) -> bool:
         """Whether some splats spoil images, none is drawn, places are lost, or stored values look like those of another convention."""
         return bool(self.invalid.any()) or 0 < self.splats == self.invisible or bool(self.doubts())
+
+    def mostly_unseen(self) -> str:
+        """That most splats show nothing, in a clause; "" if most do."""
+        if 2 * self.unseen <= self.splats:
+            return ""
+        return f"{self.unseen / self.splats:.0%} of its splats show nothing, for their opacity is below 1/255 or their size is 0"
 
     def doubts(self) -> list[str]:
         """That places are lost, or that stored values look like those of another convention, in sentences."""
@@ -151,6 +160,7 @@ def examine(model: SplatModel) -> Health:
     extent = _extent(raw["means"])
     steps = _coarse_steps(raw["means"], scales, extent)
     thin = scales < TINY_SHARE * extent
+    sizeless, invisible = thin.all(1), opacities < MIN_VISIBLE
     if thin.all(0).sum() == 1:  # surfels, which have no third axis
         thin = thin[:, ~thin.all(0)]
     return Health(
@@ -161,7 +171,9 @@ def examine(model: SplatModel) -> Health:
         extent=extent,
         huge=_rows(scales > extent) if extent > 0 else 0,
         tiny=_rows(thin),
-        invisible=_rows(opacities < MIN_VISIBLE),
+        invisible=_rows(invisible),
+        sizeless=_rows(sizeless),
+        unseen=_rows(invisible | sizeless),
         rounded=len(steps),
         step=float(steps.median()) if len(steps) else 0.0,
         scales_look_linear=_look_linear(raw["scales"]),

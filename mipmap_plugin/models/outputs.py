@@ -16,10 +16,7 @@ from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_written, refuse_as_folder
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
-from mipmap_plugin.models.places import CONVERTED, REPORT, STATE
-
-# Subfolders in which the supported projects keep parts of a checkpoint.
-PARTS = ("point_cloud", "deform", "ckpts", "nerfstudio_models")
+from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE
 
 # What is written into a model folder, of all families.
 WRITTEN = (

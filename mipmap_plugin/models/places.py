@@ -11,6 +11,9 @@ from mipmap_plugin.formats.atomic import named
 GSPLAT = ("ckpts", r"ckpt_(?P<step>\d+)(?:_rank(?P<rank>\d+))?\.pt")
 SPLATFACTO = ("nerfstudio_models", r"step-(?P<step>\d+)\.ckpt")
 
+# Subfolders in which the supported projects keep parts of a checkpoint.
+PARTS = ("point_cloud", "deform", GSPLAT[0], SPLATFACTO[0])
+
 # What is appended to the name of an adapted file, for the report that lies beside it.
 REPORT = ".adaptation.json"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -48,26 +48,50 @@ PARALLEL = 1e-6
 SAME_DIRECTION = math.radians(60)
 
 
+@dataclass(frozen=True)
+class Orbit:
+    """What an orbit goes around, in world units: `center`, the vertical `up`, and how far away its cameras are."""
+
+    center: tuple[float, float, float]
+    up: tuple[float, float, float]
+    distance: float
+
+    @classmethod
+    def around(cls, means: Tensor, up: Sequence[float] | None = None) -> Orbit:
+        """Around the median of `means` [N, 3], from a distance that frames nine tenths of them. `up` defaults to `guess_up`.
+
+        Raises SettingsError without splats.
+        """
+        means = means.detach().to("cpu", torch.float64)
+        means = means[means.isfinite().all(dim=1)]
+        if len(means) == 0:
+            raise SettingsError("an orbit needs splats, but got 0 finite splats")
+        center = means.median(dim=0).values
+        vertical = guess_up(means) if up is None else torch.tensor(up, dtype=torch.float64)
+        radius = _quantile((means - center).norm(dim=1), FRAMED).item()
+        distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * NEAR_PLANE)  # a small scene must not lie in front of the near plane
+        x, y, z = center.tolist()
+        right, forward, upward = vertical.tolist()
+        return cls((x, y, z), (right, forward, upward), distance)
+
+    def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
+        """`count` views of `size` (height, width) px; azimuths are evenly spaced from a random start, elevations are random."""
+        if count < 1:
+            raise SettingsError(f"an orbit needs views, but got {count}")
+        center, vertical = (torch.tensor(vector, dtype=torch.float64) for vector in (self.center, self.up))
+        directions = _sky_directions(vertical / vertical.norm(), count, generator)
+        return [_looking_at(center, center + self.distance * way, vertical, size, f"orbit_{i:04d}") for i, way in enumerate(directions)]
+
+
 def orbit(
     means: Tensor | Gaussians, size: tuple[int, int], count: int, generator: torch.Generator, up: Sequence[float] | None = None
 ) -> list[Camera]:
-    """`count` views of `size` (height, width) px around the scene, for a checkpoint without cameras.
+    """`count` views of `size` (height, width) px around the scene, for a checkpoint without cameras (`Orbit`).
 
-    All look at the median of `means` [N, 3] from a distance that frames nine tenths of them; azimuths are evenly spaced from a
-    random start, elevations are random. `up` (world axes) defaults to `guess_up`. Suitable for objects: the positions of the
-    cameras of an unbounded scene do not follow from its splats. Raises SettingsError without splats or views.
+    Suitable for objects: the positions of the cameras of an unbounded scene do not follow from its splats. Raises SettingsError
+    without splats or views.
     """
-    means = means.means if isinstance(means, Gaussians) else means
-    means = means.detach().to("cpu", torch.float64)
-    means = means[means.isfinite().all(dim=1)]
-    if len(means) == 0 or count < 1:
-        raise SettingsError(f"an orbit needs splats and views, but got {len(means)} finite splats and {count} views")
-    center = means.median(dim=0).values
-    vertical = guess_up(means) if up is None else torch.tensor(up, dtype=torch.float64)
-    radius = _quantile((means - center).norm(dim=1), FRAMED).item()
-    distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * NEAR_PLANE)  # a small scene must not lie in front of the near plane
-    directions = _sky_directions(vertical / vertical.norm(), count, generator)
-    return [_looking_at(center, center + distance * direction, vertical, size, f"orbit_{i:04d}") for i, direction in enumerate(directions)]
+    return Orbit.around(means.means if isinstance(means, Gaussians) else means, up).views(size, count, generator)
 
 
 def guess_up(means: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.effects import explain
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.models.base import effects_of
+from mipmap_plugin.scenes.trajectories import Orbit
 from mipmap_plugin.tiles.scene import TiledScene
 
 
@@ -29,6 +30,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         scale=scene.scale,
         base=scene.digest,
         inputs=scene.wrapped.asked,
+        orbit=Orbit.around(scene.base.places[:, :3]),
         settings=config,
         backend=scene.backend_note,
         views=f"{scene.views.note}, in {len(files)} tiles",

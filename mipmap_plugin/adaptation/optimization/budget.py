@@ -81,18 +81,38 @@ def most_of(config: AdaptConfig) -> int:
 def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, AdaptConfig]:
     """The task and the settings with as many further steps as the time budget allows, and as many views as these use.
 
-    Only of runs that introduce their views one after the other; those of other recipes are short, or take all views from the start.
+    Only of runs that introduce their views one after the other; those of other recipes are short, or take all views from the start. A run
+    that goes on has its plan already.
     """
     if config.time_budget_s is None or not task.views or run.watch.seconds >= config.time_budget_s:
         return task, config
-    with run.watch:
-        pace = Pace.of(run.student, task)
-    run.reserved = pace.a_choice
+    if not run.planned:
+        with run.watch:
+            pace = Pace.of(run.student, task)
+        run.reserved, run.planned = pace.a_choice, config.steps
+        if config.gathering:
+            run.planned = min(most_of(config), pace.steps(config, max(0.0, config.time_budget_s - run.seconds), task.follow))
     if not config.gathering:
         return task, config
-    steps = min(most_of(config), run.step + pace.steps(config, max(0.0, config.time_budget_s - run.seconds), task.follow))
-    views = max(config.views_per_step, math.ceil(steps * config.views_per_step / USES))
-    return replace(task, views=evenly(task.views, views)), config.model_copy(update={"steps": steps})
+    views = max(config.views_per_step, math.ceil(run.planned * config.views_per_step / USES))
+    return replace(task, views=evenly(task.views, views)), config.model_copy(update={"steps": run.planned})
+
+
+def plan_note(run: Run, config: AdaptConfig) -> str:
+    """Which steps were planned for a time budget, in brackets; empty if they are those of the settings, or if something else ended the run."""
+    planned = run.step >= run.planned or run.ended_by.startswith("time budget")
+    if not run.step or not planned or run.planned in (0, config.steps):
+        return ""
+    taken = "" if run.step >= run.planned else f"after {run.step} of {run.planned} steps, "
+    return f" ({taken}planned for the time budget in place of {config.steps})"
+
+
+def no_steps_note(run: Run, config: AdaptConfig) -> str:
+    """That a time budget left no time for steps, and which one would; empty if it did."""
+    if config.time_budget_s is None or run.step or run.seconds < config.time_budget_s:
+        return ""
+    least = math.ceil(2 * run.seconds)  # the start takes half of a budget at most
+    return f"the time budget of {config.time_budget_s:g} s left no time for steps after the start; give {least} s or more to have some"
 
 
 def _seconds(function: Callable[[Camera], object], camera: Camera, device: torch.device) -> float:

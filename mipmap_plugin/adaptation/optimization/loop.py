@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin import threads
-from mipmap_plugin.adaptation.curve import CurvePoint, decibel, reason_to_stop
+from mipmap_plugin.adaptation.curve import CurvePoint, decibel
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
@@ -53,7 +53,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     began = run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
     with bar, ticking(bar), interruptible() as interrupted:
-        reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.seconds, config)
+        reason = STOPPED if observe(run) else run.reason_to_stop(config)
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
@@ -67,7 +67,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             bar.update()
             if run.curve[-1].step == run.step:
                 bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
-            reason = STOPPED if observe(run) else reason_to_stop(run.curve, run.seconds, config)
+            reason = STOPPED if observe(run) else run.reason_to_stop(config)
             if interrupted():
                 on_interrupt(run)
         with run.watch:

@@ -121,6 +121,8 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "square_error": float(run.square_error),
         "rows_changed": run.rows_changed,
         "ended_by": run.ended_by,
+        "planned": run.planned,
+        "reserved": run.reserved,
         "curve": [point.model_dump() for point in run.curve],
         "parameters": {name: tensor.detach() for name, tensor in run.student.parameters().items()},
         "held": getattr(run.student, "held", None),
@@ -135,7 +137,8 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
 
 def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) -> Run:
     """Return the run of a state that `save_run` wrote; its parameters replace those of `student`."""
-    for name, kind in (("step", int), ("seconds", float), ("square_error", float), ("rows_changed", bool), ("ended_by", str)):
+    kinds = {"step": int, "planned": int, "seconds": float, "reserved": float, "square_error": float, "rows_changed": bool, "ended_by": str}
+    for name, kind in kinds.items():
         if not isinstance(state[name], kind):
             raise TypeError(f"{name} must be of type {kind.__name__}")
     device = student.parameters()["means"].device
@@ -161,7 +164,7 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     return Run(
         student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, steering, _trial(state["trial"], device), state["step"],
         [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"], Costs(earlier=tuple(state["costs"])),
-        state["ended_by"],
+        state["ended_by"], reserved=state["reserved"], planned=state["planned"],
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress, reason_to_stop
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
@@ -108,6 +108,7 @@ class Run:
     by_rows: ByRows | None = None  # the student, while the backend moves it
     threads: QuickestThreads = field(default_factory=QuickestThreads)
     reserved: float = 0.0  # seconds of a time budget for what comes after the steps
+    planned: int = 0  # steps for the time budget; 0: not planned (yet)
 
     @classmethod
     def start(cls, student: SplatModel, task: Task, config: AdaptConfig, spent: float = 0.0) -> Run:
@@ -129,6 +130,10 @@ class Run:
     def seconds(self) -> float:
         """What is gone of a time budget."""
         return self.watch.seconds + self.reserved
+
+    def reason_to_stop(self, config: AdaptConfig) -> str | None:
+        """Why it ends before its last step; None to continue."""
+        return reason_to_stop(self.curve, self.seconds, config, self.reserved)
 
     def states(self, initial: SplatModel) -> dict[str, SplatModel]:
         """The best and the last state, where they differ from the start (the `initial` model) and from each other, by what reports call them."""

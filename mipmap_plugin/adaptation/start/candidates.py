@@ -24,7 +24,7 @@ from mipmap_plugin.camera import evenly
 from mipmap_plugin.effects import INTEGRATED, SURFEL
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, Thinned
-from mipmap_plugin.models.contract import rebuild
+from mipmap_plugin.models.contract import rebuild, reshape
 from mipmap_plugin.render_settings import MIN_ALPHA
 
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
@@ -158,7 +158,7 @@ class StartSearch:
                 cast(Thinned, student).thin(evenly_in_space(means, self._pixel_size(means) / problem.scale, fraction))
         if self._forms:
             with problem.phase("closed form"):
-                student.reshape(lambda gaussians: self._closed_form(gaussians, weights), problem.views)
+                reshape(student, lambda gaussians: self._closed_form(gaussians, weights), problem.views)
         return student
 
     def _merge(self, student: SplatModel, weights: Tensor, fraction: float, coarsely: bool) -> Tensor:

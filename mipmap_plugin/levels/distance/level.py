@@ -28,7 +28,7 @@ from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size, 
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import GOLDEN, choose_views
+from mipmap_plugin.adaptation.views import GOLDEN, choose_views, orbit_of
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -260,6 +260,7 @@ class LevelRun:
             curve=curve,
             versions=versions(),
             inputs=scene.base.asked,
+            orbit=orbit_of(scene.base.model),
             notes=doubts_in(scene.base.model.notes),
         )
 

@@ -1,0 +1,91 @@
+"""`mipmap-plugin list`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from mipmap_plugin.commands.common import print_facts
+from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.garbage import uncollected
+
+if TYPE_CHECKING:
+    from mipmap_plugin.registry import Registry
+
+Kind = Literal["families", "recipes", "viewers", "backends", "upsamplers"]
+
+
+def list_(kinds: tyro.conf.Positional[tuple[Kind, ...]] = (), json: bool = False) -> None:
+    """List the families, recipes, viewers, backends and upsamplers, and those that installed packages add.
+
+    Args:
+        kinds: Only these; families and recipes are listed at once, the others after a moment.
+        json: Print JSON.
+    """
+    if json:
+        print_facts({each: _facts(each) for each in kinds or KINDS}, json)
+        return
+    for each in kinds or KINDS:
+        facts = _facts(each)
+        added = [f"{name}: {what}" for name, what in facts["of packages"].items()]
+        refused = [f"recognized and refused: {', '.join(facts['refused'])}"] if facts.get("refused") else []
+        print_facts({each: [", ".join(facts["built in"]), *refused, *added]}, json)
+
+
+def _facts(kind: str) -> dict[str, Any]:
+    """What is known of a kind: names that are built in, and what packages add, with its place and what is wrong with it."""
+    with uncollected():  # some import torch
+        registry, find = KINDS[kind]()
+    added = {name: f"{place}{_trouble(name, registry, find)}" for name, place in registry.packages().items()}
+    built_in = [name for name in registry.names() if registry.is_taken(name)]
+    if kind != "families":
+        return {"built in": built_in, "of packages": added}
+    refused = [name for name in built_in if find(name).load is None]
+    return {"built in": [name for name in built_in if name not in refused], "refused": refused, "of packages": added}
+
+
+def _families() -> tuple[Registry, Callable[[str], Any]]:
+    from mipmap_plugin.models.families import FAMILIES, find_family
+
+    return FAMILIES, find_family
+
+
+def _recipes() -> tuple[Registry, Callable[[str], Any]]:
+    from mipmap_plugin.recipes import RECIPES, recipe
+
+    return RECIPES, lambda name: [recipe(name, scale) for scale in (1 / 4, 4)]
+
+
+def _viewers() -> tuple[Registry, Callable[[str], Any]]:
+    from mipmap_plugin.splatting.viewers import VIEWERS, find_viewer, viewers_for
+
+    return VIEWERS, lambda name: [find_viewer(member) for member in viewers_for(name)]
+
+
+def _backends() -> tuple[Registry, Callable[[str], Any]]:
+    from mipmap_plugin.backends import BACKENDS, get_backend
+
+    return BACKENDS, get_backend
+
+
+def _upsamplers() -> tuple[Registry, Callable[[str], Any]]:
+    from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, find_upsampler
+
+    return UPSAMPLERS, find_upsampler
+
+
+# The registry of each kind, and what finds one by name and checks it.
+KINDS = {"families": _families, "recipes": _recipes, "viewers": _viewers, "backends": _backends, "upsamplers": _upsamplers}
+
+
+def _trouble(name: str, registry: Registry, find: Callable[[str], Any]) -> str:
+    """What is wrong with a plug-in, to be appended to where it is; "" if nothing is."""
+    if registry.is_taken(name):
+        return ", not used: the name is taken by a built-in one; choose another"
+    try:
+        find(name)
+    except MipmapPluginError as error:
+        return f", not used: {error}"
+    return ""

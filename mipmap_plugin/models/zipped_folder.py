@@ -1,0 +1,84 @@
+"""A model folder in a zip archive, as clusters and cloud drives hand it out: unpacked once for as long as this process lives."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import threading
+import warnings
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.formats.magic import archive
+from mipmap_plugin.formats.zipped import copied, only_ply, refuse_large
+from mipmap_plugin.models.places import PARTS
+
+# The file by which a model folder is known, after the name of the folder.
+SPLATS = re.compile(r"(?:(.*)/)?(?:point_cloud/(?:coarse_)?iteration_\d+/point_cloud\.ply|ckpts/ckpt_\w+\.pt|nerfstudio_models/step-\d+\.ckpt)")
+
+_OPENED: dict[tuple[Path, int, int], tuple[tempfile.TemporaryDirectory[str], Path]] = {}  # the folder is removed with its first part
+_LOCK = threading.Lock()
+
+
+def opened(path: Path) -> Path:
+    """The unpacked model folder of a zip archive that holds one; `path` itself if it is anything else. Raises CheckpointError."""
+    if not (path.is_file() and zipfile.is_zipfile(path)) or (root := _root(path)) is None:
+        return path
+    state = path.stat()
+    with _LOCK:
+        key = path.absolute(), state.st_mtime_ns, state.st_size
+        if key not in _OPENED:
+            place = tempfile.TemporaryDirectory(prefix="mipmap-plugin-")
+            _OPENED[key] = place, _unpack(path, root, Path(place.name, path.stem or "model"))
+        return _OPENED[key][1]
+
+
+@contextmanager
+def told_of_archives() -> Iterator[None]:
+    """Tell errors and warnings of this block about unpacked folders as of the archives."""
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always")
+        try:
+            yield
+        except CheckpointError as error:
+            raise CheckpointError(told(error)) from error
+    for doubt in doubts:
+        warnings.warn(told(doubt.message), doubt.category, stacklevel=3)
+
+
+def told(words: object) -> str:
+    """What is said of files in unpacked folders, as said of the archives."""
+    text = str(words)
+    for (path, *_), (_, folder) in list(_OPENED.items()):
+        text = text.replace(str(folder), str(path))
+    return text
+
+
+def _root(path: Path) -> str | None:
+    """The name of the model folder in an archive, "" if it is the archive itself; None if it holds none, or nothing but one PLY."""
+    with archive(path) as inside:
+        roots = sorted({found[1] or "" for name in inside.namelist() if (found := SPLATS.fullmatch(name))})
+    if len(roots) > 1:
+        raise CheckpointError(f"{path} holds {len(roots)} model folders ({', '.join(roots[:3])}); unpack it and give one of them")
+    return roots[0] if roots and only_ply(path) is None else None
+
+
+def _unpack(path: Path, root: str, folder: Path) -> Path:
+    """Write what is read of a model folder to `folder`; return it. Raises CheckpointError, also for a name that leads out of the folder."""
+    with archive(path) as inside:
+        read = _read_of(inside.infolist(), f"{root}/" if root else "")
+        if wrong := next((entry.filename for names, entry in read.items() if any(name == ".." or set(name) & set("\\:") for name in names)), None):
+            raise CheckpointError(f"{path} holds the name {wrong!r}, which leads out of its folder; do not open it")
+        refuse_large(path, sum(entry.file_size for entry in read.values()), folder.parent)
+        for names, entry in read.items():
+            copied(path, inside, entry, folder.joinpath(*names))
+    return folder
+
+
+def _read_of(entries: Iterable[zipfile.ZipInfo], prefix: str) -> dict[tuple[str, ...], zipfile.ZipInfo]:
+    """What is read of the model folder with that `prefix`, by the parts of its name in the folder; not its pictures."""
+    named = {PurePosixPath(entry.filename.removeprefix(prefix)).parts: entry for entry in entries if entry.filename.startswith(prefix)}
+    return {names: entry for names, entry in named.items() if not entry.is_dir() and (len(names) == 1 or names[0] in PARTS)}

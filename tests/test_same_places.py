@@ -1,0 +1,61 @@
+"""Without cameras a base and what is adapted from it are looked at from the same places."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin import wrap_model
+from mipmap_plugin.adaptation import views
+from mipmap_plugin.models.adapted_scale import adapted_orbit
+
+SCALE = 0.125
+
+
+@pytest.fixture(autouse=True)
+def _small_pictures(monkeypatch):
+    monkeypatch.setattr(views, "ORBIT_PIXELS", 16)
+
+
+def poses(path) -> torch.Tensor:
+    return torch.stack([view.viewmat for view in wrap_model(path, backend="reference").views()])
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A base, and a file that was adapted from it, whose splats have other means."""
+    base = tiny.ply(tmp_path / "base.ply")
+    adapted = wrap_model(base, backend="reference").adapt(SCALE, recipe="instant", extra_views=4)
+    with torch.no_grad():
+        adapted.model.parameters()["means"].add_(0.01)
+    return base, adapted.save(tmp_path / "adapted.ply")
+
+
+@pytest.mark.parametrize("kept", ["both", "report", "header"])
+def test_an_adapted_file_is_seen_from_where_its_base_is(files, kept):
+    base, adapted = files
+    if kept == "header":
+        adapted.with_name(adapted.name + ".adaptation.json").unlink()
+    elif kept == "report":
+        adapted.write_bytes(adapted.read_bytes().replace(b"comment mipmap_plugin {", b"comment another_plugin {"))
+    assert torch.equal(poses(adapted), poses(base))
+
+
+def test_and_so_is_what_is_adapted_from_it_again(files, tmp_path):
+    base, _ = files
+    fewer = {"recipe": "instant", "most_splats": 20, "extra_views": 4}
+    first = wrap_model(base, backend="reference").adapt(1.0, viewer="classic", **fewer).save(tmp_path / "first.ply")
+    second = wrap_model(first, backend="reference").adapt(SCALE, recipe="instant", extra_views=4).save(tmp_path / "second.ply")
+    assert torch.equal(poses(second), poses(base))
+
+
+@pytest.mark.parametrize("orbit", [None, 3, {}, {"center": [1, 2], "up": [0.0, 0.0, 1.0], "distance": 1.0}])
+def test_a_report_without_an_orbit_is_taken_as_one_of_before(files, orbit):
+    _, adapted = files
+    adapted.write_bytes(adapted.read_bytes().replace(b"comment mipmap_plugin {", b"comment another_plugin {"))
+    report = adapted.with_name(adapted.name + ".adaptation.json")
+    report.write_text(json.dumps(json.loads(report.read_text()) | {"orbit": orbit}))
+    assert adapted_orbit(adapted) is None and len(poses(adapted)) > 1
