@@ -82,7 +82,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     with _kept(unfinished):
         folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
     try:
-        with threads.limited(wrapped.threads, shared=getattr(wrapped.backend()[0], "own_threads", False)):
+        with threads.limited_for(wrapped.backend()[0], wrapped.threads):
             files = exports.write(folder, ladder.contents)
     except (KeyboardInterrupt, MipmapPluginError) as error:
         again = f"{folder} has the levels, and the same command with --overwrite goes on from these"

@@ -38,7 +38,7 @@ def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str |
     scene = scene_of(base, request, band)
     store = LevelStore(None if resume is None else Path(resume), base, request)
     first = store.level("level_0", lambda state: _first(base, request, band, state))
-    with threads.limited(base.threads, shared=getattr(scene.backend, "own_threads", False)):
+    with threads.limited_for(scene.backend, base.threads):
         levels = [first]
         for number in range(1, scene.rule.count):
             run = LevelRun(scene, number, [level.model for level in levels])
