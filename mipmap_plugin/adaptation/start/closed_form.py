@@ -24,21 +24,22 @@ Without these, and before the steps of a zoom-out, it is left out.
 
 Opacities from areas are exact for splats that hide nothing; where blend weights are known they are matched afterwards (`matching`).
 
-The distance is that of the closest view, which saw the finest detail that training could resolve (as for the 3D filter of
-Mip-Splatting); the mean distance costs 0.3 to 0.7 dB at zoom-in on lego and the demo scene.
+At zoom-out the distance is that of the closest view, which saw the finest detail that training could resolve (as for the 3D filter of
+Mip-Splatting): elsewhere a splat then stays too wide, which its opacity makes up for. At zoom-in such a splat would leave holes in all other
+views, and it is widened for the mean of them (`mean_pixel_size`): +0.3 to 0.5 dB on photographs of lego and chair at x2 and x4, +3 dB on a
+capture of flowers at x2.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 
 import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import in_chunks
+from mipmap_plugin.adaptation.start.pixel_size import enough_views, mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant, widened_to_filter
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects
@@ -56,22 +57,6 @@ AREA_POWER = 1.25
 # The closed form keeps variances this many times above the threshold at which a viewer leaves splats out, since foreshortening reduces them.
 CULL_MARGIN = 2.0
 
-# Number of views from which the area and the blend weight of a splat are computed: doubled, up to a limit, until a splat is in SEEN of them on
-# average. An object needs no more than the least; of a walk through nine rooms these show a third of the splats, and cost the closed form 20 dB
-# at x1/2. With half of SEEN, a phone's capture of a bird ends 0.7 dB lower at x1/4.
-LEAST_VIEWS, MOST_VIEWS, SEEN = 12, 192, 8.0
-
-# The closest view of a splat is looked for among this many times more: a view costs less there, and few of them miss it. Along a street and
-# around the bird this is worth 1 to 2.5 dB at x1/4, after the default steps.
-CLOSEST_OF = 4
-
-# Of a splat that fewer than this fraction of these have in their pictures they easily miss the closest: it is looked for in all views, so many times
-# at most for all such splats together, in a second. Of nine rooms this is worth 2 dB of the closed form at x1/4.
-RARE, MOST_LOOKS = 1 / 3, 1 << 23
-
-# Splats that are looked for in views.
-COUNTED = 1 << 14
-
 
 @dataclass(frozen=True)
 class FormSettings:
@@ -80,7 +65,7 @@ class FormSettings:
     area_power: float = AREA_POWER  # zoom-out: opacity falls with this power of the area
     crispness: float = 0.0  # 0..1, zoom-in: the base's images are averages over a pixel (0), or over the whole filter (1)
     views: int | None = None  # how many are looked at, evenly spread, where it is known how much they show; None: `enough_views`
-    pixel: Tensor | None = None  # `pixel_size` [N], where it is known
+    pixel: Tensor | None = None  # zoom-out: `pixel_size` [N], where it is known
     matched: bool = False  # whether opacities are matched afterwards (`matching`)
 
 
@@ -94,10 +79,17 @@ def closed_form(
     if filter_suffices(base, target) or (draws_alike(base, target) and not form.matched):
         return gaussians.scales, gaussians.opacities
     count = form.views or enough_views(gaussians.means, views)
-    pixels, some = pixel_size(gaussians.means, views, count) if form.pixel is None else form.pixel, every_nth(views, count)
+    pixels, some = _pixels(gaussians.means, views, scale, count, form.pixel), every_nth(views, count)
     formed = in_chunks(lambda chunk: _form(gaussians[chunk], pixels[chunk], some, scale, (base, target), form), gaussians.means)
     scales, opacities = zip(*formed, strict=True)
     return torch.cat(scales), torch.cat(opacities)
+
+
+def _pixels(means: Tensor, views: Sequence[Camera], scale: float, count: int, closest: Tensor | None) -> Tensor:
+    """[N] in world units: the size of a base pixel at each splat, that decides by how much it is narrowed or widened."""
+    if scale > 1:
+        return mean_pixel_size(means, views, count)
+    return pixel_size(means, views, count) if closest is None else closest
 
 
 def _form(
@@ -165,75 +157,6 @@ def _of_surfels(
         return wide, gaussians.opacities
     crisp = wide.square().lerp(gaussians.scales.square(), form.crispness).sqrt()
     return crisp, (gaussians.opacities * area_ratio(wide) / area_ratio(crisp)).clamp_max(1)
-
-
-def enough_views(means: Tensor, views: Sequence[Camera]) -> int:
-    """How many of the views, evenly spread, have enough of the splats at `means` [N, 3] in their pictures."""
-    some, points = every_nth(views, LEAST_VIEWS), means[:: max(1, len(means) // COUNTED)]
-    shares = [float(view.in_picture(view.to_camera(points)).float().mean()) for view in some]
-    return views_for(sum(shares) / max(1, len(shares)))
-
-
-def views_for(share: float) -> int:
-    """How many views show enough, where each shows this fraction of the splats."""
-    count = LEAST_VIEWS
-    while share * count < SEEN and count < MOST_VIEWS:
-        count *= 2
-    return count
-
-
-def pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = None) -> Tensor:
-    """The size of a pixel at each mean in the closest view that sees it (of all views, if none does): [N] in world units.
-
-    Of many views only some are used, evenly spread: CLOSEST_OF times `count`, or else `enough_views`; and more for what few of these see.
-    """
-    some = every_nth(views, _closest_of(means, views, count))
-    finest, seeing = _finest(means, some)
-    rare = (seeing < RARE * len(some)).nonzero()[:, 0]
-    further = every_nth(views, max(len(some), MOST_LOOKS // max(1, len(rare))))
-    if len(rare) and len(further) > len(some):
-        finest[rare] = torch.minimum(finest[rare], _finest(means[rare], further)[0])
-    unseen = finest.isinf()
-    return finest.masked_scatter(unseen, _nearest(means[unseen], some)) if unseen.any() else finest
-
-
-def seen_pixel_size(means: Tensor, views: Sequence[Camera], near: float) -> Tensor:
-    """`pixel_size` of those of the means [N, 3] that are in a picture, beyond `near` (world units): [M], M at most N; 0 if nothing is seen."""
-    seen, _ = _finest(means, every_nth(views, _closest_of(means, views)), near)
-    if not seen.isfinite().any():  # few of many views may show something
-        seen, _ = _finest(means, views, near)
-    return seen[seen.isfinite()]
-
-
-def _closest_of(means: Tensor, views: Sequence[Camera], count: int | None = None) -> int:
-    """Among how many views the closest is looked for."""
-    return min(MOST_VIEWS, CLOSEST_OF * (count or enough_views(means, views)))
-
-
-def _finest(means: Tensor, views: Sequence[Camera], near: float = 0.0) -> tuple[Tensor, Tensor]:
-    """The size of a pixel at each mean in the closest view that sees it, [N], infinity if none does; and the number of views that see it, [N]."""
-
-    def of_chunk(chunk: slice) -> tuple[Tensor, Tensor]:
-        finest, seeing = torch.full_like(means[chunk, 0], torch.inf), torch.zeros_like(means[chunk, 0])
-        for view in views:
-            points = view.to_camera(means[chunk])
-            seen = view.in_picture(points, near)
-            finest, seeing = torch.where(seen, torch.minimum(finest, points[:, 2] / _focal(view)), finest), seeing + seen
-        return finest, seeing
-
-    finest, seeing = zip(*in_chunks(of_chunk, means), strict=True)
-    return torch.cat(finest), torch.cat(seeing)
-
-
-def _nearest(means: Tensor, views: Sequence[Camera]) -> Tensor:
-    """The size of a pixel at each mean in the closest of all views, by its distance, for in the camera's own plane a depth is 0: [N]."""
-    least = torch.finfo(means.dtype).eps
-    nearest: Tensor = reduce(torch.minimum, (view.to_camera(means).norm(dim=1).clamp_min(least) / _focal(view) for view in views))
-    return nearest
-
-
-def _focal(view: Camera) -> float:
-    return math.sqrt(view.fx * view.fy)
 
 
 def min_variance(effects: Effects) -> float:

@@ -9,7 +9,7 @@ import torch
 
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.start.closed_form import seen_pixel_size
+from mipmap_plugin.adaptation.start.pixel_size import seen_pixel_size
 from mipmap_plugin.effects import INTEGRATED
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.distance.chunks import Chunks

@@ -23,8 +23,8 @@ from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import Validation, split_validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
-from mipmap_plugin.adaptation.start.closed_form import enough_views, pixel_size, seen_pixel_size
 from mipmap_plugin.adaptation.start.compilation import warm_up
+from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size, seen_pixel_size
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import fitting

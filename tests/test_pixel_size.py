@@ -1,0 +1,85 @@
+"""The size of a pixel at a splat: in the closest view of it, in the mean of its views, and how many of these are looked at."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.start import pixel_size as module
+from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, MOST_VIEWS, SEEN, enough_views, mean_pixel_size, pixel_size, views_for
+from mipmap_plugin.camera import Camera
+
+FOCAL = 40.0
+VIEW = Camera(32, 24, FOCAL, FOCAL, 16.0, 12.0, torch.eye(4))
+CLOSER = VIEW.looking_from(torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]]), "closer")
+AWAY = VIEW.looking_from(torch.diag(torch.tensor([1.0, -1, -1, 1])), "away")
+
+
+def test_a_pixel_is_the_depth_over_the_focal_length():
+    means = torch.tensor([[0.0, 0.0, 4.0], [0.5, 0.2, 2.0]])
+    torch.testing.assert_close(pixel_size(means, [VIEW]), torch.tensor([4.0, 2.0]) / FOCAL)
+    anamorphic = replace(VIEW, fx=20.0, fy=80.0)
+    torch.testing.assert_close(pixel_size(means[:1], [anamorphic]), means.new_tensor([4 / math.sqrt(20 * 80)]))
+
+
+def test_a_pixel_is_that_of_the_closest_view_that_sees_the_splat():
+    means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [30.0, 0.0, 4.0]])  # both see it; only the first does; none does
+    torch.testing.assert_close(pixel_size(means, [VIEW, CLOSER]), torch.tensor([2.0, 1.0, math.hypot(30, 2)]) / FOCAL)
+
+
+def test_a_pixel_has_a_size_in_the_plane_of_the_camera_too():
+    """Else weights over it are infinite, and merged colors NaN."""
+    size = pixel_size(torch.tensor([[1.0, 0.0, 0.0]]), [VIEW])
+    assert size.item() == pytest.approx(1 / FOCAL)
+    assert pixel_size(VIEW.center[None].float(), [VIEW]).pow(-2).isfinite().all()
+
+
+def test_the_mean_pixel_is_that_of_least_squares_in_the_pixels_of_the_views():
+    """Depths of 4 and 2, focal length 40: variances of c px² there are c/100 and c/400, and that of both is c/340."""
+    means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [30.0, 0.0, 4.0]])  # both see it; only the first does; none does
+    found = mean_pixel_size(means, [VIEW, CLOSER])
+    torch.testing.assert_close(found[0].square(), torch.tensor(1 / 340))
+    torch.testing.assert_close(found[1:], pixel_size(means[1:], [VIEW, CLOSER]))
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
+def test_the_mean_pixel_holds_in_any_unit(unit):
+    views = [view.looking_from(torch.cat([view.viewmat[:, :3], view.viewmat[:, 3:] * torch.tensor([[unit], [unit], [unit], [1.0]])], dim=1), "far")
+             for view in (VIEW, CLOSER)]  # fmt: skip
+    found = mean_pixel_size(torch.tensor([[0.0, 0.0, 4.0]]) * unit, views)
+    torch.testing.assert_close(found / unit, torch.tensor([1 / math.sqrt(340)]))
+
+
+@pytest.mark.parametrize(("share", "count"), [(1.0, LEAST_VIEWS), (SEEN / LEAST_VIEWS, LEAST_VIEWS), (0.4, 2 * LEAST_VIEWS), (0.1, 8 * LEAST_VIEWS)])
+def test_views_are_doubled_until_they_show_a_splat_often_enough(share, count):
+    assert views_for(share) == count
+    assert views_for(0.0) == MOST_VIEWS
+
+
+def test_of_a_walk_through_rooms_more_views_are_looked_at_than_of_an_object():
+    ring, means = tiny.cameras(40), tiny.gaussians(60).means
+    assert enough_views(means, ring) == LEAST_VIEWS
+    rooms = torch.cat([means + torch.tensor([100.0 * room, 0.0, 0.0]) for room in range(9)])
+    assert enough_views(rooms, ring) > LEAST_VIEWS
+
+
+def test_the_closest_view_is_looked_for_among_more_views():
+    """Of 40 views one is twice as close: every third does not show it."""
+    views = [CLOSER if number == 1 else VIEW for number in range(40)]
+    torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), views, 12), torch.tensor([2.0]) / FOCAL)
+
+
+def test_too_many_rare_splats_to_look_at_more_views_are_not_looked_at_twice(monkeypatch):
+    looked, finest = [], module._finest
+    monkeypatch.setattr(module, "_finest", lambda means, views, *near: looked.append(len(views)) or finest(means, views, *near))
+    monkeypatch.setattr(module, "MOST_LOOKS", 100)
+    pixel_size(torch.tensor([[0.0, 0.0, 4.0]]).expand(10, 3), [VIEW, *[AWAY] * 199], 12)
+    assert looked == [40]
+
+
+def test_the_closest_view_of_what_few_views_show_is_looked_for_among_all():
+    """Of 200 views, of which every fifth is looked at, two show the splat, and the closer is not among these."""
+    views = [VIEW, CLOSER, *[AWAY] * 198]
+    torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), views, 12), torch.tensor([2.0]) / FOCAL)
