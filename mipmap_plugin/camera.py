@@ -193,6 +193,14 @@ class Camera:
         return replace(self, viewmat=viewmat, name=name)
 
 
+def viewmat_of(rotation: Tensor, center: Tensor) -> Tensor:
+    """World to camera [4, 4] float64 from a camera-to-world rotation [3, 3] and the eye [3]."""
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ center
+    return viewmat
+
+
 def evenly(views: Sequence[Item], most: int | None) -> list[Item]:
     """At most `most` views, evenly spaced in their order; all of them if `most` is None."""
     return [views[i * len(views) // most] for i in range(most)] if most is not None and len(views) > most else list(views)

@@ -50,5 +50,10 @@ class OutputExists(MipmapPluginError, FileExistsError):
     """An output that exists already and must not be overwritten."""
 
 
+def brief(error: BaseException) -> str:
+    """The first line of another library's error."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
 class JobsFailed(MipmapPluginError):
     """Some of many jobs failed; the others are done."""

@@ -10,11 +10,11 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar, copy_context
 from functools import cache
 from operator import index
-from typing import SupportsIndex, TypeVar
+from typing import Any, SupportsIndex, TypeVar
 
 import torch
 
@@ -74,6 +74,11 @@ def limited(threads: int | None, *, shared: bool) -> Iterator[None]:
             yield
     finally:
         _shared.reset(token)
+
+
+def limited_for(backend: Any, threads: int | None) -> AbstractContextManager[None]:
+    """`limited`, shared where the kernels of a backend have threads of their own."""
+    return limited(threads, shared=getattr(backend, "own_threads", False))
 
 
 @contextmanager

@@ -213,7 +213,7 @@ class Wrapped:
         base_images = self._base_images(model, backend, self.keeps_images or first is not None)
         request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs)
         family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
-        alone = threads.limited(self.threads, shared=getattr(backend, "own_threads", False))
+        alone = threads.limited_for(backend, self.threads)
         with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
             stages = Stages(request, list(cameras), photographs, None if resume is None else Path(resume), observe)
             adapted = stages.adapt(scale, config, first)

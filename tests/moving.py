@@ -85,6 +85,10 @@ def write_hexplane(folder: Path, options: str = "", state: dict[str, Tensor] | N
     return folder
 
 
+def without(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    return {key: tensor for key, tensor in state.items() if key != name}
+
+
 def at(time: float | None) -> Camera:
     return replace(tiny.cameras(1)[0], time=time)
 

@@ -158,10 +158,11 @@ def test_outside_libraries_stay_in_their_modules(path):
         assert any(name_of(path).startswith(place) for place in CONFINED.get(library, [])), f"{library} in {name_of(path)}"
 
 
-def test_importing_the_package_loads_nothing_optional():
+def test_importing_the_package_and_its_backends_loads_nothing_optional():
     optional = ["numba", "llvmlite", "gsplat", "triton", "matplotlib", "pycolmap", "pytest", "skimage", "tyro"]
     optional += ["dask", "distributed", "spandrel", "safetensors", "lpips", "torchvision", "viser"]
-    code = f"import sys, mipmap_plugin; print([name for name in {optional} if name in sys.modules])"
+    package = ", ".join(f"mipmap_plugin.backends.{name}" for name in ("cpu", "gsplat", "inria", "triton"))
+    code = f"import sys, {package}; print([name for name in {optional} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -169,6 +169,11 @@ def test_a_recipe_that_ends_the_process_is_told_by_name():
             dict(render=lambda self, *shot: (drawn := ReferenceBackend.render(self, *shot)).replaced(image=drawn.image.detach().numpy())),
             "has to return a Rendered with an image .*; it returned a ndarray",
         ),
+        (dict(render=lambda self, *shot: ReferenceBackend.render(self, *shot).image), r"has to return a Rendered with an image \[24, 32, 3\]"),
+        (
+            dict(render=lambda self, *shot: (drawn := ReferenceBackend.render(self, *shot)).replaced(image=drawn.image.movedim(2, 0))),
+            r"has to return a Rendered with an image \[24, 32, 3\]",
+        ),
     ],
 )
 def test_what_a_backend_returns_wrong_is_told_by_its_name(members, said):

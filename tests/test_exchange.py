@@ -405,7 +405,3 @@ def test_real_splats_survive_each_format(shared_data, tmp_path, ending):
     base = load_model(shared_data / "checkpoints/yashica-t4/yashica-t4-top8192.ply")
     saved = base.save(tmp_path / f"a.{ending}", provenance={})
     assert (agree(base, load_model(saved), nearest=True) > 0.95).all()
-
-
-def test_the_ply_of_the_same_capture_loads(shared_data):
-    assert len(load_model(shared_data / "checkpoints/yashica-t4/yashica-t4-top8192.ply")) == 8192

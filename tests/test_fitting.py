@@ -31,12 +31,8 @@ def test_the_zoom_of_a_count_is_that_at_which_the_recipe_keeps_it(scale):
     assert scale_of_fraction(recipe("default", scale).merge_to) == pytest.approx(scale)
 
 
-def test_more_splats_than_the_bases_suit_its_own_scale():
-    assert fitting_scale(200, tiny.model(60)) == 1
-
-
 def test_as_many_splats_as_the_base_has_suit_its_own_scale():
-    assert fitting_scale(60, tiny.model(60)) == 1 and fitting_scale(59, tiny.model(60)) < 1
+    assert fitting_scale(200, tiny.model(60)) == fitting_scale(60, tiny.model(60)) == 1 > fitting_scale(59, tiny.model(60))
 
 
 def test_as_many_splats_as_fit_into_a_file_do_fit(tmp_path):

@@ -21,7 +21,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance import chunks as chunks_module
 from mipmap_plugin.levels.distance.chunks import Chunks, shrunk
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats, shaped
-from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, scene_of
+from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
 from mipmap_plugin.levels.distance.mixture import Mixture, together
 from mipmap_plugin.levels.distance.rule import DistanceRule, focal, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
@@ -330,7 +330,6 @@ def test_a_ladder_from_end_to_end(tmp_path, small_chunks, capsys):
     """The far splats of every level are those of the first; the manifest gives what PlayCanvas is set to."""
     base = wrapped()
     ladder = base.levels("classic", by="distance", coarsest=1 / 4, ratio=2.0, **BRIEF)
-    assert isinstance(ladder, DistanceLadder)
     folder = ladder.save(tmp_path / "levels")
     manifest = json.loads((folder / MANIFEST).read_text())
     files = [load_model(folder / level["file"]).gaussians(base.any_camera()) for level in manifest["levels"]]

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from ply_files import splat_columns, write, write_splats
 
-from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError
-from mipmap_plugin.formats import ply as ply_module
+from mipmap_plugin.errors import CheckpointError, SettingsError
 from mipmap_plugin.formats.ply import read_header, read_ply, write_ply
 
 
@@ -132,28 +131,6 @@ def test_writes_what_it_reads(tmp_path):
     file = read_ply(write_ply(tmp_path / "a.ply", columns, ["first", "Brüder\nsecond"]))
     assert file.comments == ("first", "Br\\xfcder second")
     assert {name: column.tobytes() for name, column in file.columns.items()} == {name: column.tobytes() for name, column in columns.items()}
-
-
-def test_does_not_overwrite_without_the_option(tmp_path):
-    path = write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)})
-    with pytest.raises(OutputExists, match="--overwrite"):
-        write_ply(path, {"x": np.ones(1, np.float32)})
-    write_ply(path, {"x": np.ones(1, np.float32)}, overwrite=True)
-    assert read_ply(path).columns["x"].tolist() == [1]
-
-
-def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)})
-    old = path.read_bytes()
-
-    def full(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(ply_module.os, "fsync", full)
-    with pytest.raises(OutputError, match="cannot be written: No space left"):
-        write_ply(path, {"x": np.ones(1, np.float32)}, overwrite=True)
-    assert path.read_bytes() == old
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_refuses_comments_that_it_could_not_read_back(tmp_path):

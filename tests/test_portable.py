@@ -67,11 +67,6 @@ def test_the_command_does_not_draw_as_several(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_files_of_a_family_that_keeps_its_filter_are_not_portable():
-    with pytest.raises(SettingsError, match="its files are for its own project alone; leave the viewer portable out"):
-        wrapped(keeps_filter=True).adapt(1 / 4, viewer="portable")
-
-
 def test_a_group_is_made_of_names():
     for wrong in ((), (find_viewer("spark"),)):
         register_viewer("wrong", wrong, replace=True)

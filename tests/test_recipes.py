@@ -19,11 +19,6 @@ def test_every_built_in_recipe_fits_every_scale():
         assert {recipe(name, scale).recipe for scale in (1 / 16, 1 / 4, 1, 4)} == {name}
 
 
-def test_a_scale_that_is_none_is_refused():
-    with pytest.raises(SettingsError, match=r"scale must be from 1e-09 to 10000, such as 0\.25 or 4, got 0"):
-        recipe("default", 0)
-
-
 def test_an_unknown_recipe_is_told_the_known_ones():
     with pytest.raises(SettingsError, match="there is no recipe 'best'; choose from default, instant, paper, thorough"):
         recipe("best", 2)

@@ -9,7 +9,7 @@ from mipmap_plugin.adaptation.target import upsamplers
 from mipmap_plugin.adaptation.target.resampling import matrix_of
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, register_upsampler
-from mipmap_plugin.errors import PluginError, SettingsError
+from mipmap_plugin.errors import SettingsError
 
 SMALLER, LARGER = (7, 10), (50, 45)
 
@@ -127,21 +127,3 @@ def test_an_upsampler_is_registered_as_a_function_or_as_a_string(image):
     assert UPSAMPLERS.get("mine")(image, LARGER).shape == (*LARGER, 3)
     assert UPSAMPLERS.get("also-mine") is upsamplers.lanczos
     assert {"mine", "also-mine"} <= set(UPSAMPLERS.names())
-
-
-def test_a_name_that_is_taken_is_refused_unless_replaced(image):
-    with pytest.raises(SettingsError, match="the name 'bicubic' is taken; pass replace=True"):
-        register_upsampler("bicubic", upsamplers.lanczos)
-    register_upsampler("bicubic", upsamplers.lanczos, replace=True)
-    assert UPSAMPLERS.get("bicubic") is upsamplers.lanczos
-
-
-def test_an_unknown_upsampler_is_refused_with_the_known_ones():
-    with pytest.raises(SettingsError, match=r"there is no 'swin'; choose from bicubic, lanczos"):
-        UPSAMPLERS.get("swin")
-
-
-def test_an_upsampler_that_does_not_import_says_why():
-    register_upsampler("broken", "no_such_package.module:function")
-    with pytest.raises(PluginError, match=r"'broken' .* cannot be loaded: ModuleNotFoundError: No module named 'no_such_package'"):
-        UPSAMPLERS.get("broken")

@@ -175,10 +175,7 @@ def test_a_capture_sorted_by_name_holds_out_what_its_photographs_do(shared_data)
 )
 def test_training_size_of_flowers(cfg, size):
     assert trained_size(5025, 3312, cfg) == size
-
-
-def test_a_narrow_image_is_not_capped():
-    assert trained_size(1600, 900, {"resolution": -1}) == (1600, 900)
+    assert trained_size(1600, 900, {"resolution": -1}) == (1600, 900)  # which is not capped
 
 
 @pytest.mark.parametrize("resolution", [0, -2, "half", None])

@@ -10,13 +10,12 @@ import tiny
 import torch
 from ply_files import splat_columns, splat_names, write, write_model_folder, write_splats
 
-from mipmap_plugin.errors import CheckpointError, OutputError, OutputExists, SettingsError, ShapeError
-from mipmap_plugin.formats import staging
+from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError, ShapeError
 from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.models import inria_folder, load_model
+from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.columns import OPACITY_MARGIN
 from mipmap_plugin.models.raw import MIN_SCALE
@@ -253,14 +252,6 @@ def test_reshape_keeps_leaves_and_stays_finite_at_the_ends():
         model.reshape(lambda _: (torch.ones(1, 3), torch.ones(3)))
 
 
-def test_replace_parameters_keeps_the_same_tensors():
-    model = raw_model(3).copy()
-    fresh = {name: tensor.detach()[:2].clone().requires_grad_() for name, tensor in model.parameters().items()}
-    model.replace_parameters(fresh)
-    assert len(model) == 2
-    assert all(model.parameters()[name] is tensor for name, tensor in fresh.items())
-
-
 def test_shapes_are_checked():
     raw = raw_model().parameters()
     for broken, sentence in {
@@ -394,32 +385,6 @@ def test_a_trained_model_is_not_replaced_even_with_the_option(tmp_path):
     with pytest.raises(OutputExists, match="holds a trained model, which --overwrite would delete"):
         raw_model().save(folder, provenance={}, overwrite=True)
     assert load_model(folder).source.exists()
-
-
-def test_the_base_folder_is_never_replaced(tmp_path):
-    folder = write_model_folder(tmp_path / "m")
-    model = load_model(folder)
-    for target in (folder, tmp_path):
-        with pytest.raises(OutputExists, match="holds the base checkpoint"):
-            model.save(target, provenance={}, overwrite=True)
-
-
-@pytest.mark.parametrize("failing", ["copy", "rename"])
-def test_a_failed_save_leaves_the_old_folder_and_nothing_else(tmp_path, monkeypatch, failing):
-    model = load_model(write_model_folder(tmp_path / "m"))
-    raw_model(2).save(tmp_path / "out", provenance={})
-
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    if failing == "copy":
-        monkeypatch.setattr(inria_folder.shutil, "copyfile", full)
-    else:
-        monkeypatch.setattr(staging, "exchange", full)
-    with pytest.raises(OutputError, match="cannot be written: No space left"):
-        model.save(tmp_path / "out", provenance={}, overwrite=True)
-    assert len(load_model(tmp_path / "out")) == 2
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["m", "out"]
 
 
 # Real files

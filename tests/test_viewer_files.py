@@ -1,6 +1,5 @@
 """Files made for a viewer: adapted as it draws, and named after it."""
 
-import signal
 
 import anchor_checkpoints
 import moving
@@ -15,7 +14,7 @@ from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained, flattened
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.wrap import Interrupted, wrap_model
+from mipmap_plugin.wrap import wrap_model
 
 BRIEF = dict(steps=2, extra_views=2, merge_to=1.0, warm_up=0)
 
@@ -83,17 +82,6 @@ def test_at_scale_one_a_viewer_comes_closer_to_the_bases_own_picture(viewer):
     for camera in tiny.cameras(3, seed=9):  # that nothing was adapted to
         own, naive, new = model.render(camera).image, model.render(camera, viewer=viewer).image, adapted.render(camera).image
         assert psnr(new, own) > psnr(naive, own) + 1
-
-
-def test_a_run_for_one_viewer_is_not_resumed_for_another(tmp_path):
-    def stop(step, *_):
-        if step == 1:
-            signal.raise_signal(signal.SIGINT)
-
-    with pytest.raises(Interrupted):
-        wrapped().adapt(1 / 4, viewer="spark", resume=tmp_path / "run", observe=stop, **BRIEF)
-    with pytest.raises(SettingsError, match="belongs to another base, settings or views"):
-        wrapped().adapt(1 / 4, viewer="playcanvas", resume=tmp_path / "run", **BRIEF)
 
 
 def test_the_command_writes_a_file_for_each_viewer_and_says_what_it_holds(tmp_path, capsys):

@@ -90,14 +90,11 @@ def adapt(
         json: Print the reports as JSON.
     """
     settings = without_none(**vars(changes)) | dict(recipe=recipe, seed=seed)
-    if many.tiles is not None:
+    if many.tiles is not None or many.asked(checkpoints):
         _refuse_for_many(many.holds(checkpoints), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
-        return adapt_tiled(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
-    if many.asked(checkpoints):
-        _refuse_for_many(many.holds(checkpoints), scale, bytes, report)
-        request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
-        return adapt_many(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
+        adapt_jobs = adapt_many if many.tiles is None else adapt_tiled
+        return adapt_jobs(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
     [checkpoint] = checkpoints
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)

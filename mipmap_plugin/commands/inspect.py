@@ -52,7 +52,9 @@ def inspect(
     if not json:
         print_facts(facts, json)  # before pictures are drawn, which takes longer
     with announced("drawing as viewers do"):
-        differences = _differences(wrapped) if viewers else "not requested"
+        from mipmap_plugin.evaluation.viewer_differences import viewer_differences
+
+        differences = viewer_differences(wrapped) if viewers else "not requested"
     last = {"viewers": differences, "notes": [note for note in model.notes if note not in [*facts["health"], *asked]]}
     print_facts(known | facts | last if json else last, json)
 
@@ -81,12 +83,6 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
         "health": told or ["nothing found"],
     }
-
-
-def _differences(wrapped: Wrapped) -> str:
-    from mipmap_plugin.evaluation.viewer_differences import viewer_differences
-
-    return viewer_differences(wrapped)
 
 
 def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: bool, unseen: str) -> str:

@@ -18,9 +18,8 @@ from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
     from mipmap_plugin.levels.contents import Contents as ZoomContents
-    from mipmap_plugin.levels.distance.ladder import DistanceLadder
     from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
-    from mipmap_plugin.levels.ladder import Ladder
+    from mipmap_plugin.levels.finished import Ladder
     from mipmap_plugin.levels.request import LadderRequest
     from mipmap_plugin.wrapped import Wrapped
 
@@ -83,7 +82,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     with _kept(unfinished):
         folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
     try:
-        with threads.limited(wrapped.threads, shared=getattr(wrapped.backend()[0], "own_threads", False)):
+        with threads.limited_for(wrapped.backend()[0], wrapped.threads):
             files = exports.write(folder, ladder.contents)
     except (KeyboardInterrupt, MipmapPluginError) as error:
         again = f"{folder} has the levels, and the same command with --overwrite goes on from these"
@@ -92,7 +91,7 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     return read_manifest(folder), files
 
 
-def _made(wrapped: Wrapped, request: LadderRequest, unfinished: Path) -> Ladder | DistanceLadder:
+def _made(wrapped: Wrapped, request: LadderRequest, unfinished: Path) -> Ladder:
     """The ladder, whose levels `unfinished` keeps as they are made. Raises what `make_levels` raises."""
     from mipmap_plugin.levels.ladder import make_levels
 

@@ -93,17 +93,21 @@ def make_jobs(many: Many, given: Sequence[Path], request: Request, base: Base) -
     """A job for each checkpoint, scale and viewer of this shard. Raises SettingsError if none of them can be right."""
     checkpoints = _checkpoints([*given, *(read_list(many.list) if many.list else [])])
     several = many.is_list(given) or len(request.targets) > 1
-    skip, settings = many.skip_existing or not request.overwrite, dict(request.settings)
-    recipe = settings.pop("recipe")
-    jobs = []
-    for path in checkpoints:
-        own = replace(base, checkpoint=path.absolute(), cameras=of_scene(base.cameras, path))
-        for scale, viewer in request.targets:
-            target = adapted_path(path, request.output, scale, viewer, several=several).absolute()
-            images = of_scene(request.images, path)
-            jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite, skip))
+    skip = many.skip_existing or not request.overwrite
+    jobs = [replace(job, skip_finished=skip) for path in checkpoints for job in jobs_of(path, request, base, several=several)]
     _refuse(jobs)
     return shard(jobs, *_part(many.shard))
+
+
+def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) -> list[Job]:
+    """The job of one checkpoint for each scale and viewer. `several`: the output is a folder for all."""
+    own = replace(base, checkpoint=checkpoint.absolute(), cameras=_of_scene(base.cameras, checkpoint))
+    settings, images = dict(request.settings), _of_scene(request.images, checkpoint)
+    recipe, jobs = settings.pop("recipe"), []
+    for scale, viewer in request.targets:
+        target = adapted_path(checkpoint, request.output, scale, viewer, several=several).absolute()
+        jobs.append(Job(own, target, scale, viewer, recipe, settings, images, request.overwrite))
+    return jobs
 
 
 def _checkpoints(given: Sequence[Path]) -> list[Path]:
@@ -118,7 +122,7 @@ def _checkpoints(given: Sequence[Path]) -> list[Path]:
     return checkpoints
 
 
-def of_scene(path: Path | None, checkpoint: Path) -> Path | None:
+def _of_scene(path: Path | None, checkpoint: Path) -> Path | None:
     """A path in which {name} stands for the checkpoint's name."""
     place = checkpoint.resolve()
     name = place.stem if place.is_file() else place.name

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts
-from mipmap_plugin.commands.many import Many, Request, engine, of_scene
-from mipmap_plugin.commands.outputs import adapted_path
+from mipmap_plugin.commands.many import Many, Request, engine, jobs_of
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.jobs.base import Base
@@ -31,7 +29,7 @@ def adapt_tiled(many: Many, given: Sequence[Path], request: Request, base: Base,
     def run(jobs: Sequence[Job]) -> Generator[Outcome, None, None]:
         return engine(many, jobs, threads)
 
-    jobs = _jobs(given[0], request, base)
+    jobs = jobs_of(given[0], request, base, several=len(request.targets) > 1)
     skip = many.skip_existing or (len(jobs) > 1 and not request.overwrite)  # as in a list
     reports = _finished(jobs, json) if skip else {}
     left = [job for job in jobs if job.target not in reports]
@@ -57,16 +55,6 @@ def _finished(jobs: Sequence[Job], json: bool) -> dict[Path, dict[str, Any]]:
     return {target: {"file": str(file), **facts} for target, (file, facts) in found.items()}
 
 
-def _jobs(checkpoint: Path, request: Request, base: Base) -> list[Job]:
-    """The job of each scale and viewer."""
-    settings, several = dict(request.settings), len(request.targets) > 1
-    recipe, images, jobs = settings.pop("recipe"), of_scene(request.images, checkpoint), []
-    for scale, viewer in request.targets:
-        target = adapted_path(checkpoint, request.output, scale, viewer, several=several).absolute()
-        jobs.append(Job(_absolute(base, checkpoint), target, scale, viewer, recipe, settings, images, request.overwrite))
-    return jobs
-
-
 def _say(job: Job, tiles: int, joined: Joined) -> None:
     report = joined.report
     splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats"
@@ -74,7 +62,3 @@ def _say(job: Job, tiles: int, joined: Joined) -> None:
     say(f"x{job.scale:g}{viewer}, {tiles} tiles: {report.gain()}, {splats}, {report.seconds['total']:.1f} s")
     say(str(joined.file))
     detail(f"  holds {report.returned}; {report.views}; {report.filters}; backend {report.backend}")
-
-
-def _absolute(base: Base, checkpoint: Path) -> Base:
-    return replace(base, checkpoint=checkpoint.absolute(), cameras=of_scene(base.cameras, checkpoint))

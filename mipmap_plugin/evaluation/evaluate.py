@@ -174,14 +174,14 @@ def adapted_row(name: str, adapted: Adapted, judge: Evaluator) -> Row:
 
 
 def evaluator_of(
-    model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, watcher: Watcher | None = None, cells: Cells | None = None
+    model: Wrapped, scene: Scene, protocol: str, perceptual: Perceptual | None = None, cells: Cells | None = None
 ) -> Evaluator:
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
     scene = model.place(scene)
     if not model.cameras:
         raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
     views = test_views(scene, model.cameras, model.background)
-    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, watcher, cells or Cells(), scene.notes)
+    return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
 
 
 def evaluate(

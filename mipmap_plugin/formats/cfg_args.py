@@ -6,7 +6,7 @@ import ast
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, brief
 from mipmap_plugin.formats.magic import read_head
 
 # Bytes; real files have 200 to 2,000. Parsing time and depth grow with the text.
@@ -28,7 +28,7 @@ def read_cfg_args_and_rest(path: str | Path) -> tuple[dict[str, Any], list[str]]
         call = ast.parse(text.decode("utf-8").strip(), mode="eval").body
         return _keywords(call)
     except (SyntaxError, ValueError, TypeError, RecursionError, MemoryError) as error:
-        raise CheckpointError(f"{path} is not a plain `Namespace(name=literal, ...)`, and is not executed: {_brief(error)}") from error
+        raise CheckpointError(f"{path} is not a plain `Namespace(name=literal, ...)`, and is not executed: {brief(error)}") from error
 
 
 def format_cfg_args(options: dict[str, Any]) -> str:
@@ -52,7 +52,3 @@ def _keywords(call: ast.expr) -> tuple[dict[str, Any], list[str]]:
         except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
             rest.append(name)
     return options, rest
-
-
-def _brief(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]

@@ -17,7 +17,8 @@ from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, Switch
-from mipmap_plugin.levels.distance.ladder import DistanceLadder, by_distance, make_levels_by_distance
+from mipmap_plugin.levels.distance.ladder import by_distance, make_levels_by_distance
+from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.manifest import write_ladder
 from mipmap_plugin.levels.request import FINEST_RATIO, SAME, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
@@ -36,34 +37,7 @@ MORE_SPLATS = "more splats than the finer level has"
 UNSHOWN = "at every zoom a neighbor is as good"
 
 
-@dataclass(frozen=True, eq=False)
-class Ladder:
-    """A finished ladder in memory."""
-
-    contents: Contents
-    _store: LevelStore
-
-    @property
-    def levels(self) -> list[Level]:
-        """From the finest to the coarsest."""
-        return self.contents.levels
-
-    def save(self, folder: str | Path, *, overwrite: bool = False, keep_resume: bool = False) -> Path:
-        """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError.
-
-        `keep_resume`: leave what was kept to go on from until `forget`.
-        """
-        saved = write_ladder(self.contents, Path(folder), overwrite)
-        if not keep_resume:
-            self.forget()
-        return saved
-
-    def forget(self) -> None:
-        """Delete what was kept to go on from."""
-        self._store.remove()
-
-
-def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> Ladder | DistanceLadder:
+def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
     """Make the levels. `resume`: a folder for finished levels, to go on from after an interruption; saving the ladder removes it.
 
     Raises SettingsError for a model that no viewer draws, for views that show nothing and for a group of viewers, BackendUnavailable, Interrupted.
@@ -90,7 +64,7 @@ def _make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | Non
         edges = [1.0, *(switch.zoom for switch in switches), max(request.coarsest, lowest)]
         curve = _curve(levels, edges, yardstick, lambda zoom: yardstick.psnr_of_base(base, request.viewer, zoom))
     left_out = sorted([*unused, *unshown], key=lambda level: -level.scale)
-    return Ladder(Contents(request, base, levels, switches, curve, left_out), store)
+    return Ladder(Contents(request, base, levels, switches, curve, left_out), store, write_ladder)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """Families whose PLY has a column `filter_3D`: Mip-Splatting, Gaussian Opacity Fields and Analytic-Splatting.
 
 Everything else is stored as in 3DGS. The 3D filter keeps splats from being thinner than the training cameras resolved. It is a constant
-of each row: scales and opacities were optimized with it, so another value would change the image. It is recomputed
-(`MipModel.refilter`) only before further training in the original project, which does so itself.
+of each row: scales and opacities were optimized with it, so another value would change the image. Before further training the original
+project recomputes it itself.
 """
 
 from __future__ import annotations
@@ -114,13 +114,6 @@ class MipModel:
 
     def row_opacities(self, views: Sequence[Camera] = ()) -> Tensor:
         return self.gaussians().opacities.detach()
-
-    @torch.no_grad()
-    def refilter(self, cameras: Sequence[Camera]) -> None:
-        """Recompute the 3D filter from the training cameras, and the raw scales and opacities such that the smoothed splats do not change."""
-        smoothed = self.gaussians()
-        self.filter_3d.copy_(filter_3d_of(smoothed.means, cameras))
-        self.reshape(lambda _: (smoothed.scales, smoothed.opacities))
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """As `VanillaModel.refuse_output`."""

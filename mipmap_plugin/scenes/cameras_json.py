@@ -11,9 +11,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.json_file import MAX_SIDE, numbers, pixels, positive, present, read_json, rotation
@@ -140,9 +138,7 @@ def _camera(entry: dict[str, Any], name: str, split: Any, where: str) -> Camera:
     """`rotation` is camera to world, `position` the eye; the principal point is the image center by construction."""
     camera_to_world = rotation(present(entry, "rotation", where), f"{where}, rotation")
     position = numbers(present(entry, "position", where), (3,), f"{where}, position")
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = camera_to_world.T
-    viewmat[:3, 3] = -camera_to_world.T @ position
+    viewmat = viewmat_of(camera_to_world, position)
     width, height = (pixels(present(entry, key, where), f"{where}, {key}") for key in ("width", "height"))
     fx, fy = (positive(present(entry, key, where), f"{where}, {key}") for key in ("fx", "fy"))
     return Camera(width, height, fx, fy, width / 2, height / 2, viewmat, name, split)

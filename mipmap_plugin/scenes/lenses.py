@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SceneError, install
+from mipmap_plugin.errors import SceneError, brief, install
 
 if TYPE_CHECKING:
     import pycolmap
@@ -40,7 +40,7 @@ class Lens:
         try:
             flat = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self._camera())
         except Exception as error:  # what pycolmap's C++ raises
-            raise SceneError(f"camera {camera.name!r}: its lens ({self.model}) cannot be undistorted ({_brief(error)}); leave it out") from error
+            raise SceneError(f"camera {camera.name!r}: its lens ({self.model}) cannot be undistorted ({brief(error)}); leave it out") from error
         fx, fy, cx, cy = map(float, flat.params)
         return replace(camera, width=flat.width, height=flat.height, fx=fx, fy=fy, cx=cx, cy=cy)
 
@@ -74,7 +74,3 @@ def can_undistort() -> bool:
     except ImportError:
         return False
     return True
-
-
-def _brief(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]

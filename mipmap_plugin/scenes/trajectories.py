@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import Camera, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
@@ -133,7 +133,7 @@ def jittered(
     far = list(range(count))
     if spread:
         far = _farthest(_places(moved, turned, times[index], centers), _places(centers, rotations, times, centers), count)
-    poses = [(cameras[int(index[i])], _viewmat(turned[i], moved[i])) for i in far]
+    poses = [(cameras[int(index[i])], viewmat_of(turned[i], moved[i])) for i in far]
     return [replace(camera, viewmat=pose, name=f"jittered_{n:04d}", split="train") for n, (camera, pose) in enumerate(poses)]
 
 
@@ -237,15 +237,7 @@ def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], 
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
     height, width = size
     focal = min(size) / (2 * math.tan(ORBIT_FOV / 2))
-    return Camera(width, height, focal, focal, width / 2, height / 2, _viewmat(rotation, eye), name)
-
-
-def _viewmat(rotation: Tensor, center: Tensor) -> Tensor:
-    """World to camera [4, 4] from a camera-to-world rotation and the eye."""
-    viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ center
-    return viewmat
+    return Camera(width, height, focal, focal, width / 2, height / 2, viewmat_of(rotation, eye), name)
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:

@@ -39,7 +39,7 @@ class TileJob(Job):
         from mipmap_plugin.tiles.scene import opened
 
         scene = opened(self.base, self.scale, self.viewer, self.config(), self.target.parent)
-        with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
+        with thread_pool.limited_for(scene.backend, threads):
             self._do(scene, self.target.parent)
         pool.release_to_system()
         return Outcome(self, "done", self.target, _facts(self.target))

@@ -88,7 +88,7 @@ def _adapted_and_saved(scene: TiledScene, stages: _Stages, began: float, threads
     job, folder = stages.job, work_folder(stages.job.target)
     facts = _adapted(scene, folder, stages)
     last = time.perf_counter()
-    with thread_pool.limited(threads, shared=getattr(scene.backend, "own_threads", False)):
+    with thread_pool.limited_for(scene.backend, threads):
         validation, returned = judged(scene, folder)
     stages.seconds["validation"] = time.perf_counter() - last
     stages.seconds["total"] = time.perf_counter() - began
@@ -192,15 +192,13 @@ def _save(scene: TiledScene, job: Job, files: Sequence[Path], joined: Joined) ->
     provenance = {**joined.report.provenance(), "tiles": len(files)}
     comments = with_tags(scene.comments, scene.target.screen_filter, provenance, scene.target.eps2d)
 
-    def write(ply: Path) -> None:
-        with new_file(ply, overwrite=True) as temporary, temporary.open("xb") as out:
+    def write(ply: Path, overwrite: bool = True) -> None:
+        with new_file(ply, overwrite) as temporary, temporary.open("xb") as out:
             concatenate(files, comments, out)
 
     with together(job.target):
         if job.target.suffix.lower() == ".ply":
-            with new_file(job.target, job.overwrite) as temporary, temporary.open("xb") as out:
-                concatenate(files, comments, out)
-            saved = job.target
+            write(saved := job.target, job.overwrite)
         else:
             trained = replace(scene.wrapped.model.trained, screen_filter=scene.target.screen_filter, eps2d=scene.target.eps2d)
             degree = scene.wrapped.model.gaussians(scene.wrapped.any_camera()).sh_degree

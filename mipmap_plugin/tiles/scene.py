@@ -60,10 +60,6 @@ class Views:
     choosing: Sequence[Camera]
     note: str
 
-    @property
-    def all(self) -> list[Camera]:
-        return [*self.adapted, *self.steering, *self.choosing]
-
 
 def find_splats(path: Path) -> tuple[Checkpoint, type[VanillaModel]]:
     """The checkpoint at `path`, and what reads its columns. Raises CheckpointError; SettingsError for a family that cannot be cut."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.start.pixel_size import pixel_size
-from mipmap_plugin.camera import Camera, evenly
+from mipmap_plugin.camera import Camera, evenly, viewmat_of
 from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.limits import MAX_SCALE, MIN_SCALE
 from mipmap_plugin.splatting.rotations import quaternions, rotations
@@ -37,9 +37,7 @@ class Pose:
     def camera(self, width: int, height: int) -> Camera:
         """The pinhole of an image of `width` x `height` px."""
         rotation = rotations(torch.tensor([self.wxyz], dtype=torch.float64))[0]
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = rotation.T
-        viewmat[:3, 3] = -rotation.T @ torch.tensor(self.position, dtype=torch.float64)
+        viewmat = viewmat_of(rotation, torch.tensor(self.position, dtype=torch.float64))
         focal = height / (2 * math.tan(self.fov / 2))
         return Camera(width, height, focal, focal, width / 2, height / 2, viewmat, "screen")
 

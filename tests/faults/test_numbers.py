@@ -19,6 +19,7 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.wrap import wrap_model
 
 BAD_SCALES = [1e5, 1e308, 1e-50, 1e-10, 0, -1, math.nan, math.inf]
+NO_SCALES = [True, "1/4", None, [0.25], 1j, 10**400]
 BAD_COLORS = [(math.nan,) * 3, (1e30, 0, 0), (0.5, 0.5), (0, 0, 0, 0), (-0.1, 0, 0), (math.inf, 0, 0), "red", 5, (None, 0, 0), ("x", 0, 0)]
 BAD_SETTINGS = [
     *({"seed": seed} for seed in (2**64, 2**63, 10**30, -1, math.nan, "x")),
@@ -39,10 +40,10 @@ def no_work(monkeypatch):
     monkeypatch.setattr("mipmap_plugin.adaptation.conversion.Session", lambda *_: pytest.fail("worked in vain"))
 
 
-@pytest.mark.parametrize("scale", BAD_SCALES)
+@pytest.mark.parametrize("scale", [*BAD_SCALES, *NO_SCALES])
 @pytest.mark.parametrize("recipe", ["instant", "default"])
 def test_scales_that_nothing_can_be_adapted_to(model, no_work, scale, recipe):
-    with pytest.raises(SettingsError, match=r"scale must be from 1e-09 to 10000"):
+    with pytest.raises(SettingsError, match=r"scale must be from 1e-09 to 10000, such as 0\.25 or 4, got "):
         model.adapt(scale, recipe=recipe)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -19,6 +18,7 @@ from mipmap_plugin.levels.distance.manifest import Contents, write
 from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import focal_of, foreground
 from mipmap_plugin.levels.distance.yardstick import measured
+from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.progress import announced
@@ -30,34 +30,7 @@ from mipmap_plugin.wrap import Wrapped
 CHUNK = 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class DistanceLadder:
-    """A finished ladder in memory."""
-
-    contents: Contents
-    _store: LevelStore
-
-    @property
-    def levels(self) -> list[Adapted]:
-        """From the finest to the coarsest."""
-        return self.contents.levels
-
-    def save(self, folder: str | Path, *, overwrite: bool = False, keep_resume: bool = False) -> Path:
-        """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError.
-
-        `keep_resume`: leave what was kept to go on from until `forget`.
-        """
-        saved = write(self.contents, Path(folder), overwrite)
-        if not keep_resume:
-            self.forget()
-        return saved
-
-    def forget(self) -> None:
-        """Delete what was kept to go on from."""
-        self._store.remove()
-
-
-def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> DistanceLadder:
+def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
     """Make the levels. `resume`: as for `levels.ladder.make_levels`. Raises what that raises, and SettingsError for a model whose splats cannot be
     merged, or for settings that levels by distance do not have."""
     refuse(base, request)
@@ -65,14 +38,14 @@ def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str |
     scene = scene_of(base, request, band)
     store = LevelStore(None if resume is None else Path(resume), base, request)
     first = store.level("level_0", lambda state: _first(base, request, band, state))
-    with threads.limited(base.threads, shared=getattr(scene.backend, "own_threads", False)):
+    with threads.limited_for(scene.backend, base.threads):
         levels = [first]
         for number in range(1, scene.rule.count):
             run = LevelRun(scene, number, [level.model for level in levels])
             levels.append(store.level(f"level_{number}", run.run))
         with announced("measuring the levels"):
             curve = measured(scene, [level.model for level in levels])
-    return DistanceLadder(Contents(scene, levels, curve), store)
+    return Ladder(Contents(scene, levels, curve), store, write)
 
 
 def by_distance(base: Wrapped, request: LadderRequest) -> bool:

@@ -1,0 +1,41 @@
+"""A finished ladder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.levels.contents import Contents, Level
+from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
+from mipmap_plugin.levels.store import LevelStore
+
+
+@dataclass(frozen=True, eq=False)
+class Ladder:
+    """A ladder in memory, whichever way its levels were made."""
+
+    contents: Contents | DistanceContents
+    _store: LevelStore
+    _write: Callable[[Any, Path, bool], Path]  # contents, folder, whether to overwrite
+
+    @property
+    def levels(self) -> list[Level] | list[Adapted]:
+        """From the finest to the coarsest."""
+        return self.contents.levels
+
+    def save(self, folder: str | Path, *, overwrite: bool = False, keep_resume: bool = False) -> Path:
+        """Write the levels and the manifest `levels.json` to a folder, atomically; return it. Raises OutputExists, OutputError.
+
+        `keep_resume`: leave what was kept to go on from until `forget`.
+        """
+        saved = self._write(self.contents, Path(folder), overwrite)
+        if not keep_resume:
+            self.forget()
+        return saved
+
+    def forget(self) -> None:
+        """Delete what was kept to go on from."""
+        self._store.remove()
