@@ -266,6 +266,24 @@ def test_a_limit_that_was_found_before_anything_was_gained_rises_with_what_is_ga
     assert not run.is_rising(12, config)  # a limit that was found after a gain stays
 
 
+@pytest.mark.parametrize(
+    ("gained", "progress", "warm_up", "bold"),
+    [(0.0, 0.25, 0.1, True), (2 * TIE_DB, 0.25, 0.1, False), (0.0, 0.24, 0.1, False), (0.0, 0.25, 0.0, False)],
+)
+def test_where_limited_rates_gained_nothing_high_ones_are_tried_and_nothing_is_taken_back(gained, progress, warm_up, bold):
+    run, config = steering(ceiling=0.1), recipe("default", SCALE, steps=16, warm_up=warm_up)
+    run.update_best(30 + gained, 4, tiny.model(2, seed=1))
+    run.dare(progress, config)
+    assert (run.bold, run.ceiling) == (bold, 1.0 if bold else 0.1)
+    assert run.is_harmful(10.0) != bold
+
+
+def test_rates_that_nothing_limits_are_steered_on():
+    run = steering()
+    run.dare(1.0, recipe("default", SCALE))
+    assert not run.bold
+
+
 @pytest.mark.parametrize("rows", [5, 3])
 def test_what_is_taken_back_is_held_without_the_momentum_of_what_was_done_since(rows):
     student, other = tiny.model(5).copy(), tiny.model(rows, seed=1)
@@ -340,6 +358,11 @@ def test_a_run_goes_on_gently_after_harm():
     points = wrapped().adapt(SCALE, **{**HARMFUL, "steps": 16, "decay": 1.0, "rates": boldly}).report.curve
     assert points[1].taken_back and not points[-1].taken_back
     assert points[-1].validation_db > points[0].validation_db + 0.5
+
+
+def test_a_run_that_gained_nothing_by_a_quarter_of_its_steps_takes_nothing_back_from_there_on():
+    points = wrapped().adapt(SCALE, **{**HARMFUL, "steps": 16, "warm_up": 0.25, "gathering": 0.25}).report.curve
+    assert [point.step for point in points if point.taken_back] == [1, 2, 3, 4]
 
 
 def test_the_last_state_is_returned_where_it_is_asked_for():

@@ -203,6 +203,7 @@ class Steering:
     best_factor: float = 1.0  # the rate factor of the step that led there
     ceiling: float = 1.0  # upper limit of the rate factor, after larger rates did harm
     rises: bool = False  # whether the ceiling rises again with what is gained
+    bold: bool = False  # whether steps may do harm on the way
 
     @classmethod
     def begin(cls, student: SplatModel, psnr: float) -> Steering:
@@ -219,6 +220,8 @@ class Steering:
 
     def is_harmful(self, psnr: float, *, rising: bool = False) -> bool:
         """Whether a state with this PSNR is worse than the start or, while rates are `rising`, has lost much of what was gained."""
+        if self.bold:
+            return False
         if rising:
             return psnr < self.best_db - max(LOST_DB, LOST_FRACTION * (self.best_db - self.start_db))
         return psnr < self.start_db - HARM_DB
@@ -231,6 +234,14 @@ class Steering:
         self.rises = rising and self.best_step == 0
         lower = rising and self.best_step > 0 and self.best_factor < rate_factor
         self.ceiling = self.best_factor if lower else RATE_REDUCTION * rate_factor
+
+    def dare(self, progress: float, config: AdaptConfig) -> None:
+        """Limit no rates and take nothing back any more if limited ones gained nothing while new views came: there is nothing to lose.
+
+        Where few views show a splat, any rate does harm at first, and high ones gain in the end, as they fall.
+        """
+        if config.warm_up and self.ceiling < 1 and progress >= config.gathering and self.best_db - self.start_db <= TIE_DB:
+            self.ceiling, self.bold = 1.0, True
 
     def update_best(self, psnr: float, step: int, student: SplatModel, rows_changed: bool = False, rate_factor: float = 1.0) -> None:
         """Keep the student's state, to which steps of `rate_factor` led, as the best one, unless it is worse."""
