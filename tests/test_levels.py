@@ -203,6 +203,12 @@ def test_a_level_that_starts_from_a_finer_one_takes_fewer_steps():
     assert LadderRequest("spark", recipe="instant").steps(1 / 4)["steps"] == 0
 
 
+def test_merging_costs_a_level_no_more_than_its_steps_regain():
+    assert "merging_costs" not in LadderRequest("spark").steps(1 / 4)
+    assert "merging_costs" not in LadderRequest("spark", recipe="instant", settings={"steps": 9}).steps(1 / 4)
+    assert LadderRequest("spark", recipe="instant").steps(1 / 4)["merging_costs"] == recipe("instant", 1 / 4).merging_costs
+
+
 def test_levels_of_a_large_scene_take_fewer_steps_unless_asked_for(monkeypatch):
     monkeypatch.setattr("mipmap_plugin.recipes.DEFAULT_OUT", recipes.DEFAULT_OUT | dict(steps=40, most_draws=1.0, extra_views=2))
 
