@@ -103,10 +103,8 @@ class LadderRequest:
 
         Raises SettingsError for a setting that is unknown or out of range.
         """
-        usual = recipe(self.recipe, scale)
-        steps = {"steps": math.ceil(STEPS_KEPT * usual.steps), "most_draws": recipe(self.recipe, scale, **self.settings).most_draws}
-        takes_steps = self.settings.get("steps", usual.steps) > 0
-        return steps if takes_steps else steps | {"merging_costs": usual.merging_costs}  # which no step regains
+        steps = math.ceil(STEPS_KEPT * recipe(self.recipe, scale).steps)
+        return {"steps": steps, "most_draws": recipe(self.recipe, scale, **self.settings).most_draws}
 
     @property
     def seed(self) -> int:
