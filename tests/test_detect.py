@@ -106,6 +106,12 @@ def test_other_files(tmp_path, content, sentence):
         detect(tmp_path / "a.bin")
 
 
+def test_a_capture_in_lcc_is_converted_first(tmp_path):
+    (tmp_path / "hall.lcc").write_text('{"version": "5.0", "source": "lcc", "totalSplats": 9}')
+    with pytest.raises(CheckpointError, match=r"hall.lcc is LCC of XGRIDS, which is not read here; convert it: splat-transform hall.lcc hall.ply"):
+        detect(tmp_path / "hall.lcc")
+
+
 def test_point_cloud_is_not_a_splat(tmp_path):
     write(tmp_path / "points3D.ply", f4("x", "y", "z", "red", "green", "blue"))
     with pytest.raises(CheckpointError, match="plain point cloud or a mesh"):
