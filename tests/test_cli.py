@@ -146,6 +146,17 @@ def test_inspect_as_json(run, tmp_path):
     assert isinstance(facts["effects"], list) and isinstance(facts["notes"], list)
 
 
+def test_cameras_beside_a_lone_file_are_named_but_not_read(run, tmp_path):
+    """They may be of another scene."""
+    ply, cameras = tiny.ply(tmp_path / "a.ply"), tmp_path / "cameras.json"
+    cameras.write_text("[]")
+    out = run("inspect", ply, "--no-viewers")[1]
+    assert f"cameras:      none are read; {cameras} may be of this scene\n" in out
+    assert f"adapt {ply} --scale 1/4 --cameras {cameras}\n" in out
+    err = run("adapt", ply, "--scale", "1/2", "--recipe", "instant", "--backend", "reference")[2]
+    assert f"give the scene's cameras (--cameras), such as {cameras}, if it is of this scene" in " ".join(err.split())
+
+
 def test_inspect_says_how_far_viewers_are_from_training(run, model_folder):
     pytest.importorskip("numba")
     [line] = [line for line in run("inspect", model_folder)[1].splitlines() if line.startswith("viewers:")]
@@ -293,6 +304,16 @@ def test_render_writes_the_row_of_supersampling_that_evaluate_judges(run, tmp_pa
     assert abs(shown - (base.render(view.zoomed(1 / 4), 1 / 4, "scaled", 4).image.clamp(0, 1) * 255).round().numpy()).max() > 1
 
 
+def test_render_says_that_no_view_shows_anything(run, tmp_path):
+    behind = torch.zeros(4, 4, dtype=torch.float64)
+    behind[2, 3] = -100.0
+    away = [replace(camera, viewmat=camera.viewmat + behind) for camera in tiny.cameras(2)]
+    scene = write_cameras(tmp_path / "cameras.json", away)
+    code, out, err = run("render", tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "out", "--cameras", scene, "--backend", "reference")
+    assert (code, out) == (0, f"2 pictures in {tmp_path / 'out'}\n")
+    assert "none of the 2 views shows a splat: the cameras seem to be of another scene" in " ".join(err.split())
+
+
 def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, model_folder, tmp_path):
     refused(run("render", model_folder, "--output", tmp_path / "out", "--view", "nowhere"), "there is no view nowhere; the first of 4 are view_")
     words = ["render", model_folder, "--output", tmp_path / "out", "--view", "view_1", "--backend", "reference"]
@@ -347,7 +368,7 @@ def test_evaluate_says_which_rows_are_missing_and_that_no_row_is_exposed(run, mo
 def test_evaluate_and_tradeoff_tell_of_photographs_that_are_absent(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
     (scene / "test" / "view_1.png").unlink()
-    note = "transforms_test.json: 1 listed images are absent; 1 of their cameras are left out because the file has no w and h"
+    note = "transforms_test.json: 1 listed image is absent; 1 camera is left out because the file has no w and h"
     words = [model_folder, "--images", scene, "--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--json"]
     code, out, err = run("evaluate", *words, "--output", tmp_path / "rows.json")
     assert code == 0 and f"mipmap-plugin: {scene}: {note}\n" in err

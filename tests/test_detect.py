@@ -106,6 +106,12 @@ def test_other_files(tmp_path, content, sentence):
         detect(tmp_path / "a.bin")
 
 
+def test_a_capture_in_lcc_is_converted_first(tmp_path):
+    (tmp_path / "hall.lcc").write_text('{"version": "5.0", "source": "lcc", "totalSplats": 9}')
+    with pytest.raises(CheckpointError, match=r"hall.lcc is LCC of XGRIDS, which is not read here; convert it: splat-transform hall.lcc hall.ply"):
+        detect(tmp_path / "hall.lcc")
+
+
 def test_point_cloud_is_not_a_splat(tmp_path):
     write(tmp_path / "points3D.ply", f4("x", "y", "z", "red", "green", "blue"))
     with pytest.raises(CheckpointError, match="plain point cloud or a mesh"):
@@ -166,7 +172,7 @@ def test_folders_without_an_answer(tmp_path):
     with pytest.raises(CheckpointError, match="holds no iteration_<N> folder"):
         detect(tmp_path / "e")
     (tmp_path / "empty/below").mkdir(parents=True)
-    with pytest.raises(CheckpointError, match="no point_cloud folder and no PLY file"):
+    with pytest.raises(CheckpointError, match="no point_cloud folder and no file of splats"):
         detect(tmp_path / "empty")
     with pytest.raises(CheckpointError, match="does not exist"):
         detect(tmp_path / "none")
@@ -176,7 +182,7 @@ def test_folder_with_one_ply_and_with_several(tmp_path):
     only = write_splats(tmp_path / "fused.ply")
     assert detect(tmp_path).path == only
     write_splats(tmp_path / "other.ply")
-    with pytest.raises(CheckpointError, match=r"2 PLY files \(fused.ply, other.ply\)"):
+    with pytest.raises(CheckpointError, match=r"2 files of splats \(fused.ply, other.ply\)"):
         detect(tmp_path)
     named = write_splats(tmp_path / "point_cloud.ply")
     assert detect(tmp_path).path == named
@@ -219,20 +225,35 @@ def test_real_companions_are_named(shared_data):
     for path, sentence in {
         "octree_mlps/color_mlp.pt": "TorchScript",
         "deform/deform.pth": "deformation network",
-        "lod_tiles": "4 PLY files",
+        "lod_tiles": "4 files of splats",
     }.items():
         with pytest.raises(CheckpointError, match=sentence):
             load_model(folder / path)
 
 
+def test_a_folder_with_one_exchange_file_is_that_file(tmp_path):
+    """As is one with one PLY, before which it does not come."""
+    for name in ("cameras.json", "scene.SPZ"):
+        (tmp_path / name).write_bytes(b"NGSP" + bytes(64))
+    assert detect(tmp_path).path == tmp_path / "scene.SPZ"
+    write_splats(tmp_path / "base.ply")
+    assert detect(tmp_path).path == tmp_path / "base.ply"
+
+
+def test_a_folder_with_several_exchange_files_names_them(tmp_path):
+    for name in ("a.spz", "b.splat"):
+        (tmp_path / name).write_bytes(b"NGSP" + bytes(64))
+    with pytest.raises(CheckpointError, match=r"holds 2 files of splats \(a.spz, b.splat\); give one file"):
+        detect(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("there", "said"),
     [
-        ("phone.SPZ", "no PLY file, but phone.SPZ; give one PLY"),
-        ("export/a.ply", "no PLY file, but export; give one PLY"),
-        ("images/a.jpg", r"no PLY file, but photographs or what a scene is trained on \(that is for --images and --cameras\); give one PLY"),
-        ("a.JPG", "no PLY file, but photographs"),
-        ("notes.txt", "no PLY file; give one PLY"),
+        ("export/a.ply", "no file of splats, but export; give one file"),
+        ("images/a.jpg", r"no file of splats, but photographs or what a scene is trained on \(that is for --images and --cameras\); give one file"),
+        ("a.JPG", "no file of splats, but photographs"),
+        ("notes.txt", "no file of splats; give one file"),
     ],
 )
 def test_a_folder_without_splats_says_what_it_holds_instead(tmp_path, there, said):

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from ply_files import write
+from ply_files import write, write_splats
 
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.splatting.harmonics import basis
 from mipmap_plugin.splatting.projection import axes_of
@@ -102,6 +103,14 @@ def test_compressed_ply_is_recognized_by_its_columns(tmp_path, tool):
     write(tmp_path / "a.ply", {"packed_position": np.zeros(1, np.int32)})
     assert len(load_model(tmp_path / "a.ply")) == 60
     assert tool_request(tool)[1].endswith(".compressed.ply")
+
+
+def test_a_plain_ply_with_the_name_of_a_compressed_one_stays_plain(tmp_path):
+    """Its adaptation is not rounded, which would lose some of what the base has."""
+    plain = write_splats(tmp_path / "a.compressed.ply")
+    assert adapted_name(plain, 1 / 4) == "a_x0.25.ply"
+    packed = write(tmp_path / "b.compressed.ply", {"packed_position": np.zeros(1, np.int32)})
+    assert adapted_name(packed, 1 / 4) == "b_x0.25.compressed.ply"
 
 
 def test_a_sog_whose_checksums_are_wrong_is_refused(tmp_path, tool):

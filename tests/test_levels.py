@@ -108,6 +108,7 @@ def test_a_run_starts_from_a_finer_level_and_keeps_a_fraction_of_the_base():
 def test_splats_that_share_no_pixel_are_merged_where_enough_is_left_to_see(monkeypatch):
     def count(least_db):
         monkeypatch.setattr(candidates, "LEAST_DB", least_db)
+        monkeypatch.setattr(candidates.StartSearch, "_least_psnr", lambda *_: -math.inf)
         settings = dict(steps=0, merge_to=0.05, merging_costs=99, validation_views=2, returns="last")
         return len(base.adapt(0.9, viewer="antialiased", start=FinerLevel(base.model, 1.0), **settings).model)
 
@@ -115,9 +116,20 @@ def test_splats_that_share_no_pixel_are_merged_where_enough_is_left_to_see(monke
     assert count(-math.inf) == 2 < count(math.inf)
 
 
-@pytest.mark.parametrize(("coarse_db", "base_db", "coarsely"), [(30.0, 32.0, True), (30.0, 34.0, False), (26.0, 20.0, False), (20.0, 20.0, False)])
-def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypatch, coarse_db, base_db, coarsely):
-    """The finer level has 38 dB and may lose 9, as the closed form may; the base itself may lose 3."""
+@pytest.mark.parametrize(
+    ("coarse_db", "base_db", "steps", "start"),
+    [
+        (30.0, 32.0, 1, ("merged", 0.1, True)),
+        (30.0, 34.0, 1, ("merged", 0.1, False)),
+        (26.0, 20.0, 1, ("merged", 0.1, False)),
+        (20.0, 20.0, 1, ("merged", 0.1, False)),
+        (30.0, 32.0, 0, ("merged", 0.1, False)),
+        (30.0, 33.0, 0, ("finer",)),
+    ],
+)
+def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypatch, coarse_db, base_db, steps, start):
+    """The finer level has 38 dB and may lose 9, as the closed form may; the base itself may lose 3. Without a step, merging leaves half of what the
+    closed form, of 34 dB, gains on the base."""
 
     def quality(model):
         return Quality(*[{"finer": 38.0, "base": base_db, "formed": 34.0}.get(model[0], coarse_db if model[-1] else 33.0)] * 2)
@@ -131,14 +143,14 @@ def test_what_is_merged_too_coarsely_leaves_the_choice_to_plain_merging(monkeypa
         def parameters(self):
             return {"means": torch.zeros(100, 3)}
 
-    config = SimpleNamespace(most_splats=None, closed_form=True, merge_to=0.1, merging_costs=9.0, returns="best", time_budget_s=None)
+    config = SimpleNamespace(most_splats=None, closed_form=True, merge_to=0.1, merging_costs=9.0, returns="best", time_budget_s=None, steps=steps)
     problem = SimpleNamespace(
         base=lambda: Base(["finer"]), coarse_base=lambda: Base(["base"]), config=config, quality=quality, may_lose=9.0, name="the finer level",
         views=[], scale=0.5, phase=lambda _: nullcontext(), base_effects=Effects(0), target=Effects(0), has_blend_weights=False,
     )  # fmt: skip
     monkeypatch.setattr(candidates.StartSearch, "_base_weights", lambda *_: None)
     monkeypatch.setattr(candidates.StartSearch, "_candidate", candidate)
-    assert candidates.StartSearch(problem).best()[0] == ("merged", 0.1, coarsely)
+    assert candidates.StartSearch(problem).best()[0] == start
 
 
 def test_a_start_has_to_be_finer():
@@ -493,6 +505,8 @@ def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     assert manifest == json.loads((tmp_path / "ladder" / MANIFEST).read_text())
     print_summary(tmp_path, manifest)
     said = capsys.readouterr().out
+    print_summary(tmp_path, manifest | {"levels": manifest["levels"][:1]})
+    assert capsys.readouterr().out.startswith(f"{tmp_path}, for antialiased: 1 level\n")
     assert "2 levels" in said and "level_1.ply  x0.5, shown up to" in said and "at worst" in said
     assert not state_path(tmp_path / "ladder").exists() and not (tmp_path / "ladder" / "report.html").exists()
     assert cli.main(words) == 2 and "--overwrite" in capsys.readouterr().err

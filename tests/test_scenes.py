@@ -246,7 +246,7 @@ def test_absent_images_are_counted_and_left_out(tmp_path):
     frames = [frame(), frame(file_path="train/r_1"), frame(file_path="train/r_2")]
     scene = read_transforms(write_json(tmp_path / "transforms_train.json", {"camera_angle_x": 0.8, "frames": frames}))
     assert len(scene.cameras) == 1
-    assert scene.notes == ["transforms_train.json: 2 listed images are absent; 2 of their cameras are left out because the file has no w and h"]
+    assert scene.notes == ["transforms_train.json: 2 listed images are absent; 2 cameras are left out because the file has no w and h"]
 
 
 def test_a_stated_size_makes_views_without_images(tmp_path):
@@ -257,6 +257,24 @@ def test_a_stated_size_makes_views_without_images(tmp_path):
 def test_without_images_and_size_the_folder_is_refused(tmp_path):
     with pytest.raises(SceneError, match="none of the listed images is there"):
         read_transforms(write_json(tmp_path / "transforms_train.json", {"camera_angle_x": 0.8, "frames": [frame()]}))
+
+
+def test_absent_images_whose_cameras_stay_are_counted_alone(tmp_path):
+    data = {"camera_angle_x": 0.8, "w": 40, "h": 30, "frames": [frame()]}
+    assert read_transforms(write_json(tmp_path / "transforms.json", data)).notes == ["transforms.json: 1 listed image is absent"]
+
+
+def test_the_scale_of_a_cameras_axes_is_left_out(tmp_path):
+    """As Blender writes it for a camera that was made smaller; its place is the same."""
+    data = {"camera_angle_x": 0.8, "w": 40, "h": 30}
+    pose = np.array(frame()["transform_matrix"], dtype=np.float64)
+    scaled = pose.copy()
+    scaled[:3, :3] *= 1e-3
+    expected, found = (
+        read_transforms(write_json(tmp_path / f"{name}.json", {**data, "frames": [frame(transform_matrix=matrix.tolist())]})).cameras[0]
+        for name, matrix in {"a": pose, "b": scaled}.items()
+    )
+    torch.testing.assert_close(found.viewmat, expected.viewmat)
 
 
 def test_a_stated_lens_follows_the_size_of_the_image(tmp_path):
@@ -339,7 +357,7 @@ def test_a_checkpoint_may_come_with_cameras_or_without(tmp_path):
 def test_a_transforms_file_may_have_any_name(tmp_path):
     scene = load_scene(write_json(tmp_path / "polycam.json", {"fl_x": 9.0, "w": 8, "h": 8, "frames": [frame()]}))
     assert [camera.size for camera in scene.cameras] == [(8, 8)]
-    with pytest.raises(SceneError, match="is not a list of cameras"):
+    with pytest.raises(SceneError, match=r"other.json: has no cameras: neither the frames of a transforms.json nor the list of a cameras.json"):
         load_scene(write_json(tmp_path / "other.json", {"fx": 9.0}))
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import accumulate
+from pathlib import Path
 from statistics import fmean
 
 import torch
@@ -21,7 +22,12 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.render_settings import MIN_ALPHA
+<<<<<<< HEAD
 from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, Orbit, jittered
+=======
+from mipmap_plugin.scenes import unread_cameras
+from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, jittered, orbit
+>>>>>>> a9a7b3f517301984dd60e815ac72a03e7a208cff
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
 ORBIT_PIXELS = 800
@@ -235,6 +241,12 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     if max(view.fx for view in views) * width / least < width / 2 + CLEAR * near:
         wrong = f"renderers of 3DGS draw nothing nearer than {near:g} units; scale the scene and its cameras up"
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
+
+
+def orbited(source: Path | None) -> str:
+    """`ORBITED`, with the cameras.json that lies beside the file of the splats."""
+    file = unread_cameras(source)
+    return f"{ORBITED}, such as {file}, if it is of this scene" if file else ORBITED
 
 
 def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:

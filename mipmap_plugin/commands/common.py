@@ -61,10 +61,10 @@ def without_none(**options: Any) -> dict[str, Any]:
     return {name: value for name, value in options.items() if value is not None}
 
 
-def summary(cameras: Sequence[Camera]) -> str:
-    """Describe cameras in a sentence."""
+def summary(cameras: Sequence[Camera], unread: Path | None) -> str:
+    """Describe cameras in a sentence. `unread`: the file beside a lone file (`unread_cameras`)."""
     if not cameras:
-        return "none beside the checkpoint"
+        return f"none are read; {unread} may be of this scene" if unread else "none beside the checkpoint"
     return f"{len(cameras)}, {cameras[0].width} x {cameras[0].height} px, {sum(c.split == 'test' for c in cameras)} of them test views"
 
 

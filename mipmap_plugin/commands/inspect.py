@@ -66,6 +66,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
     from mipmap_plugin.models.base import effects_of
     from mipmap_plugin.models.health import examine, holds_splats
     from mipmap_plugin.models.vanilla import VanillaModel
+    from mipmap_plugin.scenes import unread_cameras
 
     model = wrapped.model
     with announced("examining"):
@@ -79,7 +80,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
-        "cameras": summary(wrapped.cameras),
+        "cameras": summary(wrapped.cameras, unread_cameras(model.source)),
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
         "health": told or ["nothing found"],
     }
@@ -89,14 +90,16 @@ def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: 
     """Whether the checkpoint is sound, and what to do with it. `health`: remarks; `spoilt`: one says that it is not; `unseen`: that most is."""
     from mipmap_plugin.models.adapted_scale import adapted_scale
     from mipmap_plugin.models.health import DROPPED
+    from mipmap_plugin.scenes import unread_cameras
 
     notes, seen, scale = wrapped.model.notes, bool(wrapped.cameras), adapted_scale(wrapped.model.source)
 
     if lost := next((note for note in notes if DROPPED in note), None):
         return f"doubtful: {lost}; train or export it again, or adapt what is left"
-    place = shlex.quote(str(checkpoint))
+    place, cameras = shlex.quote(str(checkpoint)), unread_cameras(wrapped.model.source)
+    views = "" if seen else f" --cameras {shlex.quote(str(cameras or 'SCENE'))}"
     told = wrapped.asked["screen filter"]
-    advice = f"mipmap-plugin adapt {place} --scale 1/4" + (f" --screen-filter {told}" if told else "") + ("" if seen else " --cameras SCENE")
+    advice = f"mipmap-plugin adapt {place} --scale 1/4" + (f" --screen-filter {told}" if told else "") + views
     if scale not in (None, 1.0):
         advice = f"mipmap-plugin render {place}, at x{scale:g}, which it was adapted to and looks right at"
     remarks = len(health)

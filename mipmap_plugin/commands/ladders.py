@@ -150,7 +150,7 @@ def _left_out(manifest: dict[str, Any]) -> list[str]:
 
 
 def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    lines = [f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels"]
+    lines = [f"{folder}, for {manifest['viewer']}: {_counted(manifest)}"]
     for level in manifest["levels"]:
         ends = {"down to": level["shown_from"], "up to": level["shown_to"]}
         shown = ", ".join(f"{word} x{zoom:.3g}" for word, zoom in ends.items() if zoom is not None) or "at every zoom"
@@ -160,13 +160,18 @@ def _zooms(folder: Path, manifest: dict[str, Any]) -> list[str]:
 
 
 def _distances(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    lines = [f"{folder}, for {manifest['viewer']}: {len(manifest['levels'])} levels by distance"]
+    lines = [f"{folder}, for {manifest['viewer']}: {_counted(manifest)} by distance"]
     for level in manifest["levels"]:
         ends = {"from": level["distance_from"] or None, "to": level["distance_to"]}
         shown = " ".join(f"{word} {distance:.3g}" for word, distance in ends.items() if distance is not None) or "everywhere"
         lines.append(f"  {level['file']}  shown {shown}: {_size(level)}")
     rule = f"lodBaseDistance {manifest['lodBaseDistance']:.4g}, lodMultiplier {manifest['lodMultiplier']:.3g}"
     return [*lines, f"  distances in world units on a canvas of {manifest['canvas']} px: {rule}"]
+
+
+def _counted(manifest: dict[str, Any]) -> str:
+    count = len(manifest["levels"])
+    return f"{count} level{'s' * (count > 1)}"
 
 
 def _size(level: dict[str, Any]) -> str:

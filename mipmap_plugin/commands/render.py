@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -74,9 +75,7 @@ def render(
     told = [replace(camera, name=f"{camera.name}_t{camera.time:g}") for camera in views] if len(time) > 1 else views
     pictures = [output / name for name in picture_names(told)]
     _refuse(wrapped, pictures, outputs, overwrite)
-    if exposure:
-        for camera in views:
-            wrapped.model.traits.exposures.of(camera)  # raises before anything is written
+    _check(wrapped, views, exposure)
     # Samples are clamped as `evaluate` clamps them, except those that an exposure may still bring into the range of a picture.
     options: RenderOptions = {"viewer": viewer, "filter_3d": filter_3d, "outputs": outputs, "exposure": exposure, "clamped": not exposure}
     for camera, picture in counted(zip(views, pictures, strict=True), len(views), "rendering", "view"):
@@ -84,6 +83,19 @@ def render(
     count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
     taken = [f"at x{zoom:g}"] * (scale is None and zoom != 1) + [f"in {own_viewer}"] * (own_viewer is not None)
     say(", ".join([f"{count} in {output}", *[" ".join(taken), "which the file was adapted for"] * bool(taken)]))
+
+
+def _check(wrapped: Wrapped, views: Sequence[Camera], exposure: bool) -> None:
+    """Raise the error of a view without an `exposure`; warn of views that show nothing, or a speck, which are written all the same."""
+    from mipmap_plugin.wrap import refuse_undrawn
+
+    if exposure:
+        for camera in views:
+            wrapped.model.traits.exposures.of(camera)
+    try:
+        refuse_undrawn(wrapped, views)
+    except SettingsError as error:
+        warnings.warn(str(error), stacklevel=1)
 
 
 def _at_times(wrapped: Wrapped, views: Sequence[Camera], times: Sequence[float]) -> list[Camera]:

@@ -5,10 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipmap_plugin.errors import MipmapPluginError
-from mipmap_plugin.formats.splat_transform import READ_ONLY, WRITTEN
+from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
+<<<<<<< HEAD
 from mipmap_plugin.models.zipped_folder import opened
+=======
+from mipmap_plugin.models.family import Files
+
+COMPRESSED = EXCHANGE["compressed"][1]
+>>>>>>> a9a7b3f517301984dd60e815ac72a03e7a208cff
 
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
@@ -22,12 +28,21 @@ def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> s
     return f"{name[: len(name) - len(read)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
 
 
+def _is_plain(checkpoint: Path) -> bool:
+    """Whether a file is a PLY whose columns are not packed, whatever its name says."""
+    try:
+        files = Files(checkpoint)
+        return files.header is not None and not files.compressed
+    except MipmapPluginError:  # whoever loads it says so
+        return False
+
+
 def _endings(checkpoint: Path, name: str, *, for_viewer: bool) -> tuple[str, str]:
     """The ending of a checkpoint's name, and that of the adapted file; "" for none."""
     if not checkpoint.is_file() and checkpoint.suffix != ".ply":
         return "", ""
     if ending := next((known for known in (*WRITTEN, ".ply", *READ_ONLY) if name.lower().endswith(known)), ""):
-        return ending, ".ply" if ending in READ_ONLY else ending
+        return ending, ".ply" if ending in READ_ONLY or (ending == COMPRESSED and _is_plain(checkpoint)) else ending
     try:
         family = find_family(detect(checkpoint).family)
     except MipmapPluginError:  # whoever loads it says so

@@ -127,6 +127,8 @@ def _why_not(files: Files) -> str:
         return f"{path} is a torch file that holds no known checkpoint; give a PLY file or a model folder"
     if path.suffix == ".npz":
         return f"{path} is a NumPy archive that no family knows; give a PLY file or a model folder, or register its family"
+    if path.suffix.lower() in (".lcc", ".lcc2"):
+        return f"{path} is LCC of XGRIDS, which is not read here; convert it: splat-transform {path.name} {path.stem}.ply"
     if path.suffix == ".hier":
         chunk = "the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)"
         return f"{path} is a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; give {chunk}"
@@ -145,7 +147,7 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         return _detect_step(family, folder, steps, iteration)
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
-    clouds = sorted(folder.glob("*.ply"))
+    clouds = sorted(folder.glob("*.ply")) or sorted(file for file in folder.glob("*") if _is_exchanged(file))
     clouds = [cloud for cloud in clouds if not cloud.with_name(cloud.name + REPORT).exists()] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]
@@ -155,18 +157,21 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
     if not clouds and (below := _below(folder)):
         more = ", ..." if len(below) > NAMED else ""
         raise CheckpointError(f"{folder} lies above its checkpoint{'s' * (len(below) > 1)}; give {' or '.join(map(str, below[:NAMED]))}{more}")
-    content = f"{len(clouds)} PLY files ({some})" if clouds else f"no point_cloud folder and no PLY file{_instead(folder)}"
-    raise CheckpointError(f"{folder} holds {content}; give one PLY file, or a model folder with point_cloud/iteration_<N>")
+    content = f"{len(clouds)} files of splats ({some})" if clouds else f"no point_cloud folder and no file of splats{_instead(folder)}"
+    raise CheckpointError(f"{folder} holds {content}; give one file, or a model folder with point_cloud/iteration_<N>")
+
+
+def _is_exchanged(file: Path) -> bool:
+    return file.suffix.lower() in EXCHANGED and file.is_file()
 
 
 def _instead(folder: Path) -> str:
-    """What people mean who give a folder without splats, in words: a file of another format, a folder below, or what a scene is trained on."""
+    """What people mean who give a folder without splats, in words: a folder below, or what a scene is trained on."""
     try:
         entries = sorted(folder.iterdir())
     except OSError:
         return ""
-    meant = [entry for entry in entries if entry.suffix.lower() in EXCHANGED]
-    meant += [entry for entry in entries if entry.is_dir() and any(entry.glob("*.ply"))]
+    meant = [entry for entry in entries if entry.is_dir() and any(entry.glob("*.ply"))]
     if meant:
         return f", but {', '.join(entry.name for entry in meant[:5])}{', ...' * (len(meant) > 5)}"
     if any(entry.suffix.lower() in PHOTOGRAPHS or entry.name in ("images", "sparse") for entry in entries):

@@ -18,7 +18,9 @@ from mipmap_plugin.scenes.transforms import read_transforms
 # The names of the files of a COLMAP model.
 COLMAP_FILES = {f"{name}{suffix}" for name in ("cameras", "images", "points3D", "frames", "rigs") for suffix in (".bin", ".txt")}
 
-__all__ = ["Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms", "write_cameras"]
+__all__ = [
+    "Scene", "jittered", "load_scene", "model_cameras", "orbit", "read_cameras", "read_colmap", "read_transforms", "unread_cameras", "write_cameras",
+]  # fmt: skip
 
 
 def load_scene(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
@@ -57,6 +59,12 @@ def model_cameras(folder: str | Path | None, cfg: dict[str, Any] | None = None) 
     return read_cameras(Path(folder) / "cameras.json", cfg)
 
 
+def unread_cameras(source: Path | None) -> Path | None:
+    """The cameras.json in the folder of a lone file of splats: it may be of another scene, and is only read where it is asked for."""
+    file = source.parent / "cameras.json" if source is not None else None
+    return file if file is not None and file.is_file() else None
+
+
 def _of_file(path: Path, cfg: dict[str, Any] | None) -> Scene:
     """The scene of one file: with frames it is a transforms file, whatever its name, else a cameras.json. Raises SceneError."""
     if path.suffix.lower() != ".json":
@@ -65,6 +73,8 @@ def _of_file(path: Path, cfg: dict[str, Any] | None) -> Scene:
     data = read_json(path)
     if path.name.startswith("transforms") or (isinstance(data, dict) and "frames" in data):
         return read_transforms(path)
+    if isinstance(data, dict):
+        raise SceneError(f"{path}: has no cameras: neither the frames of a transforms.json nor the list of a cameras.json; give one of these")
     return _cameras_only(path, path, cfg)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
-from mipmap_plugin.formats.json_file import numbers, pixels, positive, present, read_json, rotation
+from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
 from mipmap_plugin.scenes.base import ABSENT, Scene
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
@@ -55,7 +55,7 @@ def read_transforms(path: str | Path) -> Scene:
         distorted += [lens for _, _, lens in views if lens]
         if absent:
             unsized = absent - sum(image is None for _, image, _ in views)
-            notes.append(f"{file.name}: {absent} listed images are {ABSENT}; {unsized} of their cameras are left out because the file has no w and h")
+            notes.append(f"{file.name}: {_counted(absent)} {ABSENT}{_left_out(unsized)}")
     if not cameras:
         raise SceneError(f"{path}: none of the listed images is there, and the sizes are unknown; add the images, or w and h to the file")
     first = transforms_files(path)[0][0]
@@ -86,6 +86,18 @@ def viewmat_from_opengl(camera_to_world: Tensor) -> Tensor:
 
 def _first_file(folder: Path, *names: str) -> list[Path]:
     return [folder / name for name in names if (folder / name).is_file()][:1]
+
+
+def _counted(absent: int) -> str:
+    return f"{absent} listed images are" if absent > 1 else "1 listed image is"
+
+
+def _left_out(unsized: int) -> str:
+    """What becomes of the cameras of photographs that are absent; "" if all stay."""
+    if not unsized:
+        return ""
+    cameras = f"{unsized} cameras are" if unsized > 1 else "1 camera is"
+    return f"; {cameras} left out because the file has no w and h"
 
 
 def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[Camera, Path | None, Lens | None]], int]:
@@ -154,17 +166,32 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], name: str, split: 
 
 
 def _viewmat(values: Mapping[str, Any], where: str) -> Tensor:
-    return viewmat_from_opengl(_pose(present(values, "transform_matrix", where), f"{where}, transform_matrix"))
+    pose, where = present(values, "transform_matrix", where), f"{where}, transform_matrix"
+    return viewmat_from_opengl(_pose(_unscaled(pose, where), where))
+
+
+def _unscaled(value: Any, where: str) -> list[list[float]]:
+    """A camera's pose without the scale of its axes: in a modeling program a camera has a size, which no picture shows."""
+    rows = numbers(_upper(value), (3, 4), where)
+    determinant = torch.linalg.det(rows[:, :3]).item()
+    if determinant > 0 and abs(determinant - 1) > ROTATION_TOLERANCE:
+        rows[:, :3] /= determinant ** (1 / 3)
+    listed: list[list[float]] = rows.tolist()
+    return listed
 
 
 def _pose(value: Any, where: str) -> Tensor:
     """A rotation and a translation as [4, 4] float64. Raises SceneError, beginning with `where`."""
-    rows = value[:3] if isinstance(value, list) else value  # the last row is 0 0 0 1, and some files leave it out
-    upper = numbers(rows, (3, 4), where)
+    upper = numbers(_upper(value), (3, 4), where)
     rotation(upper[:, :3].tolist(), where)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3] = upper
     return pose
+
+
+def _upper(value: Any) -> Any:
+    """The first three rows of a pose: the last one is 0 0 0 1, and some files leave it out."""
+    return value[:3] if isinstance(value, list) else value
 
 
 def _focal(values: Mapping[str, Any], axis: str, size: int, where: str) -> float | None:

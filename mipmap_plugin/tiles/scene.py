@@ -16,7 +16,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.optimization.validation import split_validation
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import ORBITED, choose_views
+from mipmap_plugin.adaptation.views import choose_views, orbited
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera
@@ -199,7 +199,7 @@ class TiledScene:
         if not cameras or self.config.views == "orbit":  # which surrounds the splats
             means = means[means.isfinite().all(1)]
         if not cameras and self.config.views != "orbit":
-            warnings.warn(ORBITED, stacklevel=1)
+            warnings.warn(orbited(self.checkpoint.path), stacklevel=1)
         chosen, note = choose_views(cameras, means, self.config)
         adapted, validation = split_validation(cameras, chosen, means, self.scale, self.config)
         note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""

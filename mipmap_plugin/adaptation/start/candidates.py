@@ -101,13 +101,20 @@ class StartSearch:
         before, after = problem.quality(base), problem.quality(formed)
         if self._alike and after.visible < before.visible:  # the filter itself is the better answer, for merged splats too
             self._forms, after = False, before
-        bounds = Bounds(after.psnr - config.merging_costs, before.visible - problem.may_lose)
+        bounds = Bounds(self._least_psnr(after), before.visible - problem.may_lose)
         self._least = least_fraction(base, problem.views, problem.scale) if base.traits.thins else 0.0
         fewer = config.merge_to < 1 and self._least < 1
         merged = self._merged(weights, bounds, self._coarse_bounds(bounds, before)) if fewer else None
         if merged is not None:
             return merged, start_name(self._forms, merged=True, thinned=base.traits.thins)
         return (formed, start_name(True)) if self._forms and after.visible >= before.visible else (base, problem.name)
+
+    def _least_psnr(self, formed: Quality) -> float:
+        """What merging has to leave of the PSNR of the closed form: of a level that no step betters, half of what it gains on the base."""
+        problem, least = self._problem, formed.psnr - self._problem.config.merging_costs
+        if problem.coarse_base is None or problem.config.steps:
+            return least
+        return max(least, (formed.psnr + problem.quality(problem.coarse_base()).psnr) / 2)
 
     def _merged(self, weights: Tensor | None, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
         """What is merged furthest within bounds; None if merging costs too much.
