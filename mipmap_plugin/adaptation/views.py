@@ -22,12 +22,8 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.render_settings import MIN_ALPHA
-<<<<<<< HEAD
-from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, Orbit, jittered
-=======
 from mipmap_plugin.scenes import unread_cameras
-from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, jittered, orbit
->>>>>>> a9a7b3f517301984dd60e815ac72a03e7a208cff
+from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, Orbit, jittered
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
 ORBIT_PIXELS = 800

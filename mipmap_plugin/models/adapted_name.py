@@ -8,13 +8,10 @@ from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
-<<<<<<< HEAD
-from mipmap_plugin.models.zipped_folder import opened
-=======
 from mipmap_plugin.models.family import Files
+from mipmap_plugin.models.zipped_folder import opened
 
 COMPRESSED = EXCHANGE["compressed"][1]
->>>>>>> a9a7b3f517301984dd60e815ac72a03e7a208cff
 
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
