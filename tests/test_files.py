@@ -90,6 +90,11 @@ def test_the_base_is_known_by_every_name_that_it_has(tmp_path):
     refuse_output(tmp_path / "base/other.ply", True, [base])
 
 
+def test_a_name_that_no_disk_takes_is_told_in_a_sentence(tmp_path):
+    with pytest.raises(OutputError, match=r"a\.ply cannot be written: File name too long"), new_file(tmp_path / ("n" * 300) / "a.ply", True):
+        pass
+
+
 def test_a_disk_without_room_or_leave_is_refused_before_any_work(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     refuse_unwritable(tmp_path / "new/deep/a.ply", room=1)

@@ -95,7 +95,7 @@ def _as_output_error(path: Path) -> Iterator[None]:
     except MipmapPluginError:
         raise
     except OSError as error:
-        file = next((parent for parent in path.parents if parent.is_file()), None)
+        file = next((parent for parent in path.parents if os.path.isfile(parent)), None)
         reason = f"{file} is a file, not a folder; choose another path" if file else error.strerror or error
         raise OutputError(f"{path} cannot be written: {reason}") from error
 
