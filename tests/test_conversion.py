@@ -6,6 +6,7 @@ import pytest
 import tiny
 
 from mipmap_plugin.adaptation.conversion import conversion
+from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.session import Session
 from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.effects import Effects
@@ -108,8 +109,21 @@ def test_a_time_budget_is_for_both_and_told_as_it_was_given(monkeypatch):
     monkeypatch.setattr(Session, "run", lambda self, *given: budgets.append(self.config.time_budget_s) or run(self, *given))
     report = wrapped().adapt(2, viewer="antialiased", time_budget_s=60.0, **BRIEF).report
     assert budgets == [30.0, 30.0] and report.settings.time_budget_s == 60.0 and report.ended_by == "3 steps"
-    spent = wrapped().adapt(2, viewer="antialiased", time_budget_s=1e-3, **BRIEF).report
-    assert spent.ended_by.startswith("time budget of 0.001 s")
+
+
+def test_a_budget_that_both_stages_start_takes_is_told_whole_and_once():
+    with pytest.warns(UserWarning, match="the time budget of 0.001 s left no time for steps") as said:
+        spent = wrapped().adapt(2, viewer="antialiased", time_budget_s=1e-3, **BRIEF).report
+    assert spent.ended_by == "time budget of 0.001 s, all of which the conversion and the start took"
+    assert [("time budget" in str(warning.message)) for warning in said].count(True) == 1
+    assert [("time budget of 0.001 s" in note) for note in spent.notes] == [True, False]
+
+
+def test_what_the_choice_takes_of_a_budget_is_told_beside_both_starts(monkeypatch):
+    monkeypatch.setattr(Pace, "of", classmethod(lambda *_: Pace(1.0, 1.0, 1.0, 1e6)))
+    with pytest.warns(UserWarning, match="give [0-9]{7} s or more"):  # of which each stage has a half, and its start half of that
+        report = wrapped().adapt(2, viewer="antialiased", time_budget_s=1e4, **BRIEF).report
+    assert report.ended_by == "time budget of 10000 s, all of which the conversion, the start and the choice of a state take"
 
 
 def test_with_a_budget_too_what_has_ended_is_not_taken_further(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ import torch
 from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, restore_snapshot
+from mipmap_plugin.adaptation.optimization.run import Run
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.validation import (
     FIRST_RATE_FACTOR,
@@ -278,9 +279,10 @@ def test_where_limited_rates_gained_nothing_high_ones_are_tried_and_nothing_is_t
     assert run.is_harmful(10.0) != bold
 
 
-def test_rates_that_nothing_limits_are_steered_on():
-    run = steering()
-    run.dare(1.0, recipe("default", SCALE))
+@pytest.mark.parametrize(("ceiling", "gathering"), [(1.0, 0.25), (0.5, 0.0)], ids=["nothing limits", "no new views come"])
+def test_rates_that_had_no_time_to_gain_are_steered_on(ceiling, gathering):
+    run = steering(ceiling=ceiling)
+    run.dare(1.0, recipe("default", SCALE, gathering=gathering))
     assert not run.bold
 
 
@@ -334,6 +336,14 @@ def test_harmful_steps_return_nothing_worse_than_the_base_and_the_start(monkeypa
         images = model.render(small).image, started.render(small).image, adapted.render(small).image
         base, first, final = (from_the_base(model, image, camera, scale) for image in images)
         assert final >= max(base, first) - HARM_DB
+
+
+@pytest.mark.filterwarnings("ignore:the time budget")
+def test_a_zoom_in_without_time_for_steps_is_the_one_without_steps():
+    brief, without = (wrapped().adapt(4, extra_views=2, **settings) for settings in ({"time_budget_s": 1e-6}, {"steps": 0}))
+    assert brief.report.returned == "the closed form for the mean of the views"
+    for name, tensor in without.model.parameters().items():
+        torch.testing.assert_close(brief.model.parameters()[name], tensor)
 
 
 def test_a_report_says_which_state_was_returned_and_why(monkeypatch):
@@ -408,7 +418,7 @@ def test_a_curve_has_its_first_and_its_last_point(settings, steps):
 
 def test_a_run_that_ends_between_two_checks_is_looked_at_all_the_same(monkeypatch):
     reasons = iter([None, None, "enough"])
-    monkeypatch.setattr(loop, "reason_to_stop", lambda curve, seconds, config: next(reasons))
+    monkeypatch.setattr(Run, "reason_to_stop", lambda run, config: next(reasons))
     report = wrapped().adapt(SCALE, steps=9, check_every=50, extra_views=0, warm_up=0).report
     assert (report.ended_by, [point.step for point in report.curve]) == ("enough", [0, 2])
 

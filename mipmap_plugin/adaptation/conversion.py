@@ -74,12 +74,13 @@ class Stages:
         session.keeps_state = True
         converted = session.run(self.resume and conversion_state(self.resume), self.observe)
         half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if _stopped(converted.report) else {}))
-        request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, told=True))
+        request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, told=True), budget_share=SHARE)
         with _kept_if_interrupted(converted.states):
             adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self._further(converted.report))
         settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if _stopped(converted.report) else {})
         its_own, given = (f"budget of {each.time_budget_s or 0:g} s" for each in (half, config))
-        ended_by = adapted.report.ended_by.replace(its_own, given).replace("all of which the start", "all of which the conversion and the start")
+        ended_by = adapted.report.ended_by.replace(its_own, given)
+        ended_by = ended_by.replace("the start took", "the conversion and the start took").replace("the start and", "the conversion, the start and")
         report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings), "ended_by": ended_by})
         return replace(adapted, report=_joined(converted.report, report), states=[*converted.states, *adapted.states])
 

@@ -20,7 +20,7 @@ from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, takes_steps
-from mipmap_plugin.adaptation.optimization.budget import no_steps_note, plan_note, within_budget
+from mipmap_plugin.adaptation.optimization.budget import no_steps_notes, plan_note, within_budget
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
@@ -68,6 +68,7 @@ class AdaptationRequest:
     base_in_viewer: SplatModel  # what the viewer reads of the base's own file: mostly the base itself
     finer: FinerLevel | None = None  # what the run starts from instead of the base
     inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
+    budget_share: float = 1.0  # of the time budget that was asked for, which the settings have
 
 
 class Session:
@@ -84,7 +85,7 @@ class Session:
         asked, near = fitting(config, self.base_effects), self.effects.near_plane
         self.asked_steps, config = config.steps, affordable_for_model(asked, self.base, cameras, near)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
-        self.finer, self.inputs = request.finer, dict(request.inputs)
+        self.finer, self.inputs, self.budget_share = request.finer, dict(request.inputs), request.budget_share
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.base.parameters()["means"].device)
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
@@ -118,9 +119,8 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near = self.base_effects.near_plane
+        near, few = self.base_effects.near_plane, _rows(self.base) <= (self.config.most_splats or sys.maxsize)
         refuse_blind(self.base_views, self.base, near, self.truth)
-        few = _rows(self.base) <= (self.config.most_splats or sys.maxsize)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
@@ -142,7 +142,9 @@ class Session:
         self.seconds["total"] = time.perf_counter() - began
         if self._takes_steps:
             run, ended_by = self._optimize(initial.copy(), resume, observe)
-            curve, states = run.curve, states | run.states(initial)
+            began = time.perf_counter()
+            curve, states = run.curve, states | ({} if run.steering.best_step else search.without_steps()) | run.states(initial)
+            self.seconds["total"] += time.perf_counter() - began
         return self._select(states, curve, ended_by)
 
     def _start_problem(self) -> StartProblem:
@@ -211,7 +213,7 @@ class Session:
         self.seconds["validation"] = self.seconds.get("validation", 0.0) + checks
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
-        self.notes = [*self.notes, *filter(None, [no_steps_note(run, self.config)])]
+        self.notes = [*self.notes, *([] if self.keeps_state else no_steps_notes(run, self.config, self.budget_share))]
         return run, run.ended_by + (plan_note(run, self.config) or fewer_note(self.asked_steps, self.config)) + growth_note(run)
 
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:

@@ -107,12 +107,12 @@ def plan_note(run: Run, config: AdaptConfig) -> str:
     return f" ({taken}planned for the time budget in place of {config.steps})"
 
 
-def no_steps_note(run: Run, config: AdaptConfig) -> str:
-    """That a time budget left no time for steps, and which one would; empty if it did."""
+def no_steps_notes(run: Run, config: AdaptConfig, share: float = 1.0) -> list[str]:
+    """That a time budget, of which the run has a share, left no time for steps, and which one would; empty if it did."""
     if config.time_budget_s is None or run.step or run.seconds < config.time_budget_s:
-        return ""
-    least = math.ceil(2 * run.seconds)  # the start takes half of a budget at most
-    return f"the time budget of {config.time_budget_s:g} s left no time for steps after the start; give {least} s or more to have some"
+        return []
+    least = math.ceil(2 * run.seconds / share)  # the start takes half of a share at most
+    return [f"the time budget of {config.time_budget_s / share:g} s left no time for steps after the start; give {least} s or more to have some"]
 
 
 def _seconds(function: Callable[[Camera], object], camera: Camera, device: torch.device) -> float:

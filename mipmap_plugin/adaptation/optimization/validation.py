@@ -240,7 +240,7 @@ class Steering:
 
         Where few views show a splat, any rate does harm at first, and high ones gain in the end, as they fall.
         """
-        if config.warm_up and self.ceiling < 1 and progress >= config.gathering and self.best_db - self.start_db <= TIE_DB:
+        if config.warm_up and config.gathering and self.ceiling < 1 and progress >= config.gathering and self.best_db - self.start_db <= TIE_DB:
             self.ceiling, self.bold = 1.0, True
 
     def update_best(self, psnr: float, step: int, student: SplatModel, rows_changed: bool = False, rate_factor: float = 1.0) -> None:
