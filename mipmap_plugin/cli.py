@@ -67,7 +67,7 @@ def _run(words: Sequence[str]) -> int:
     except BrokenPipeError:  # as of `| head`, whose reader wants no more
         return 141
     except (MipmapPluginError, OSError) as error:
-        voice.complain(f"mipmap-plugin: {error}")
+        voice.complain(f"mipmap-plugin: {_told(error)}")
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
@@ -96,7 +96,14 @@ def _show(text: str, said: set[str]) -> None:
     """Show a warning without its place in the source, and once: all levels of a ladder, and all scales of a checkpoint, warn of the same."""
     if text not in said:
         said.add(text)
-        voice.complain(f"mipmap-plugin: {text}")
+        voice.complain(f"mipmap-plugin: {_told(text)}")
+
+
+def _told(words: object) -> str:
+    """What is said of unpacked archives, as said of the archives, for what is unpacked is gone when it is read."""
+    from mipmap_plugin.models.zipped_folder import told
+
+    return told(words)
 
 
 if __name__ == "__main__":

@@ -125,11 +125,18 @@ def test_it_is_unpacked_once_and_without_its_pictures(tmp_path, folder, monkeypa
     assert zipped_folder.opened(path) == place and len(load_model(path)) == 60
 
 
-@pytest.mark.parametrize("name", ["point_cloud/../../x", "..", "c:x", "point_cloud/..\\x"])
+@pytest.mark.parametrize("name", ["point_cloud/../../x", ".."])
 def test_a_name_that_leads_out_of_the_folder_is_refused(tmp_path, folder, name):
     path = packed(tmp_path / "a.zip", folder, beside={f"my model/{name}": b"x"})
     refused(path, "a.zip holds the name .* which leads out of its folder; do not open it")
     assert not list(tmp_path.rglob("x"))
+
+
+@pytest.mark.parametrize("name", ["log_12:30:01.txt", "c:x", "point_cloud/..\\x"])
+def test_a_name_that_windows_takes_for_a_place_is_left_out(tmp_path, folder, name):
+    place = zipped_folder.opened(packed(tmp_path / "a.zip", folder, beside={f"my model/{name}": b"x"}))
+    assert {path.name for path in place.iterdir()} == {path.name for path in folder.iterdir()}
+    assert not list(place.rglob("*x")) and not list(place.parent.glob("*x"))
 
 
 def test_a_folder_that_would_fill_the_disk_is_not_unpacked(tmp_path, folder):
@@ -160,6 +167,21 @@ def test_what_is_wrong_inside_is_told_by_the_archives_name(tmp_path, folder):
         load_model(packed(tmp_path / "a.zip", folder))
     splats.write_bytes(b"ply")
     refused(packed(tmp_path / "b.zip", folder), "^[^;]*b.zip has no whole checkpoint: [^;]*b.zip/point_cloud/")
+
+
+@pytest.mark.parametrize("tiles", [[], ["--tiles", "2"]])
+def test_commands_tell_what_is_wrong_by_the_archives_name(tmp_path, folder, capsys, tiles):
+    [splats] = folder.rglob("point_cloud.ply")
+    columns = read_ply(splats).columns
+    columns["x"][3] = np.nan
+    write(splats, columns)
+    path = packed(tmp_path / "a.zip", folder)
+    wrap_model(folder, backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "made")
+    made = packed(tmp_path / "made.zip", tmp_path / "made")
+    words = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--output", str(tmp_path / "out"), *tiles]
+    assert (main(["adapt", str(path), *words]), main(["adapt", str(made), *words, "--overwrite"])) == (0, 2)
+    said = capsys.readouterr().err
+    assert f"{path}/point_cloud" in said and f"{made}/point_cloud" in said and tempfile.gettempdir() + "/mipmap" not in said
 
 
 def test_workers_leave_nothing_unpacked(tmp_path, folder, monkeypatch):

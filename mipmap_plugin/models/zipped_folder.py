@@ -70,7 +70,7 @@ def _unpack(path: Path, root: str, folder: Path) -> Path:
     """Write what is read of a model folder to `folder`; return it. Raises CheckpointError, also for a name that leads out of the folder."""
     with archive(path) as inside:
         read = _read_of(inside.infolist(), f"{root}/" if root else "")
-        if wrong := next((entry.filename for names, entry in read.items() if any(name == ".." or set(name) & set("\\:") for name in names)), None):
+        if wrong := next((entry.filename for names, entry in read.items() if ".." in names), None):
             raise CheckpointError(f"{path} holds the name {wrong!r}, which leads out of its folder; do not open it")
         refuse_large(path, sum(entry.file_size for entry in read.values()), folder.parent)
         for names, entry in read.items():
@@ -79,6 +79,10 @@ def _unpack(path: Path, root: str, folder: Path) -> Path:
 
 
 def _read_of(entries: Iterable[zipfile.ZipInfo], prefix: str) -> dict[tuple[str, ...], zipfile.ZipInfo]:
-    """What is read of the model folder with that `prefix`, by the parts of its name in the folder; not its pictures."""
+    """What is read of the model folder with that `prefix`, by the parts of its name in the folder; not its pictures.
+
+    Nor what has a name that Windows takes for a place: a log may be called by its time, but nothing that is read is.
+    """
     named = {PurePosixPath(entry.filename.removeprefix(prefix)).parts: entry for entry in entries if entry.filename.startswith(prefix)}
-    return {names: entry for names, entry in named.items() if not entry.is_dir() and (len(names) == 1 or names[0] in PARTS)}
+    files = {names: entry for names, entry in named.items() if not entry.is_dir() and not set("\\:") & set("".join(names))}
+    return {names: entry for names, entry in files.items() if len(names) == 1 or names[0] in PARTS}
