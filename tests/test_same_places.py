@@ -10,6 +10,7 @@ import torch
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation import views
+from mipmap_plugin.cli import main
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 
 SCALE = 0.125
@@ -50,6 +51,17 @@ def test_and_so_is_what_is_adapted_from_it_again(files, tmp_path):
     first = wrap_model(base, backend="reference").adapt(1.0, viewer="classic", **fewer).save(tmp_path / "first.ply")
     second = wrap_model(first, backend="reference").adapt(SCALE, recipe="instant", extra_views=4).save(tmp_path / "second.ply")
     assert torch.equal(poses(second), poses(base))
+
+
+@pytest.mark.filterwarnings("ignore:no cameras")
+def test_and_so_is_what_is_adapted_in_tiles(files, tmp_path):
+    base, _ = files
+    first = wrap_model(base, backend="reference").adapt(1.0, viewer="classic", recipe="instant", most_splats=20, extra_views=4)
+    first.save(tmp_path / "first.ply")
+    words = ["--scale", "1/4", "--recipe", "instant", "--backend", "reference", "--tiles", "2"]
+    for path in (base, tmp_path / "first.ply"):
+        assert main(["adapt", str(path), "--output", str(tmp_path / "tiled.ply"), "--overwrite", *words]) == 0
+        assert torch.equal(poses(tmp_path / "tiled.ply"), poses(base))
 
 
 @pytest.mark.parametrize("orbit", [None, 3, {}, {"center": [1, 2], "up": [0.0, 0.0, 1.0], "distance": 1.0}])

@@ -184,6 +184,15 @@ def test_commands_tell_what_is_wrong_by_the_archives_name(tmp_path, folder, caps
     assert f"{path}/point_cloud" in said and f"{made}/point_cloud" in said and tempfile.gettempdir() + "/mipmap" not in said
 
 
+def test_a_list_tells_what_is_wrong_by_the_archives_name(tmp_path, folder, capsys):
+    wrap_model(folder, backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "made")
+    made = packed(tmp_path / "made.zip", tmp_path / "made")
+    words = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--output", str(tmp_path / "out")]
+    assert main(["adapt", str(made), str(packed(tmp_path / "a.zip", folder)), *words]) != 0
+    told = capsys.readouterr()
+    assert f"{made}/point_cloud" in told.out and tempfile.gettempdir() + "/mipmap" not in told.out + told.err
+
+
 def test_workers_leave_nothing_unpacked(tmp_path, folder, monkeypatch):
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))

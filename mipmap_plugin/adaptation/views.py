@@ -134,11 +134,14 @@ def extent(views: Sequence[Camera]) -> float:
     return radius if radius > 0 else 1.0
 
 
-def orbit_of(model: SplatModel) -> Orbit:
-    """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places."""
+def orbit_of(model: SplatModel, means: Tensor | None = None) -> Orbit:
+    """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places.
+
+    `means` [N, 3]: of all splats, where the model has but some of its file.
+    """
     recorded = adapted_orbit(model.source)
     if recorded is None:
-        return Orbit.around(model.parameters()["means"])
+        return Orbit.around(model.parameters()["means"] if means is None else means)
     center, up, distance = recorded
     return Orbit((center[0], center[1], center[2]), (up[0], up[1], up[2]), distance)
 

@@ -10,6 +10,7 @@ from mipmap_plugin.errors import MipmapPluginError, OutputExists
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.limits import is_out_of_memory
+from mipmap_plugin.models.zipped_folder import told
 from mipmap_plugin.scenes import load_scene
 from mipmap_plugin.wrap import state_path
 
@@ -26,13 +27,13 @@ def _attempt(job: Job, threads: int | None) -> Outcome:
         return job.own_work(threads) or _finished_before(job) or _adapt(job, threads)
     except OutputExists as error:
         # Another process may have finished the same job meanwhile.
-        return _finished_before(job) or Outcome(job, "failed", reason=str(error))
+        return _finished_before(job) or Outcome(job, "failed", reason=told(error))
     except (MipmapPluginError, OSError) as error:
-        return Outcome(job, "failed", reason=str(error))
+        return Outcome(job, "failed", reason=told(error))
     except Exception as error:
         if isinstance(error, (MemoryError, RuntimeError)) and is_out_of_memory(error):
             return Outcome(job, "failed", reason="out of memory; use a smaller scale, fewer views or fewer jobs at a time")
-        return Outcome(job, "failed", reason=f"{type(error).__name__}: {error}", trace=traceback.format_exc())
+        return Outcome(job, "failed", reason=f"{type(error).__name__}: {told(error)}", trace=traceback.format_exc())
 
 
 def _finished_before(job: Job) -> Outcome | None:

@@ -9,10 +9,10 @@ from pathlib import Path
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.report import Report, filters, versions
+from mipmap_plugin.adaptation.views import orbit_of
 from mipmap_plugin.effects import explain
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.models.base import effects_of
-from mipmap_plugin.scenes.trajectories import Orbit
 from mipmap_plugin.tiles.scene import TiledScene
 
 
@@ -30,7 +30,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         scale=scene.scale,
         base=scene.digest,
         inputs=scene.wrapped.asked,
-        orbit=Orbit.around(scene.base.places[:, :3]),
+        orbit=orbit_of(scene.wrapped.model, scene.base.places[:, :3]),
         settings=config,
         backend=scene.backend_note,
         views=f"{scene.views.note}, in {len(files)} tiles",
