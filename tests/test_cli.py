@@ -535,6 +535,7 @@ def test_list_says_where_names_come_from_and_what_is_wrong_with_one(run, tmp_pat
     place.mkdir()
     (place / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
     groups = ["viewers]\nspark = stranger:SPARK\nkiosk = stranger:KIOSK\n", "recipes]\nbrief = stranger:brief\n", "models]\nnpz = nobody:FAMILY\n"]
+    groups.append("upsamplers]\nkiosk = stranger:KIOSK\n")
     (place / "entry_points.txt").write_text("\n".join(f"[mipmap_plugin.{group}" for group in groups))
     (tmp_path / "stranger.py").write_text("brief = lambda scale, network: dict(steps=3)\nKIOSK = ('spark', 'unity')\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -544,6 +545,7 @@ def test_list_says_where_names_come_from_and_what_is_wrong_with_one(run, tmp_pat
     assert "kiosk: stranger:KIOSK of stranger 1.0\n" in out
     assert "spark: stranger:SPARK of stranger 1.0, not used: the name is taken by a built-in one; choose another\n" in out
     assert "npz: nobody:FAMILY of stranger 1.0, not used: 'npz' (nobody:FAMILY) cannot be loaded: ModuleNotFoundError" in out
+    assert "kiosk: stranger:KIOSK of stranger 1.0, not used: upsampler 'kiosk' is of type tuple; make it a function" in out
     listed = json.loads(run("list", "recipes", "--json")[1])
     assert listed["recipes"]["of packages"] == {"brief": "stranger:brief of stranger 1.0"}
 

@@ -34,10 +34,15 @@ def register_upsampler(name: str, target: Any, *, replace: bool = False) -> None
 def find_upsampler(name: str) -> Upsampler:
     """Return the upsampler of a registered name, or the network in a file. Raises SettingsError, CheckpointError and PluginError.
 
-    One that was registered raises PluginError where it fails, or returns anything else than an image of that size.
+    One that was registered raises PluginError where it is no function, and later where it fails, or returns anything else than an image of that size.
     """
     check_upsampler(name)
-    return partial(_enlarged, name, UPSAMPLERS.get(name)) if name in UPSAMPLERS.names() else Network(name)
+    if name not in UPSAMPLERS.names():
+        return Network(name)
+    upsampler = UPSAMPLERS.get(name)
+    if not callable(upsampler):
+        raise PluginError(f"upsampler {name!r} is of type {type(upsampler).__name__}; make it a function (image, size) -> image")
+    return partial(_enlarged, name, upsampler)
 
 
 def _enlarged(name: str, upsampler: Upsampler, image: Tensor, size: tuple[int, int]) -> Tensor:
