@@ -77,7 +77,8 @@ def mean_pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = 
         return mean
 
     found = torch.cat(in_chunks(of_chunk, means))
-    return torch.where(found.isfinite(), found, pixel_size(means, views, count))
+    unseen = ~found.isfinite()
+    return found.masked_scatter(unseen, pixel_size(means[unseen], views, count)) if unseen.any() else found
 
 
 def seen_pixel_size(means: Tensor, views: Sequence[Camera], near: float) -> Tensor:
