@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from ply_files import splat_columns, write, write_splats
 
-from mipmap_plugin.errors import CheckpointError, SettingsError
+from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
 from mipmap_plugin.formats.ply import read_header, read_ply, write_ply
 
 
@@ -23,6 +23,13 @@ def test_reads_every_encoding_alike(tmp_path, form, newline):
     assert (list(file.columns), file.comments, file.format) == (list(columns), ("made by hand",), form)
     for name, column in columns.items():
         np.testing.assert_array_equal(file.columns[name], column)
+
+
+def test_a_file_is_not_overwritten_unasked(tmp_path):
+    path = write_ply(tmp_path / "a.ply", {"x": np.zeros(1, np.float32)})
+    with pytest.raises(OutputExists):
+        write_ply(path, {"x": np.ones(1, np.float32)})
+    assert read_ply(path).columns["x"].tolist() == [0]
 
 
 def test_body_that_starts_with_a_newline_byte_after_a_cr_header(tmp_path):
