@@ -60,7 +60,7 @@ THOROUGH_OUT = dict(
 # Without the steps at x1, one view a step is too little to learn another way to draw, where each view shows few of the splats: for spark at x2 a
 # board that a tenth of the views shows gains 5 dB by 90 of them, 8 by 180, 11 by 360. Objects gain nothing, and take longer by each.
 DEFAULT_IN = dict(
-    conversion_steps=180, steps=200, crispness=0.25, compare_at="base", resize="fitting", patience=2, check_every=25, prune_every=1000, decay=0.3,
+    conversion_steps=180, steps=200, crispness=0.5, compare_at="base", resize="fitting", patience=2, check_every=25, prune_every=1000, decay=0.3,
     least_zoom_in=LEAST_ZOOM_IN, rates=LearningRates(opacities=0.02, networks=5e-4),
 )  # fmt: skip
 DEFAULT_UPSAMPLED = dict(

@@ -65,11 +65,11 @@ def test_crispness_reaches_the_start():
     assert (crisp["opacities"] >= plain["opacities"]).all() and (crisp["scales"] < plain["scales"]).any()
 
 
-@pytest.mark.parametrize(("scale", "steps", "size"), [(2, 0, mean_pixel_size), (2, 1, pixel_size), (1 / 2, 0, pixel_size)])
-def test_a_zoom_in_without_steps_is_formed_for_the_mean_of_the_views(scale, steps, size, monkeypatch):
+@pytest.mark.parametrize(("scale", "size"), [(2, mean_pixel_size), (1 / 2, pixel_size)])
+def test_a_zoom_in_is_formed_for_the_mean_of_the_views(scale, size, monkeypatch):
     forms = []
     monkeypatch.setattr(start, "closed_form", lambda *arguments: forms.append(arguments[-1]) or closed_form(*arguments))
-    adapted(scale=scale, steps=steps, extra_views=0)
+    adapted(scale=scale, extra_views=0)
     assert torch.equal(forms[0].pixel, size(tiny.model(COUNT).parameters()["means"], tiny.cameras()))
 
 

@@ -338,13 +338,6 @@ def test_harmful_steps_return_nothing_worse_than_the_base_and_the_start(monkeypa
         assert final >= max(base, first) - HARM_DB
 
 
-@pytest.mark.filterwarnings("ignore:the time budget")
-def test_a_zoom_in_without_time_for_steps_is_the_one_without_steps():
-    brief, without = (wrapped().adapt(4, extra_views=2, **settings) for settings in ({"time_budget_s": 1e-6}, {"steps": 0}))
-    assert brief.report.returned == "the closed form for the mean of the views"
-    torch.testing.assert_close(brief.model.parameters()["scales"], without.model.parameters()["scales"])
-
-
 def test_a_report_says_which_state_was_returned_and_why(monkeypatch):
     monkeypatch.setattr(Steering, "is_harmful", lambda self, psnr, rising: False)
     report = wrapped().adapt(SCALE, **HARMFUL).report

@@ -142,9 +142,7 @@ class Session:
         self.seconds["total"] = time.perf_counter() - began
         if self._takes_steps:
             run, ended_by = self._optimize(initial.copy(), resume, observe)
-            began = time.perf_counter()
-            curve, states = run.curve, states | ({} if run.steering.best_step else search.without_steps()) | run.states(initial)
-            self.seconds["total"] += time.perf_counter() - began
+            curve, states = run.curve, states | run.states(initial)
         return self._select(states, curve, ended_by)
 
     def _start_problem(self) -> StartProblem:

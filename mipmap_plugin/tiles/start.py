@@ -13,7 +13,7 @@ from mipmap_plugin.adaptation.optimization.validation import mean_db
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
 from mipmap_plugin.adaptation.start.candidates import start_name
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices, is_for_the_mean
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
 from mipmap_plugin.adaptation.start.pixel_size import enough_views, mean_pixel_size, pixel_size
@@ -100,7 +100,7 @@ class StartSearch:
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             pixel, found[1] = sizes(gaussians)
-            if is_for_the_mean(scene.scale, scene.config.steps):
+            if scene.scale > 1:
                 pixel = mean_pixel_size(gaussians.means, scene.views.adapted)
             form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, pixel=pixel)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)

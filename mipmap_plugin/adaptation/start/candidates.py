@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights, may_show, weighed, whole_weights
-from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices, is_for_the_mean
+from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import ROUNDS, matched_opacities
 from mipmap_plugin.adaptation.start.merging import Rounds, merge_down, merge_seen
 from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, mean_pixel_size, pixel_size, views_for
@@ -70,13 +70,11 @@ class StartSearch:
         self._problem, self._rounds = problem, Rounds()
         self._count: int | None = None  # of the views that show enough of the splats; None as long as it is not known
         self._of_base: tuple[Tensor, Tensor] | None = None  # the base's means and its pixel size
-        self._weights: Tensor | None = None  # blend weights of the base's splats, once known
         self._shown = torch.empty(0, dtype=torch.bool)  # of the base's splats (`may_show`), once blend weights are known
         self._least = 0.0  # fraction of the rows that stay
         self.notes: list[str] = []  # on what the views show of the base
         self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
         self._alike = draws_alike(problem.base_effects, problem.target)
-        self._for_the_mean = is_for_the_mean(problem.scale, problem.config.steps)
         # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
         keeps = self._alike and problem.config.steps > 0 and problem.scale <= 1
         unchanged = keeps or filter_suffices(problem.base_effects, problem.target)
@@ -93,7 +91,7 @@ class StartSearch:
             return base, problem.name
         with problem.phase("blend weights"):
             merges = config.merge_to < 1 and not base.traits.thins
-            weights = self._weights = self._base_weights(base) if self._matches_weights or merges or too_many else None
+            weights = self._base_weights(base) if self._matches_weights or merges or too_many else None
         if too_many:
             return self._candidate(weights, 0.0), start_name(self._forms, merged=True)
         with self._clock.timing("candidate"):
@@ -117,14 +115,6 @@ class StartSearch:
         if problem.coarse_base is None or problem.config.steps:
             return least
         return max(least, (formed.psnr + problem.quality(problem.coarse_base()).psnr) / 2)
-
-    @torch.no_grad()
-    def without_steps(self) -> dict[str, SplatModel]:
-        """What a zoom-in starts from that takes no steps, by its name, for one whose steps gained nothing; empty if it is what `best` found."""
-        if not self._forms or self._for_the_mean or not is_for_the_mean(self._problem.scale, 0):
-            return {}
-        self._for_the_mean = True
-        return {f"{start_name(True)} for the mean of the views": self._candidate(self._weights, 1.0)}
 
     def _merged(self, weights: Tensor | None, bounds: Bounds, coarse_bounds: Bounds | None) -> SplatModel | None:
         """What is merged furthest within bounds; None if merging costs too much.
@@ -204,9 +194,8 @@ class StartSearch:
         while rounds and not self._clock.allows("weights", rounds):
             rounds -= 1
         area_power = 1.0 if rounds else AREA_POWER
-        pixel = formed_for = self._pixel_size(gaussians.means)
-        if self._for_the_mean:
-            formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._count)
+        pixel = self._pixel_size(gaussians.means)
+        formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._count) if problem.scale > 1 else pixel
         settings = FormSettings(area_power, problem.config.crispness, self._count, formed_for, matched=weights is not None and rounds > 0)
         scales, opacities = closed_form(gaussians, problem.views, problem.scale, problem.base_effects, problem.target, settings)
         if weights is None or not rounds:

@@ -24,10 +24,10 @@ Without these, and before the steps of a zoom-out, it is left out.
 
 Opacities from areas are exact for splats that hide nothing; where blend weights are known they are matched afterwards (`matching`).
 
-The distance is that of the closest view, which saw the finest detail that training could resolve (as for the 3D filter of
-Mip-Splatting). At zoom-in it leaves holes in views from farther away, which steps close. Where none follow, splats are widened for the mean
-of the views (`mean_pixel_size`): +0.3 to 0.5 dB on photographs of lego and chair at x2 and x4, +2.6 dB on a capture of flowers at x2, and
-LPIPS is worse by 0.01, as with a lower crispness.
+At zoom-out the distance is that of the closest view, which saw the finest detail that training could resolve (as for the 3D filter of
+Mip-Splatting): elsewhere splats then stay too wide, and lower opacities make up for it. At zoom-in they would leave holes in views from
+farther away, so they are widened for the mean of the views (`mean_pixel_size`). Without steps this is worth 0.3 to 0.4 dB on photographs of
+lego and chair at x2 and x4, and 2.6 dB on a capture of flowers at x2.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import in_chunks
-from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size
+from mipmap_plugin.adaptation.start.pixel_size import enough_views, mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant, widened_to_filter
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects
@@ -65,7 +65,7 @@ class FormSettings:
     area_power: float = AREA_POWER  # zoom-out: opacity falls with this power of the area
     crispness: float = 0.0  # 0..1, zoom-in: the base's images are averages over a pixel (0), or over the whole filter (1)
     views: int | None = None  # how many are looked at, evenly spread, where it is known how much they show; None: `enough_views`
-    pixel: Tensor | None = None  # the size of a base pixel at each splat [N], in world units; None: `pixel_size`
+    pixel: Tensor | None = None  # the size of a base pixel at each splat [N], in world units; None: it is computed
     matched: bool = False  # whether opacities are matched afterwards (`matching`)
 
 
@@ -79,15 +79,11 @@ def closed_form(
     if filter_suffices(base, target) or (draws_alike(base, target) and not form.matched):
         return gaussians.scales, gaussians.opacities
     count = form.views or enough_views(gaussians.means, views)
-    pixels, some = pixel_size(gaussians.means, views, count) if form.pixel is None else form.pixel, every_nth(views, count)
+    size, some = pixel_size if scale <= 1 else mean_pixel_size, every_nth(views, count)
+    pixels = size(gaussians.means, views, count) if form.pixel is None else form.pixel
     formed = in_chunks(lambda chunk: _form(gaussians[chunk], pixels[chunk], some, scale, (base, target), form), gaussians.means)
     scales, opacities = zip(*formed, strict=True)
     return torch.cat(scales), torch.cat(opacities)
-
-
-def is_for_the_mean(scale: float, steps: int) -> bool:
-    """Whether splats are widened for the mean of the views (`mean_pixel_size`), and not for the closest."""
-    return scale > 1 and steps == 0
 
 
 def _form(
