@@ -52,7 +52,8 @@ class Registry:
         if not isinstance(name, str) or (name not in self._targets and name not in self._installed()):
             meant = difflib.get_close_matches(str(name).lower(), self.names(), 1)
             guess = f"; did you mean {meant[0]}?" if meant else ""
-            raise SettingsError(f"{self.group}: there is no {name!r}; choose from {', '.join(self.names())}{guess}")
+            kind = self.group.rpartition(".")[2].removesuffix("s")
+            raise SettingsError(f"there is no {kind} {name!r}; choose from {', '.join(self.names())}{guess}")
         target = self._targets[name] if name in self._targets else self._installed()[name]
         return load_target(name, target) if isinstance(target, str) else target
 

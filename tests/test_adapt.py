@@ -444,7 +444,7 @@ def test_settings_that_cannot_be_served_are_refused_in_a_sentence(settings, sent
 
 
 def test_an_unknown_backend_and_one_that_cannot(monkeypatch):
-    with pytest.raises(SettingsError, match="there is no 'gpu'; choose from"):
+    with pytest.raises(SettingsError, match="there is no backend 'gpu'; choose from"):
         wrap_model(tiny.model(5), cameras=tiny.cameras(), backend="gpu").adapt(4)
     monkeypatch.setattr(ReferenceBackend, "lacking", lambda self, needs: ["it has no gradients"] if needs.gradients else [])
     assert wrapped().adapt(4, recipe="instant").report.ended_by == "0 steps"  # which needs none

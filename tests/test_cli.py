@@ -435,7 +435,7 @@ def test_backends_check_prints_a_table_and_fails_if_a_case_does(run, monkeypatch
     outcomes += [Outcome(f"other {i}", 0.0, True, True, "it has no colors", skipped=True) for i in range(20)]
     code, _, err = run("backends", "--check", "reference")
     assert code == 2 and "passes 1 of 21 cases, too few to tell whether it is right; of the others it says: it has no colors\n" in err
-    refused(run("backends", "--check", "gpu"), "there is no 'gpu'")
+    refused(run("backends", "--check", "gpu"), "there is no backend 'gpu'")
     refused(run("backends", "--full"), "give --check NAME")
 
 
@@ -513,7 +513,7 @@ def test_a_damaged_state_ends_in_one_sentence(run, model_folder, tmp_path):
 
 
 def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
-    refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no 'gpu'; choose from", "reference")
+    refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no backend 'gpu'; choose from", "reference")
     refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no upsampler 'swin'; choose from bicubic, lanczos")
     refused(run("adapt", model_folder, "--scale", "4", "--steps", "-1"), "setting steps: Input should be greater than or equal to 0")
     refused(run("adapt", model_folder), "--scale is required; give --scale 1/4")

@@ -151,7 +151,7 @@ def test_cameras_of_each_scene(run, tmp_path):
         ("a.ply b.ply --scale 4 --report", "one checkpoint at a time"),
         ("a.ply b.ply --scale 4 --steps -1", "setting steps"),
         ("a.ply b.ply --scale 4 --viewer nobody", "nobody"),
-        ("a.ply b.ply --scale 4 --backend nobody", "there is no 'nobody'"),
+        ("a.ply b.ply --scale 4 --backend nobody", "there is no backend 'nobody'"),
         ("a.ply b.ply --scale 4 --shard 3", "--shard 3: give the part"),
         ("a.ply b.ply --scale 4 --shard 3/2", "--shard 3/2: there is no such part"),
         ("a.ply b.ply --scale 4 --jobs 0", "must be at least 1"),

@@ -45,7 +45,7 @@ def test_the_report_and_the_file_say_what_viewer_they_are_for(tmp_path):
 
 
 def test_an_unknown_viewer_is_told_the_known_ones():
-    with pytest.raises(SettingsError, match=r"there is no 'sparc'; choose from .*playcanvas.*spark"):
+    with pytest.raises(SettingsError, match=r"there is no viewer 'sparc'; choose from .*playcanvas.*spark"):
         wrapped().adapt(1 / 4, viewer="sparc")
 
 

@@ -648,7 +648,7 @@ def test_the_command_renders_as_in_a_viewer(tmp_path, capsys):
     assert list((tmp_path / "out").glob("*.png"))
     words[-1] = "superspalt"
     assert cli.main([*words, "--overwrite"]) == 2
-    assert "there is no 'superspalt'; choose from" in capsys.readouterr().err
+    assert "there is no viewer 'superspalt'; choose from" in capsys.readouterr().err
 
 
 def test_an_option_that_is_not_there_is_refused():

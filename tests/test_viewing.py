@@ -486,7 +486,7 @@ def test_a_viewer_is_listed_once_under_the_name_that_was_asked_for(base):
     (["--port", "70000"], "port: must be from 0 to 65535"),
     (["--output", __file__], "give --output a folder"),
     (["--viewer", "portable"], "portable"),
-    (["--viewer", "nonsense"], "there is no 'nonsense'"),
+    (["--viewer", "nonsense"], "there is no viewer 'nonsense'"),
     (["--threads", "0"], "threads must be at least 1"),
 ])  # fmt: skip
 def test_wrong_options_are_told(tmp_path, capsys, options, message):

@@ -72,7 +72,7 @@ def test_a_quiet_command_prints_json(base, capsys):
 def test_a_quiet_command_prints_what_is_wrong(base, capsys):
     assert main(["adapt", base, "--quiet", "--scale", "1/2", "--viewer", "nobody"]) == 2
     said = capsys.readouterr()
-    assert said.out == "" and "there is no 'nobody'" in said.err
+    assert said.out == "" and "there is no viewer 'nobody'" in said.err
 
 
 def test_a_quiet_command_shows_no_progress(monkeypatch):
