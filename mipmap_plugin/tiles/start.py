@@ -16,7 +16,7 @@ from mipmap_plugin.adaptation.start.candidates import start_name
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.matching import matched_opacities
 from mipmap_plugin.adaptation.start.merging import merge_seen
-from mipmap_plugin.adaptation.start.pixel_size import enough_views, mean_pixel_size, pixel_size
+from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size
 from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
@@ -100,9 +100,7 @@ class StartSearch:
 
         def formed(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
             pixel, found[1] = sizes(gaussians)
-            if scene.scale > 1:
-                pixel = mean_pixel_size(gaussians.means, scene.views.adapted)
-            form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, pixel=pixel)
+            form = FormSettings(1.0 if self.matches else AREA_POWER, scene.config.crispness, pixel=pixel if scene.scale <= 1 else None)
             return closed_form(gaussians, scene.views.adapted, scene.scale, scene.base_effects, scene.target, form)
 
         if fraction < 1:

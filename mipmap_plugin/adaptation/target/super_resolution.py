@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.disk_cache import cached, fingerprint
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, install
+from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, brief, install
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
@@ -67,8 +67,7 @@ def _load(path: Path) -> Any:
         with _quietly():
             network = spandrel.ModelLoader().load_from_state_dict(weights)
     except (spandrel.UnsupportedModelError, RuntimeError, AttributeError, KeyError, TypeError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
-        raise CheckpointError(f"{path}: not a network that spandrel supports ({reason})") from error
+        raise CheckpointError(f"{path}: not a network that spandrel supports ({brief(error)})") from error
     if not isinstance(network, spandrel.ImageModelDescriptor) or (network.input_channels, network.output_channels) != (3, 3):
         raise SettingsError(f"{path}: {network.architecture.name} does not turn one RGB image into another; give a super-resolution network")
     if network.scale < 2:
