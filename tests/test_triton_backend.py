@@ -60,7 +60,7 @@ def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeyp
         ptx = compile_for(capability, compositing_back.composite_back_kernel, sizes.BACK_WARPS, **back)
         assert ("atom" in ptx or "red.global" in ptx) != in_order
     compile_for(capability, compositing_back.gather_kernel, 1, ROWS=32)
-    compile_for(capability, weighing.weigh_kernel, sizes.BACK_WARPS, TILE=tile)
+    compile_for(capability, weighing.weigh_kernel, sizes.BACK_WARPS, TILE=tile, BATCH=sizes.BATCH)
     compile_for(capability, adam.adam_kernel, BANDS=4, BLOCK=sizes.NUMBERS_MOVED)
 
 

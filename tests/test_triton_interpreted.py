@@ -137,8 +137,9 @@ def test_a_tile_lists_its_visible_splats_front_to_back_and_few_others():
     g, view = gaussians(150, dtype=torch.float32), camera(64, 48)
     splats = drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None)
     drawn = drawing.project(splats, [(view, Effects(1))])
-    x, y, along, shear, across, log2_opacity = drawn.records[:, :6].T[:, :, None, None]
-    assert drawn.records.shape[1] == WIDTH
+    assert drawn.listed.shape[1] == WIDTH
+    records = torch.zeros(150, WIDTH).index_copy(0, drawn.bins.splat_ids.long(), drawn.listed)
+    x, y, along, shear, across, log2_opacity = records[:, :6].T[:, :, None, None]
     ys, xs = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     u = xs - x - shear * (ys - y)
     alpha = torch.exp2(along * (ys - y) ** 2 + across * u**2 + log2_opacity)

@@ -43,24 +43,27 @@ def largest(values):
 
 
 @triton.jit
-def splat_at(records, splat_ids, slot, end):
-    """The splat in a slot and a pointer to its record. Past the end those of the last slot, which the caller has to ignore."""
-    splat = tl.load(splat_ids + tl.minimum(slot, end - 1)).to(tl.int64)
-    return splat, records + splat * RECORD
+def record_at(records, slot, end):
+    """The nine numbers in a slot; past the `end` those of a splat that is not there."""
+    row, valid = records + slot * RECORD, slot < end
+    x, y, along, shear = tl.load(row, valid, 0.0), tl.load(row + 1, valid, 0.0), tl.load(row + 2, valid, 0.0), tl.load(row + 3, valid, 0.0)
+    across, log2_opacity = tl.load(row + 4, valid, 0.0), tl.load(row + 5, valid, float("-inf"))
+    red, green, blue = tl.load(row + 6, valid, 0.0), tl.load(row + 7, valid, 0.0), tl.load(row + 8, valid, 0.0)
+    return x, y, along, shear, across, log2_opacity, red, green, blue
 
 
 @triton.jit
-def alpha_at(row, valid, px, py, least):
-    """For the record at `row` and the pixels [P]: dy, u = dx - shear · dy, and alpha before and after its cut-offs."""
-    dy = py - tl.load(row + 1)
-    u = px - tl.load(row) - tl.load(row + 3) * dy
-    log2_opacity = tl.where(valid, tl.load(row + 5), float("-inf"))
-    raw = tl.exp2(tl.load(row + 2) * dy * dy + tl.load(row + 4) * u * u + log2_opacity)
+def alpha_at(record, px, py, least):
+    """For the pixels [P]: dy, u = dx - shear · dy, and alpha before and after its cut-offs."""
+    x, y, along, shear, across, log2_opacity, _red, _green, _blue = record
+    dy = py - y
+    u = px - x - shear * dy
+    raw = tl.exp2(along * dy * dy + across * u * u + log2_opacity)
     return dy, u, raw, tl.where(raw >= least, tl.minimum(raw, MAX_ALPHA), 0.0)
 
 
 @triton.jit(do_not_specialize=["most_pixels"])
-def composite_kernel(records, splat_ids, tile_offsets, shots, images, transmittances, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr):
+def composite_kernel(records, tile_offsets, shots, images, transmittances, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr):
     """Composite one tile of one view into `images` and `transmittances`."""
     view = shots + tl.program_id(1) * NUMBERS
     px, py, at, inside = pixels(view, most_pixels, TILE)
@@ -71,13 +74,11 @@ def composite_kernel(records, splat_ids, tile_offsets, shots, images, transmitta
     red, green, blue = tl.zeros_like(running), tl.zeros_like(running), tl.zeros_like(running)
     while (slot < end) & (largest(running) >= stop.to(tl.int32, bitcast=True)):
         for _ in tl.static_range(BATCH):
-            _, row = splat_at(records, splat_ids, slot, end)
-            _, _, _, alpha = alpha_at(row, slot < end, px, py, least)
+            record = record_at(records, slot, end)
+            _dy, _u, _raw, alpha = alpha_at(record, px, py, least)
             behind = running * (1 - alpha)
             weight = tl.where(behind >= stop, running * alpha, 0.0)
-            red += weight * tl.load(row + 6)
-            green += weight * tl.load(row + 7)
-            blue += weight * tl.load(row + 8)
+            red, green, blue = red + weight * record[6], green + weight * record[7], blue + weight * record[8]
             transmittance = tl.where(behind >= stop, behind, transmittance)
             running = behind
             slot += 1

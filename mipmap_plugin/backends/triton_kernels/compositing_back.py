@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
-from mipmap_plugin.backends.triton_kernels.compositing import MAX_ALPHA, alpha_at, largest, pixels, slots, splat_at
+from mipmap_plugin.backends.triton_kernels.compositing import MAX_ALPHA, alpha_at, largest, pixels, record_at, slots
 from mipmap_plugin.backends.triton_kernels.records import LN_2, RECORD
 from mipmap_plugin.backends.triton_kernels.vectors import load3
 
@@ -28,46 +28,53 @@ def nine(a, b, c, d, e, f, g, h, i):
 
 @triton.jit(do_not_specialize=["most_pixels"])
 def composite_back_kernel(
-    records, splat_ids, tile_offsets, places, shots, images, transmittances, d_images, d_alphas, d_records, most_pixels,
+    records, tile_offsets, splat_ids, places, shots, images, transmittances, d_images, d_alphas, d_records, most_pixels,
     TILE: tl.constexpr, BATCH: tl.constexpr, DETERMINISTIC: tl.constexpr,
 ):  # fmt: skip
-    """Add the gradients of one tile's pixels to `d_records`."""
+    """Add the gradients of one tile's pixels to `d_records`, which are in the order of the splats; the `records` are in that of the lists."""
     view = shots + tl.program_id(1) * NUMBERS
     px, py, at, inside = pixels(view, most_pixels, TILE)
     slot, end = slots(tile_offsets)
     least, stop = tl.load(view + MIN_ALPHA), tl.load(view + MIN_TRANSMITTANCE)
     running = tl.where(inside, 1.0, 0.0)
     d_red, d_green, d_blue = load3(d_images + 3 * at, inside)
-    red, green, blue = load3(images + 3 * at, inside)
+    shown = load3(images + 3 * at, inside)
     # What the remaining splats and the background contribute to the loss. The gradient of alpha acts like a color of the background.
-    rest = d_red * red + d_green * green + d_blue * blue - tl.load(d_alphas + at, inside, 0.0) * tl.load(transmittances + at, inside, 0.0)
+    rest = d_red * shown[0] + d_green * shown[1] + d_blue * shown[2] - tl.load(d_alphas + at, inside, 0.0) * tl.load(transmittances + at, inside, 0.0)
     while (slot < end) & (largest(running) >= stop.to(tl.int32, bitcast=True)):
-        for _ in tl.static_range(BATCH):
-            splat, row = splat_at(records, splat_ids, slot, end)
-            dy, u, raw, alpha = alpha_at(row, slot < end, px, py, least)
+        batch, heaviest = (), tl.zeros_like(running)
+        for nth in tl.static_range(BATCH):
+            record = record_at(records, slot + nth, end)
+            dy, u, raw, alpha = alpha_at(record, px, py, least)
             behind = running * (1 - alpha)
             weight = tl.where(behind >= stop, running * alpha, 0.0)
-            if largest(weight) > 0:
-                d_weight = d_red * tl.load(row + 6) + d_green * tl.load(row + 7) + d_blue * tl.load(row + 8)
+            batch += ((record, dy, u, raw, alpha, weight),)
+            heaviest, running = tl.maximum(heaviest, weight), behind
+        if largest(heaviest) > 0:
+            for nth in tl.static_range(BATCH):
+                record, dy, u, raw, alpha, weight = batch[nth]
+                _x, _y, along, shear, across, _opacity, red, green, blue = record
+                d_weight = d_red * red + d_green * green + d_blue * blue
                 rest -= weight * d_weight
                 # The gradient of ln alpha is alpha · d_alpha, and 0 where alpha was cut off or the pixel had stopped.
                 root = tl.rsqrt(1 - alpha)  # a division takes several instructions more
                 d_log = weight * d_weight - alpha * rest * (root * root)
                 d_log = tl.where((weight > 0) & (raw <= MAX_ALPHA), d_log, 0.0)
                 d_log_u, d_log_y = d_log * u, d_log * dy
-                along, shear, across = tl.load(row + 2) * LN_2, tl.load(row + 3), tl.load(row + 4) * LN_2
-                d_u = -2 * across * tl.sum(d_log_u, axis=0)
+                along, across = -2 * LN_2 * along, -2 * LN_2 * across
+                d_u = across * tl.sum(d_log_u, axis=0)
                 field, sums = nine(
-                    d_u, -2 * along * tl.sum(d_log_y, axis=0) - shear * d_u, LN_2 * tl.sum(d_log_y * dy, axis=0),
-                    -2 * across * tl.sum(d_log_u * dy, axis=0), LN_2 * tl.sum(d_log_u * u, axis=0), LN_2 * tl.sum(d_log, axis=0),
+                    d_u, along * tl.sum(d_log_y, axis=0) - shear * d_u, LN_2 * tl.sum(d_log_y * dy, axis=0),
+                    across * tl.sum(d_log_u * dy, axis=0), LN_2 * tl.sum(d_log_u * u, axis=0), LN_2 * tl.sum(d_log, axis=0),
                     tl.sum(weight * d_red, axis=0), tl.sum(weight * d_green, axis=0), tl.sum(weight * d_blue, axis=0),
                 )  # fmt: skip
+                mask = (field < RECORD) & (slot + nth < end)
                 if DETERMINISTIC:
-                    tl.store(d_records + tl.load(places + slot) * RECORD + field, sums, field < RECORD)
+                    tl.store(d_records + tl.load(places + slot + nth, slot + nth < end, 0) * RECORD + field, sums, mask)
                 else:
-                    tl.atomic_add(d_records + splat * RECORD + field, sums, field < RECORD, sem="relaxed")
-            running = behind
-            slot += 1
+                    splat = tl.load(splat_ids + slot + nth, slot + nth < end, 0).to(tl.int64)
+                    tl.atomic_add(d_records + splat * RECORD + field, sums, mask, sem="relaxed")
+        slot += BATCH
 
 
 @triton.jit

@@ -70,7 +70,7 @@ class Projected:
     constants: dict[str, int | bool]
     tile: int  # px
     views: Tensor  # [V, numbers of `views.py`]
-    records: Tensor  # [V · N, 9]
+    listed: Tensor  # [pairs, 9], the records in the order of the lists: a program reads them one after the other
     depths: Tensor  # [V · N], infinite where a splat is not drawn
     bins: Bins
 
@@ -85,9 +85,9 @@ class Projected:
         return max(camera.width * camera.height for camera, _ in self.shots)
 
     @property
-    def lists(self) -> tuple[Tensor, Tensor, Tensor]:
+    def lists(self) -> tuple[Tensor, Tensor]:
         """The first arguments of what composites."""
-        return self.records, self.bins.splat_ids, self.bins.tile_offsets
+        return self.listed, self.bins.tile_offsets
 
 
 class Drawing(NamedTuple):
@@ -128,7 +128,8 @@ def project(splats: KernelSplats, shots: Shots) -> Projected:
     if rows:
         grid = triton.cdiv(len(means), SPLATS), len(shots)
         project_kernel[grid](*splats.arrays, views, records, depths, boxes, len(means), TILE=tile, **constants)
-    return Projected(shots, constants, tile, views, records, depths, bin_splats(records, depths, boxes, views, most_tiles(shots, tile), tile))
+    bins = bin_splats(records, depths, boxes, views, most_tiles(shots, tile), tile)
+    return Projected(shots, constants, tile, views, records[bins.splat_ids], depths, bins)
 
 
 def draw(splats: KernelSplats, shots: Shots) -> Drawing:
@@ -145,10 +146,11 @@ def draw(splats: KernelSplats, shots: Shots) -> Drawing:
 def draw_back(drawing: Drawing, d_images: Tensor, d_alphas: Tensor, *, deterministic: bool) -> Tensor:
     """Gradients of the records [V · N, 9] from those of the images [V, pixels, 3] and alphas [V, pixels]."""
     projected, bins = drawing.projected, drawing.projected.bins
-    d_records = torch.zeros_like(projected.records)
+    d_records = projected.listed.new_zeros(len(projected.depths), RECORD)
     target = d_records.new_zeros(len(bins.splat_ids), RECORD) if deterministic else d_records
     composite_back_kernel[projected.grid](
-        *projected.lists, bins.places, projected.views, drawing.images, drawing.transmittances, d_images, d_alphas, target, projected.most_pixels,
+        *projected.lists, bins.splat_ids, bins.places, projected.views, drawing.images, drawing.transmittances, d_images, d_alphas, target,
+        projected.most_pixels,
         TILE=projected.tile, BATCH=BACK_BATCH, DETERMINISTIC=deterministic, num_warps=BACK_WARPS,
     )  # fmt: skip
     if deterministic and len(d_records):
@@ -172,5 +174,8 @@ def weigh(splats: KernelSplats, shots: Shots) -> Tensor:
     """The sum of each splat's blend weights over the images, [V · N]."""
     projected = project(splats, shots)
     sums = torch.zeros_like(projected.depths)
-    weigh_kernel[projected.grid](*projected.lists, projected.views, sums, projected.most_pixels, TILE=projected.tile, num_warps=BACK_WARPS)
+    weigh_kernel[projected.grid](
+        *projected.lists, projected.bins.splat_ids, projected.views, sums, projected.most_pixels,
+        TILE=projected.tile, BATCH=BATCH, num_warps=BACK_WARPS,
+    )  # fmt: skip
     return sums

@@ -7,7 +7,7 @@ import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
 from mipmap_plugin.backends.triton_kernels.harmonics import color
-from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD, store_nine
+from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD, store_six
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes, from_covariance, load_quat
 from mipmap_plugin.backends.triton_kernels.vectors import finite, load3
 from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_camera
@@ -66,6 +66,13 @@ def direction(world):
 
 
 @triton.jit
+def by_channel(at, mask):
+    """For the splats `at` [B] their numbers, their channels and the mask in a lane per channel [B, 4], of which the fourth is none."""
+    channel = tl.arange(0, 4)[None, :]
+    return at[:, None] + 0 * channel, channel, mask[:, None] & (channel < 3)
+
+
+@triton.jit
 def bounds(center, extent, tiles, TILE: tl.constexpr):
     """The first tile that [center ± extent] px reaches, and their number; as clamped floats, because integers could overflow."""
     first = tl.minimum(tl.maximum(tl.floor((center - extent) / TILE), 0.0), tiles)
@@ -83,7 +90,7 @@ def project_kernel(
     at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     inside = at < count
     row = tl.program_id(1).to(tl.int64) * count + at
-    world, eye, safe = relative_position(view, means, at, inside)
+    _world, eye, safe = relative_position(view, means, at, inside)
     ahead = inside & (eye[2] > tl.load(view + NEAR))
     xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, ahead, HAS_COVARIANCES, RAW)
     eps2d = tl.load(view + EPS2D)
@@ -99,11 +106,12 @@ def project_kernel(
     reach = tl.sqrt(tl.maximum(log2_opacity - tl.load(view + LOG2_MIN_ALPHA), 0.0) * (2 * LN_2))
     reach_x, reach_y = reach * tl.sqrt(xx), reach * tl.sqrt(yy)
     drawn &= (x + reach_x > 0) & (x - reach_x < tl.load(view + WIDTH)) & (y + reach_y > 0) & (y - reach_y < tl.load(view + HEIGHT))
-    dx, dy, dz, _ = direction(world)
-    red, green, blue = color(sh + at * (3 * BANDS), dx, dy, dz, drawn, DEGREE)
-    drawn &= finite(red) & finite(green) & finite(blue)
-    red, green, blue = tl.maximum(red + 0.5, 0.0), tl.maximum(green + 0.5, 0.0), tl.maximum(blue + 0.5, 0.0)
-    store_nine(records + row * RECORD, x, y, (-1 / yy) * HALF_LOG2_E, shear, (-1 / across) * HALF_LOG2_E, log2_opacity, red, green, blue, drawn)
+    rows, channel, shown = by_channel(at, drawn)
+    dx, dy, dz, _ = direction(from_eye(view, *load3(means + 3 * rows, shown)))
+    value = color(sh + rows * (3 * BANDS) + channel, dx, dy, dz, shown, DEGREE)
+    drawn &= tl.min(finite(value).to(tl.int32), axis=1) > 0
+    tl.store(records + (tl.program_id(1).to(tl.int64) * count + rows) * RECORD + 6 + channel, tl.maximum(value + 0.5, 0.0), shown)
+    store_six(records + row * RECORD, x, y, (-1 / yy) * HALF_LOG2_E, shear, (-1 / across) * HALF_LOG2_E, log2_opacity, drawn)
     tl.store(depths + row, tl.where(drawn, eye[2], float("inf")), inside)
     first_x, wide_x = bounds(x, reach_x, tl.load(view + TILES_X), TILE)
     first_y, wide_y = bounds(y, reach_y, tl.load(view + TILES_Y), TILE)
