@@ -91,10 +91,12 @@ class Device(TorchDispatchMode):
 
 
 class Factories(TorchFunctionMode):
-    """Tensors from numbers, and indices from lists and tuples, which torch makes in one go where no mode looks."""
+    """Tensors from numbers, and indices from lists and tuples, which torch makes in one go where no mode looks; and lists from tensors."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
+        if func is torch.Tensor.tolist:
+            args = (args[0].cpu(),)
         if func is torch.Tensor.new_tensor and isinstance(args[0], Pretended):
             return torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype)).to(DEVICE)
         if func in (torch.Tensor.__getitem__, torch.Tensor.__setitem__) and isinstance(args[1], tuple):

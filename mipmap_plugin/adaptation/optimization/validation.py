@@ -94,12 +94,13 @@ class Validation:
         shared = model.gaussians(views[0]) if views and model.traits.same_for_all_views else None
         threads = max_threads(model.parameters()["means"], views[0].zoomed(self.scale)) if views else 1
 
-        def error(draw: Callable[[Camera], Tensor], view: Camera) -> float:
+        def error(draw: Callable[[Camera], Tensor], view: Camera) -> Tensor:
             image = draw(view.zoomed(self.scale)).clamp(0, 1)
-            return float(difference_from(self.truth(view), image, self.resize).square().mean())
+            return difference_from(self.truth(view), image, self.resize).square().mean()
 
         draws = [_drawing(render, model, shared) for render in (self.render, *self.further_renders)]
-        return [list(side_by_side(partial(error, draw), views, threads)) for draw in draws]
+        errors = [list(side_by_side(partial(error, draw), views, threads)) for draw in draws]
+        return [torch.stack(each).tolist() if each else [] for each in errors]  # a GPU is waited for once, and not for each view
 
     def steer(self, model: SplatModel) -> float:
         """The visible quality (dB) on the steering views."""
