@@ -60,6 +60,7 @@ class Device(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.waits: Counter[str] = Counter()  # by the line of the package that asks
+        self.operations = 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
@@ -72,6 +73,7 @@ class Device(TorchDispatchMode):
         goes_there = there if target is None else torch.device(target).type == DEVICE
         if not there and not goes_there:
             return func(*args, **kwargs)
+        self.operations += 1
         if func.overloadpacket.__name__ in CPU_ONLY:
             raise RuntimeError(f"{func}: torch has it for processors alone")
         if there and func not in MOVES | TAKES_INDICES and any(not isinstance(tensor, Pretended) and tensor.dim() for tensor in tensors):

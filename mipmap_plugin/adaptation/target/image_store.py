@@ -21,12 +21,12 @@ LEFT_FREE = 0.5
 
 def in_16_bits(image: Tensor) -> Tensor:
     """An image of -2..2 as it is stored."""
-    return (image * STEPS).round().clamp(-MOST, MOST).to(torch.int16)
+    return (image * STEPS).round_().clamp_(-MOST, MOST).to(torch.int16)
 
 
-def from_16_bits(stored: Tensor) -> Tensor:
+def from_16_bits(stored: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """An image that was stored, of floats or whole numbers."""
-    return stored / STEPS
+    return stored / torch.tensor(STEPS, dtype=dtype)  # on the processor: a number to a GPU, whose type the image gets in the same operation
 
 
 class ImageStore:
@@ -44,7 +44,7 @@ class ImageStore:
         if stored is None:
             stored = in_16_bits(make())
             self._keep(key, stored)
-        return from_16_bits(stored.to(self._like, non_blocking=True))
+        return from_16_bits(stored.to(self._like.device, non_blocking=True), self._like.dtype)
 
     def _keep(self, key: Hashable, image: Tensor) -> None:
         if self._bytes + image.nbytes <= self._limit:
