@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.parallel import in_batches, max_threads
+from mipmap_plugin.adaptation.parallel import in_batches, max_threads, together
 from mipmap_plugin.adaptation.start.closed_form import filter_variance
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
@@ -29,25 +29,26 @@ UNSEEN = 1e-3
 def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Tensor:
     """The blend weight of each splat, summed over the pixels of a view and averaged over `views`: [N] in pixels; 0 for an invisible splat."""
     total = torch.zeros_like(gaussians.opacities)
-    for each in _of_views(gaussians, views, backend, effects):
-        total += each
+    for some in _of_views(gaussians, views, backend, effects):
+        total += some.sum(0)
     return total / len(views)
 
 
 def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> tuple[Tensor, float]:
     """`blend_weights`, and the fraction of the splats that a view shows, mean over `views`; what is hidden behind others does not count."""
     total, shown = (torch.zeros_like(gaussians.opacities) for _ in range(2))
-    for each in _of_views(gaussians, views, backend, effects):
-        total += each
-        shown += each > SHOWN
+    for some in _of_views(gaussians, views, backend, effects):
+        total += some.sum(0)
+        shown += (some > SHOWN).sum(0)
     return total / len(views), float(shown.mean()) / len(views)
 
 
 def _of_views(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Iterator[Tensor]:
-    """The sum of each splat's blend weights over each view, [N].
+    """The sum of each splat's blend weights over each view, [V, N], of some views after the others.
 
     An image is linear in the splats' colors, so that the weights are the gradient of the image's sum with respect to the colors. Works
-    with any backend that has gradients, and faster with one that computes them itself (`Backend.blend_weights`).
+    with any backend that has gradients, and faster with one that computes them itself, for a view (`Backend.blend_weights`) or for several
+    (`Backend.weigh_views`).
     """
     plain = replace(effects, sh_degree=0, settings=effects.settings.without_color_rounding())
     weigh = getattr(backend, "blend_weights", None)
@@ -55,9 +56,12 @@ def _of_views(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, e
 
     def weights(view: Camera) -> Tensor:
         known: Tensor | None = None if weigh is None else weigh(gray, view, plain)
-        return _color_gradient(gray, view, backend, plain) if known is None else known
+        return (_color_gradient(gray, view, backend, plain) if known is None else known)[None]
 
-    return side_by_side(weights, views, max_threads(gaussians.means, views[0]))
+    if (weigh_views := getattr(backend, "weigh_views", None)) is None:
+        return side_by_side(weights, views, max_threads(gaussians.means, views[0]))
+    size = together(gaussians.means, views)
+    return (weigh_views(gray, [(view, plain) for view in views[start : start + size]]) for start in range(0, len(views), size))
 
 
 def whole_weights(gaussians: Gaussians, pixel: Tensor, views: Sequence[Camera], base: Effects, scale: float) -> Tensor:
