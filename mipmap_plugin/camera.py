@@ -123,7 +123,7 @@ class Camera:
         if determinant < 0:
             slip = "as when one axis alone is flipped between OpenGL and OpenCV; flip y and z together"
             raise SettingsError(f"camera {self.name!r}: viewmat mirrors the scene (determinant {determinant:.3g}), {slip}")
-        scale = determinant ** (1 / 3)
+        scale: float = determinant ** (1 / 3)
         off = max(abs(sum(x * y for x, y in zip(*pair, strict=True)) / scale**2 - (pair[0] is pair[1])) for pair in product(axes, axes))
         if not off <= POSE_TOLERANCE:
             advice = "give a rotation and a translation, and the intrinsics as fx, fy, cx and cy"

@@ -17,7 +17,7 @@ Result = TypeVar("Result")
 # Rows that a processor computes together, in bounded memory.
 CHUNK = 1 << 14
 
-# Rows times views that are computed together elsewhere: each takes some hundred bytes.
+# Rows times views that are computed together elsewhere, and pixels of views that are drawn together: each takes some hundred bytes.
 ROWS_OF_VIEWS = 1 << 22
 
 # Splats plus pixels of a view. Larger views are rendered one after the other: the kernels' own threads are as fast there, and only one view
@@ -41,6 +41,16 @@ def max_threads(means: Tensor, camera: Camera) -> int:
 def views_at_once(cameras: Iterable[Camera]) -> int:
     """The number of views that a step draws in one call, if none is larger than the largest of `cameras`."""
     return max(1, min(VIEWS_AT_ONCE, PIXELS_AT_ONCE // max(camera.width * camera.height for camera in cameras)))
+
+
+def together(means: Tensor, cameras: Iterable[Camera]) -> int:
+    """The number of views to draw in one call where nothing else is done meanwhile, if none is larger than the largest of `cameras`.
+
+    On a processor one: there it takes no less time, and threads draw others at the same time (`max_threads`).
+    """
+    if means.device.type == "cpu":
+        return 1
+    return max(1, ROWS_OF_VIEWS // max(len(means), *(camera.width * camera.height for camera in cameras)))
 
 
 def large_for_torch(means: Tensor) -> AbstractContextManager[None]:
