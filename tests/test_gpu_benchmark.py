@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names
 
 import gpu  # noqa: E402
 import gpu_adaptation  # noqa: E402
+import gpu_conformance  # noqa: E402
 from gpu_adaptation import Adaptation, Base  # noqa: E402
 from gpu_conformance import Checked, check_all  # noqa: E402
 from gpu_profile import Profile, kernels  # noqa: E402
@@ -106,6 +108,14 @@ def test_wrong_cases_are_named():
 def test_hard_cases_are_shared_among_processes():
     (checked,) = check_all(["reference"], "cpu", 2, ("one-splat", "sh-degree-0"))
     assert checked == Checked("reference", 2, 0, {})
+
+
+def test_a_case_that_breaks_its_process_fails_alone(monkeypatch):
+    wrong = Outcome("b", 0.0, True, False, "AcceleratorError: CUDA error: an illegal memory access was encountered")
+    monkeypatch.setattr(gpu_conformance, "check_backend", lambda backend, cases, device: [replace(wrong, case=case) for case in cases])
+    monkeypatch.setattr(gpu_conformance, "_broken", False)
+    assert [outcome.case for outcome in gpu_conformance._outcomes("reference", "cpu", ["one-splat", "sh-degree-0"])] == ["one-splat"]
+    assert gpu_conformance._outcomes("reference", "cpu", ["sh-degree-0"]) == []
 
 
 def test_the_report_and_its_files_are_named_after_the_device(tmp_path):

@@ -144,6 +144,7 @@ def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
         InriaBackend().render(gaussians(2, dtype=torch.float32), WIDE, Effects(1))
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available() or bool(InriaBackend().lacking(USUAL)), reason="there is no GPU, or no rasterizer for it")
 def test_the_rasterizer_itself_draws_the_reference():
     """Within what its footprint leaves out, a rim of at most exp(-9/2) of an opacity; so without the suite's tolerances."""
