@@ -130,16 +130,22 @@ def test_adapting_by_command_writes_the_same_file(backend, tmp_path):
         "evaluate BASE --images SCENE --scale 1/2 --steps 4 --output OUT.json --no-report",
         "tradeoff BASE --scale 1/2 --steps 4 --output OUT --no-picture --repeats 1",
         "levels BASE --viewer classic --output OUT --coarsest 1/4 --steps 4",
-        "adapt BASE --scale 1/2 --steps 4 --tiles 2 --output OUT",
         "adapt BASE --scale 1/2 --scale 2 --steps 4 --viewer classic --viewer antialiased --output OUT",
     ],
-    ids=["render", "evaluate", "tradeoff", "levels", "tiles", "many"],
+    ids=["render", "evaluate", "tradeoff", "levels", "many"],
 )
 def test_every_command_ends_well(words, backend, tmp_path):
     named = {"BASE": tiny.folder(tmp_path / "base"), "SCENE": tiny.scene(tmp_path / "scene")}
     named |= {name: tmp_path / name.lower() for name in ("OUT", "OUT.json")}
     assert main([*(str(named.get(word, word)) for word in words.split()), "--backend", backend]) == 0
     assert list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize("backend", [name for name in BACKENDS if name != "cpu"])
+def test_tiles_which_need_the_processor_are_refused(backend, tmp_path, capsys):
+    base = tiny.folder(tmp_path / "base")
+    assert main(["adapt", str(base), "--scale", "1/2", "--tiles", "2", "--output", str(tmp_path / "out"), "--backend", backend]) == 2
+    assert "it runs on cuda, not on cpu" in capsys.readouterr().err
 
 
 def test_the_demo_runs_there(tmp_path, capsys):
