@@ -137,9 +137,9 @@ def adaptations(request: Request, data: Path, bases: Sequence[Base] = BASES, **s
 
 
 def served(wanted: Sequence[str], device: str) -> tuple[list[str], dict[str, str]]:
-    """The backends that can be measured on `device`, and why the others cannot."""
+    """The backends that can be measured on `device`, and why the others cannot; the reference, which is slow, only where it is wanted."""
     found = survey(Needs(device, torch.float32, gradients=True, sh_degree=3, screen_filter="classic"))
-    selected = {name: found.get(name, ["there is no such backend"]) for name in wanted or found}
+    selected = {name: found.get(name, ["there is no such backend"]) for name in wanted or [name for name in found if name != "reference"]}
     return [name for name, lacks in selected.items() if not lacks], {name: "; ".join(lacks) for name, lacks in selected.items() if lacks}
 
 

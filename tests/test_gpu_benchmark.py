@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import pretended
 import pytest
 import tiny
 import torch
@@ -27,6 +28,7 @@ from gpu_tables import Failure, Speed, report, speed_table  # noqa: E402
 from gpu_timing import Clock, copied_per_second  # noqa: E402
 from gpu_views import Shots, Views, measure, raw_of  # noqa: E402
 
+from mipmap_plugin import load_model  # noqa: E402
 from mipmap_plugin.backends.conformance import Outcome  # noqa: E402
 
 OURS = Speed("triton", "classic", 1_000_000, 1920, 1080, 1.0, 4.0, 100.0, 10**9, 2 * 10**9)
@@ -71,14 +73,14 @@ def test_the_least_that_moves_is_counted():
 
 
 def test_millions_of_splats_are_made_from_fewer_on_the_same_surfaces(monkeypatch):
-    few = Scene.of(300, 64, 48, "cpu").raw
+    few = Scene.of(3000, 64, 48, "cpu").raw
     many = denser({name: tensor.detach() for name, tensor in few.items()}, 4)
-    assert len(many["means"]) == 1200
-    moved = (many["means"].unflatten(0, (4, 300)) - few["means"]).norm(dim=-1)
+    assert len(many["means"]) == 12_000
+    moved = (many["means"].unflatten(0, (4, 3000)) - few["means"]).norm(dim=-1)
     assert (moved <= 3**0.5 * few["log_scales"].exp().amax(1)).all() and moved.max() > 0
-    torch.testing.assert_close(many["log_scales"].exp()[:300], few["log_scales"].exp() / 2)
-    monkeypatch.setattr("gpu_speed.MOST_GENERATED", 100)
-    assert len(Scene.of(250, 64, 48, "cpu").raw["means"]) == 250
+    torch.testing.assert_close(many["log_scales"].exp()[:3000], few["log_scales"].exp() / 2)
+    monkeypatch.setattr("gpu_speed.MOST_GENERATED", 1000)
+    assert len(Scene.of(2500, 64, 48, "cpu").raw["means"]) == 2500
 
 
 def test_small_views_are_timed_alone_and_together():
@@ -173,3 +175,14 @@ def test_slow_calls_are_repeated_less(monkeypatch):
 def test_what_cannot_be_measured_is_said(name):
     able, reasons = gpu.served([name], "cpu")
     assert (able, reasons) == (([name], {}) if name == "reference" else ([], {name: "there is no such backend"}))
+
+
+def test_the_slow_reference_is_measured_only_where_it_is_wanted():
+    assert set(gpu.served([], "cpu")[0]) == {"cpu"}
+
+
+def test_a_stand_in_for_a_larger_capture_is_made_on_the_device(tmp_path):
+    model = load_model(tiny.folder(tmp_path / "base", tiny.cameras()))
+    with pretended.pretending():
+        larger = gpu_adaptation.denser(model.to(pretended.DEVICE), 150)
+        assert len(larger) == 150 and larger.parameters()["means"].device.type == pretended.DEVICE
