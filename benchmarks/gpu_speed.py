@@ -75,13 +75,18 @@ def denser(raw: dict[str, Tensor], times: int) -> dict[str, Tensor]:
     return raw | {"means": means, "log_scales": raw["log_scales"] - 0.5 * torch.tensor(float(times)).log().item()}
 
 
+_made: dict[Spec, Generated] = {}
+
+
 def generated(cases: Sequence[Case]) -> dict[Spec, Generated]:
-    """The scenes of all cases, made by several processes at once."""
-    specs = list(dict.fromkeys(spec_of(*case) for case in cases))
-    if len(specs) == 1:
-        return {specs[0]: make_to(specs[0])}
-    with ProcessPoolExecutor(len(specs), get_context("spawn")) as workers:
-        return dict(zip(specs, workers.map(make_to, specs), strict=True))
+    """The scenes of all cases, made once, by several processes at the same time."""
+    missing = list(dict.fromkeys(spec for case in cases if (spec := spec_of(*case)) not in _made))
+    if len(missing) < 2:
+        _made.update((spec, make_to(spec)) for spec in missing)
+    else:
+        with ProcessPoolExecutor(len(missing), get_context("spawn")) as workers:
+            _made.update(zip(missing, workers.map(make_to, missing), strict=True))
+    return _made
 
 
 def effects_in(mode: Mode, gaussians: Gaussians) -> Effects:
