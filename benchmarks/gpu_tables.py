@@ -126,7 +126,8 @@ def report(results: Results) -> str:
     known = results.machine
     machine = ", ".join(f"{name} {value}" for name, value in known.items() if name != "device")
     copied = f" A copy moves {results.bandwidth / 1e9:.0f} GB/s, read and written." if results.bandwidth else ""
-    lines = [f"# {known['device']}", f"{machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
+    made = "Made by `python benchmarks/gpu.py --data DATA`"
+    lines = [f"# {known['device']}", f"{made}; {machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
     lines += [adaptation_table(results.adaptation), conformance_table(results.conformance), profile_table(results.profiles)]
     lines += [f"Not measured: {' '.join(filter(None, [failure.backend, failure.what]))}: {failure.reason}" for failure in results.failures]
     return "\n\n".join(filter(None, lines))

@@ -127,7 +127,7 @@ def test_the_report_and_its_files_are_named_after_the_device(tmp_path):
     results.add(Profile("triton", 300, 64, 48, 200.0, [("kernel", 100.0, 2.0)]))
     results.save(tmp_path)
     text = (tmp_path / "nvidia_h200_sxm.md").read_text()
-    assert text.startswith("# NVIDIA H200 (SXM)\n\nmemory_gib 139. A copy moves 4000 GB/s")
+    assert text.startswith("# NVIDIA H200 (SXM)\n\nMade by `python benchmarks/gpu.py --data DATA`; memory_gib 139. A copy moves 4000 GB/s")
     assert "Not measured: inria: it is not there" in text and "| `kernel` | 100 | 50%" in text
     again = Results.of(MACHINE, tmp_path)
     assert (again.speed, again.adaptation, again.conformance, again.failures) == ([OURS], [ADAPTED], results.conformance, [])
