@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from gpu_adaptation import Adaptation
-
-from mipmap_plugin.backends.conformance import Outcome
 from mipmap_plugin.evaluation.report import markdown
+
+if TYPE_CHECKING:
+    from gpu_adaptation import Adaptation
+    from gpu_conformance import Checked
+    from gpu_profile import Profile
+    from gpu_results import Results
+    from gpu_views import Views
 
 YARDSTICK = "gsplat"
 PAPER = "Mipmap-GS needs 40 s for a zoom-out and 75 s for a zoom-in of bicycle on an A100, its targets not counted (arXiv 2408.06286)."
@@ -19,6 +24,7 @@ class Speed:
     """One backend on one scene."""
 
     backend: str
+    mode: str  # of the viewer whose filter is drawn
     splats: int
     width: int  # px
     height: int  # px
@@ -37,54 +43,91 @@ class Failure:
     what: str
     reason: str
 
+    @classmethod
+    def of(cls, backend: str, what: str, error: Exception) -> Failure:
+        return cls(backend, what, f"{type(error).__name__}: {error}".splitlines()[0])
+
 
 def speed_table(rows: Sequence[Speed], bandwidth: float) -> str:
-    """`bandwidth`: bytes a second of a copy within the device's memory."""
-    yardsticks = {(row.splats, row.width, row.height): row for row in rows if row.backend == YARDSTICK}
-    head = ["splats", "px", "backend", "forward, ms", "fwd+bwd, ms", f"x {YARDSTICK}", "GB/s", "of a copy's", "peak, MiB"]
+    """`bandwidth`: bytes a second of a copy within the device's memory. Empty where nothing was timed."""
+    yardsticks = {(row.splats, row.width, row.height, row.mode): row for row in rows if row.backend == YARDSTICK}
+    head = ["splats", "px", "filter", "backend", "forward, ms", "fwd+bwd, ms", f"x {YARDSTICK}", "GB/s", "of a copy's", "peak, MiB"]
     body = []
     for row in rows:
-        other = yardsticks.get((row.splats, row.width, row.height))
+        other = yardsticks.get((row.splats, row.width, row.height, row.mode))
         times = f"{other.forward_ms / row.forward_ms:.2f} / {other.both_ms / row.both_ms:.2f}" if other else "-"
         moved = row.both_bytes / row.both_ms * 1000
-        place = [f"{row.splats:,}", f"{row.width} x {row.height}", row.backend]
+        place = [f"{row.splats:,}", f"{row.width} x {row.height}", row.mode, row.backend]
         figures = [f"{row.forward_ms:.2f}", f"{row.both_ms:.2f}", times, f"{moved / 1e9:.0f}", f"{moved / bandwidth:.1%}", f"{row.peak_mib:.0f}"]
         body.append(place + figures)
-    return markdown(head, body)
+    intro = (
+        f"From raw parameters to the image, and back to all of them. x {YARDSTICK}: how many times faster, forward / both. GB/s: only what has to "
+        "move at least, forward and backward. playcanvas: as the steps of an adaptation draw it, without rounding."
+    )
+    return f"## Speed\n\n{intro}\n\n{markdown(head, body)}" if body else ""
 
 
-def conformance_table(checked: Mapping[str, Sequence[Outcome]]) -> str:
+def views_table(rows: Sequence[Views]) -> str:
+    """Empty where nothing was timed."""
+    head = ["px", "views", "backend", "one after the other, ms a view", "in one call, ms a view"]
+    body = [
+        [str(row.width), str(row.views), row.backend, f"{row.alone_ms:.3f}", "-" if row.together_ms is None else f"{row.together_ms:.3f}"]
+        for row in rows
+    ]
+    intro = "Small views of lego_200, forward and backward."
+    return f"## Small views\n\n{intro}\n\n{markdown(head, body)}" if body else ""
+
+
+def profile_table(rows: Sequence[Profile]) -> str:
+    """Empty where nothing was profiled."""
+    body = [
+        [f"{row.splats:,}", f"{row.width} x {row.height}", row.backend, f"`{name}`", f"{us:.0f}", f"{us / row.all_us:.0%}", f"{launches:g}"]
+        for row in rows
+        for name, us, launches in row.kernels
+    ]
+    table = markdown(["splats", "px", "backend", "kernel", "us", "of all kernels'", "launches"], body)
+    return f"## Kernels\n\nThose that take the most time of an image and its gradients.\n\n{table}" if body else ""
+
+
+def conformance_table(checked: Sequence[Checked]) -> str:
     """Empty where nothing was checked."""
-    body = []
-    for name, outcomes in checked.items():
-        drawn = [outcome for outcome in outcomes if not outcome.skipped]
-        failed = [outcome.case for outcome in drawn if not outcome.passed]
-        body.append([name, f"{len(drawn) - len(failed)} of {len(drawn)}", str(len(outcomes) - len(drawn)), ", ".join(failed) or "-"])
-    return markdown(["backend", "hard cases right", "not served", "wrong"], body) if body else ""
+    body, wrong = [], []
+    for row in checked:
+        drawn = row.cases - row.skipped
+        body.append([row.backend, f"{drawn - len(row.failed)} of {drawn}", str(row.skipped), ", ".join(row.failed) or "-"])
+        wrong += [f"- {row.backend}, {case}: {message[:240]}" for case, message in row.failed.items()]
+    table = markdown(["backend", "hard cases right", "not served", "wrong"], body)
+    return "\n\n".join(filter(None, ["## Hard cases", table, "\n".join(wrong)])) if body else ""
 
 
 def adaptation_table(rows: Sequence[Adaptation]) -> str:
     """Empty where nothing was adapted."""
-    head = ["base", "zoom", "backend", "seconds", "steps", "dB", "on a processor", "peak, MiB", "ended by"]
+    head = ["base", "zoom", "backend", "seconds", "again", "steps", "dB", "on a processor", "peak, MiB", "phases, s", "ended by"]
     body = [
-        [row.base, f"x{row.scale:g}", row.backend, f"{row.seconds:.1f}", str(row.steps), f"{row.psnr_db:.2f}",
+        [row.base, f"x{row.scale:g}", row.backend, f"{row.seconds:.2f}", f"{row.again_seconds:.2f}", str(row.steps), f"{row.psnr_db:.2f}",
          "-" if row.processor_db is None else f"{row.processor_db:.2f}",
-         "-" if row.peak_mib is None else f"{row.peak_mib:.0f}", row.ended_by]
+         "-" if row.peak_mib is None else f"{row.peak_mib:.0f}", _phases(row), row.ended_by]
         for row in rows
     ]  # fmt: skip
-    return f"{markdown(head, body)}\n\n{PAPER}" if body else ""
+    intro = (
+        "Recipe `default`. dB: of lego and chair on real test images that nothing was adapted to, of flowers on the base's own views, held out. "
+        f"Again: of a second adaptation, which has the base's images. {PAPER}"
+    )
+    return f"## Adaptation\n\n{intro}\n\n{markdown(head, body)}" if body else ""
 
 
-def report(
-    known: Mapping[str, object], bandwidth: float, rows: Sequence[Speed], failures: Sequence[Failure], adapted: Sequence[Adaptation], checked: str
-) -> str:
+def _phases(row: Adaptation) -> str:
+    longest = sorted(row.phases.items(), key=lambda phase: -phase[1])
+    return ", ".join(f"{name} {seconds:.2f}" for name, seconds in longest if name not in ("total", "loading") and seconds >= 0.005)
+
+
+def report(results: Results) -> str:
     """Everything as one page."""
+    known = results.machine
     machine = ", ".join(f"{name} {value}" for name, value in known.items() if name != "device")
-    lines = [f"# {known['device']}", f"{machine}. A copy moves {bandwidth / 1e9:.0f} GB/s, read and written."]
-    if rows:
-        lines.append(f"From raw parameters to the image, and back to all of them. x {YARDSTICK}: how many times faster, forward / both. GB/s: only "
-                     "what has to move at least, forward and backward.")  # fmt: skip
-        lines.append(speed_table(rows, bandwidth))
-    lines += [checked, adaptation_table(adapted)]
-    lines += [f"Not measured: {' '.join(filter(None, [failure.backend, failure.what]))}: {failure.reason}" for failure in failures]
+    copied = f" A copy moves {results.bandwidth / 1e9:.0f} GB/s, read and written." if results.bandwidth else ""
+    made = "Made by `python benchmarks/gpu.py --data DATA`"
+    lines = [f"# {known['device']}", f"{made}; {machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
+    lines += [adaptation_table(results.adaptation), conformance_table(results.conformance), profile_table(results.profiles)]
+    lines += [f"Not measured: {' '.join(filter(None, [failure.backend, failure.what]))}: {failure.reason}" for failure in results.failures]
     return "\n\n".join(filter(None, lines))

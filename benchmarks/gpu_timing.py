@@ -11,8 +11,8 @@ import torch
 # Bytes that are copied to measure the bandwidth: more than any cache holds.
 COPIED = 1 << 30
 
-WARM_UP = 3  # runs that do not count
-BUDGET_S = 20.0  # after which no run begins once there are enough for a median
+WARM_UP = 2  # runs that do not count
+BUDGET_S = 3.0  # after which no run begins once there are enough for a median
 FEWEST_RUNS = 3
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import json
+import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import pretended
 import pytest
 import tiny
 import torch
@@ -16,14 +18,23 @@ sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names
 
 import gpu  # noqa: E402
 import gpu_adaptation  # noqa: E402
-from gpu_adaptation import Adaptation  # noqa: E402
-from gpu_tables import Failure, Speed, adaptation_table, conformance_table, report, speed_table  # noqa: E402
+import gpu_conformance  # noqa: E402
+from gpu_adaptation import Adaptation, Base  # noqa: E402
+from gpu_conformance import Checked, check_all  # noqa: E402
+from gpu_profile import Profile, kernels  # noqa: E402
+from gpu_results import Results  # noqa: E402
+from gpu_speed import Scene, denser, measure_all  # noqa: E402
+from gpu_tables import Failure, Speed, report, speed_table  # noqa: E402
 from gpu_timing import Clock, copied_per_second  # noqa: E402
+from gpu_views import Shots, Views, measure, raw_of  # noqa: E402
 
+from mipmap_plugin import load_model  # noqa: E402
 from mipmap_plugin.backends.conformance import Outcome  # noqa: E402
 
-OURS = Speed("triton", 1_000_000, 1920, 1080, 1.0, 4.0, 100.0, 10**9, 2 * 10**9)
-THEIRS = Speed("gsplat", 1_000_000, 1920, 1080, 2.0, 5.0, 200.0, 10**9, 2 * 10**9)
+OURS = Speed("triton", "classic", 1_000_000, 1920, 1080, 1.0, 4.0, 100.0, 10**9, 2 * 10**9)
+THEIRS = Speed("gsplat", "classic", 1_000_000, 1920, 1080, 2.0, 5.0, 200.0, 10**9, 2 * 10**9)
+ADAPTED = Adaptation("lego_200", 0.25, "triton", 2.94, 2.5, 3.0, 400, "400 steps", 612.0, 33.87, 33.9, {"total": 2.94, "optimization": 2.5})
+MACHINE = {"device": "NVIDIA H200 (SXM)", "memory_gib": 139}
 
 
 def cells(table: str, row: int) -> list[str]:
@@ -36,61 +47,115 @@ def test_without_a_gpu_it_says_so():
 
 
 def test_every_backend_is_measured_on_every_scene():
-    rows, failures = gpu.measure_all(["reference", "gsplat"], [(300, 64, 48), (200, 32, 32)], "cpu", 1)
-    assert [(row.backend, row.splats, row.width, row.height) for row in rows] == [("reference", 300, 64, 48), ("reference", 200, 32, 32)]
+    records = list(measure_all(["reference", "gsplat"], [(300, 64, 48)], "cpu", 1, ("classic", "playcanvas")))
+    rows = [record for record in records if isinstance(record, Speed)]
+    assert [(row.backend, row.mode, row.splats, row.width, row.height) for row in rows] == [
+        ("reference", mode, 300, 64, 48) for mode in ("classic", "playcanvas")
+    ]
     assert all(row.forward_ms > 0 and row.both_ms > 0 for row in rows)
-    assert [failure.what for failure in failures] == ["300 splats at 64 x 48 px", "200 splats at 32 x 32 px"]
-    assert failures[0].reason.startswith("BackendUnavailable: backend 'gsplat' cannot do this")
+    failures = [record for record in records if isinstance(record, Failure)]
+    assert [(failure.backend, failure.what) for failure in failures] == [("gsplat", "as classic"), ("gsplat", "as playcanvas")]
+    assert "it runs on cuda, not on cpu" in failures[0].reason and "splats that fade to 0" in failures[1].reason
+
+
+def test_a_failure_does_not_end_the_others(monkeypatch):
+    monkeypatch.setattr("gpu_speed.measure", lambda *args: 1 / 0)
+    (failure,) = measure_all(["reference"], [(300, 64, 48)], "cpu", 1)
+    assert failure == Failure("reference", "300 splats at 64 x 48 px as classic", "ZeroDivisionError: division by zero")
 
 
 def test_the_least_that_moves_is_counted():
-    scene = gpu.Scene.of(300, 64, 48, "cpu")
+    scene = Scene.of(300, 64, 48, "cpu")
     assert scene.parameter_bytes == 300 * (3 + 3 + 4 + 1 + 48) * 4
-    rows, _ = gpu.measure_all(["reference"], [(300, 64, 48)], "cpu", 1)
+    (row,) = measure_all(["reference"], [(300, 64, 48)], "cpu", 1)
     pixels = 64 * 48 * 4 * 4  # bytes of an image and its alpha
-    assert (rows[0].forward_bytes, rows[0].both_bytes) == (scene.parameter_bytes + pixels, 3 * scene.parameter_bytes + 2 * pixels)
+    assert (row.forward_bytes, row.both_bytes) == (scene.parameter_bytes + pixels, 3 * scene.parameter_bytes + 2 * pixels)
+
+
+def test_millions_of_splats_are_made_from_fewer_on_the_same_surfaces(monkeypatch):
+    few = Scene.of(3000, 64, 48, "cpu").raw
+    many = denser({name: tensor.detach() for name, tensor in few.items()}, 4)
+    assert len(many["means"]) == 12_000
+    moved = (many["means"].unflatten(0, (4, 3000)) - few["means"]).norm(dim=-1)
+    assert (moved <= 3**0.5 * few["log_scales"].exp().amax(1)).all() and moved.max() > 0
+    torch.testing.assert_close(many["log_scales"].exp()[:3000], few["log_scales"].exp() / 2)
+    monkeypatch.setattr("gpu_speed.MOST_GENERATED", 1000)
+    assert len(Scene.of(2500, 64, 48, "cpu").raw["means"]) == 2500
+
+
+def test_small_views_are_timed_alone_and_together():
+    shots = Shots(raw_of(tiny.gaussians(), "cpu"), tiny.cameras(2))
+    alone, both = measure("reference", shots, "cpu", 1), measure("cpu", shots, "cpu", 1)
+    assert (alone.width, alone.views, alone.together_ms) == (32, 2, None) and alone.alone_ms > 0
+    assert both.together_ms > 0
+
+
+def test_where_there_are_no_kernels_none_is_listed():
+    assert kernels(lambda: torch.ones(3).sum()) == []
 
 
 def test_speeds_are_compared_with_gsplat_in_the_same_run():
-    table = speed_table([THEIRS, OURS], bandwidth=1e12)
-    assert cells(table, 1) == ["1,000,000", "1920 x 1080", "triton", "1.00", "4.00", "2.00 / 1.25", "500", "50.0%", "100"]
-    assert cells(speed_table([OURS], bandwidth=1e12), 0)[5] == "-"
+    table = speed_table([THEIRS, OURS], bandwidth=1e12).split("\n\n")[-1]
+    assert cells(table, 1) == ["1,000,000", "1920 x 1080", "classic", "triton", "1.00", "4.00", "2.00 / 1.25", "500", "50.0%", "100"]
+    assert cells(speed_table([OURS], bandwidth=1e12).split("\n\n")[-1], 0)[6] == "-"
+    assert speed_table([], 1e12) == ""
 
 
 def test_wrong_cases_are_named():
     outcomes = [Outcome("fine", 0.0, True, True, ""), Outcome("odd", 0.5, True, False, "differs"), Outcome("left", 0.0, True, True, "", skipped=True)]
-    assert cells(conformance_table({"triton": outcomes}), 0) == ["triton", "1 of 2", "1", "odd"]
-    assert conformance_table({}) == ""
+    page = report(Results(MACHINE, conformance=[Checked.of("triton", outcomes)]))
+    assert "| triton  | 1 of 2           | 1          | odd   |" in page and "- triton, odd: differs" in page
 
 
-def test_the_report_and_its_files_are_named_after_the_device(tmp_path, capsys):
-    known = {"device": "NVIDIA H200 (SXM)", "memory_gib": 139}
-    gpu.save(tmp_path, known, 4e12, [OURS], [Failure("inria", "", "it is not there")], {}, [])
+def test_hard_cases_are_shared_among_processes():
+    (checked,) = check_all(["reference"], "cpu", 2, ("one-splat", "sh-degree-0"))
+    assert checked == Checked("reference", 2, 0, {})
+
+
+def test_a_case_that_breaks_its_process_fails_alone(monkeypatch):
+    wrong = Outcome("b", 0.0, True, False, "AcceleratorError: CUDA error: an illegal memory access was encountered")
+    monkeypatch.setattr(gpu_conformance, "check_backend", lambda backend, cases, device: [replace(wrong, case=case) for case in cases])
+    monkeypatch.setattr(gpu_conformance, "_broken", False)
+    assert [outcome.case for outcome in gpu_conformance._outcomes("reference", "cpu", ["one-splat", "sh-degree-0"])] == ["one-splat"]
+    assert gpu_conformance._outcomes("reference", "cpu", ["sh-degree-0"]) == []
+
+
+def test_the_report_and_its_files_are_named_after_the_device(tmp_path):
+    results = Results(MACHINE, 4e12)
+    for record in (OURS, Failure("inria", "", "it is not there"), ADAPTED, Views("triton", 50, 4, 0.5, None), Checked("triton", 2, 1, {})):
+        results.add(record)
+    results.add(Profile("triton", 300, 64, 48, 200.0, [("kernel", 100.0, 2.0)]))
+    results.save(tmp_path)
     text = (tmp_path / "nvidia_h200_sxm.md").read_text()
-    assert text.startswith("# NVIDIA H200 (SXM)\n\nmemory_gib 139. A copy moves 4000 GB/s") and text in capsys.readouterr().out
-    assert "Not measured: inria: it is not there" in text
-    kept = json.loads((tmp_path / "nvidia_h200_sxm.json").read_text())
-    assert kept["speed"][0]["both_ms"] == 4.0 and kept["copied_bytes_per_second"] == 4e12
+    assert text.startswith("# NVIDIA H200 (SXM)\n\nMade by `python benchmarks/gpu.py --data DATA`; memory_gib 139. A copy moves 4000 GB/s")
+    assert "Not measured: inria: it is not there" in text and "| `kernel` | 100 | 50%" in text
+    again = Results.of(MACHINE, tmp_path)
+    assert (again.speed, again.adaptation, again.conformance, again.failures) == ([OURS], [ADAPTED], results.conformance, [])
 
 
-def test_bases_are_adapted_and_judged(tmp_path, monkeypatch):
-    monkeypatch.setattr(gpu_adaptation, "SCALES", {"ball_32": (1, 1 / 2), "absent_100": (1, 2)})
+def test_bases_are_adapted_and_judged(tmp_path):
     tiny.folder(tmp_path / "checkpoints" / "bases" / "ball_32", tiny.cameras())
     tiny.scene(tmp_path / "images" / "ball")
-    (row,) = gpu_adaptation.adaptations(tmp_path, ["reference"], "cpu", steps=4, extra_views=4)
+    request = gpu.Request(["reference"], [], [], tmp_path, 1, 1, math.inf, "cpu")
+    bases = [Base("ball_32", (1 / 2,)), Base("absent_100", (2,)), Base("ball_32", (1 / 2,), 90)]
+    row, split = gpu.adaptations(request, tmp_path, bases, steps=4, extra_views=4)
     assert (row.base, row.scale, row.backend, row.ended_by, row.processor_db) == ("ball_32", 0.5, "reference", "4 steps", None)
-    assert row.psnr_db > 15 and row.seconds > 0
+    assert row.psnr_db > 15 and row.seconds > 0 and row.again_seconds > 0 and row.phases["total"] == row.seconds
+    assert split.base == "ball_32 in 90"
+    late = gpu.Request(["reference"], [], [], tmp_path, 1, 1, 0.0, "cpu")
+    assert list(gpu.adaptations(late, tmp_path, bases[:1])) == [Failure("reference", "ball_32", "no time was left")]
 
 
 def test_adaptations_stand_beside_the_processors_and_the_papers():
-    table = adaptation_table([Adaptation("lego_200", 0.25, "triton", 2.94, 400, "400 steps", 612.0, 33.87, 33.9)])
-    assert cells(table, 0) == ["lego_200", "x0.25", "triton", "2.9", "400", "33.87", "33.90", "612", "400 steps"]
-    assert "40 s for a zoom-out and 75 s for a zoom-in" in table and table in report({"device": "x"}, 1e12, [], [], [
-        Adaptation("lego_200", 0.25, "triton", 2.94, 400, "400 steps", 612.0, 33.87, 33.9)], "")  # fmt: skip
+    page = report(Results(MACHINE, adaptation=[ADAPTED]))
+    table = next(part for part in page.split("\n\n") if part.startswith("| base"))
+    expected = ["lego_200", "x0.25", "triton", "2.94", "2.50", "400", "33.87", "33.90", "612", "optimization 2.50", "400 steps"]
+    assert cells(table, 0) == expected and "40 s for a zoom-out and 75 s for a zoom-in" in page
 
 
 def test_the_processors_own_results_are_read():
     assert gpu_adaptation.on_processor("lego_200", 1 / 4) > 30
+    assert gpu_adaptation.on_processor("flowers_r8", 1 / 4) > 30
     assert gpu_adaptation.on_processor("no_such_base", 1 / 4) is None
 
 
@@ -110,3 +175,14 @@ def test_slow_calls_are_repeated_less(monkeypatch):
 def test_what_cannot_be_measured_is_said(name):
     able, reasons = gpu.served([name], "cpu")
     assert (able, reasons) == (([name], {}) if name == "reference" else ([], {name: "there is no such backend"}))
+
+
+def test_the_slow_reference_is_measured_only_where_it_is_wanted():
+    assert set(gpu.served([], "cpu")[0]) == {"cpu"}
+
+
+def test_a_stand_in_for_a_larger_capture_is_made_on_the_device(tmp_path):
+    model = load_model(tiny.folder(tmp_path / "base", tiny.cameras()))
+    with pretended.pretending():
+        larger = gpu_adaptation.denser(model.to(pretended.DEVICE), 150)
+        assert len(larger) == 150 and larger.parameters()["means"].device.type == pretended.DEVICE

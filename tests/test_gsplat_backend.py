@@ -141,6 +141,7 @@ def test_requirements_are_checked_once_per_kind_of_request(stand_in, monkeypatch
     assert [needs.screen_filter for needs in checked] == ["classic", "mip"]
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 def test_gsplat_itself_draws_the_reference_but_for_what_is_known():
     wrong = {outcome.case: outcome.message for outcome in check_backend(GsplatBackend(), device="cuda") if not outcome.passed}

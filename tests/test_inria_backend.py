@@ -17,7 +17,7 @@ from mipmap_plugin.backends import BACKENDS, survey
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.conformance import CASES, check_backend
 from mipmap_plugin.backends.external import NO_CUDA
-from mipmap_plugin.backends.inria import NO_PACKAGE, OLDER, PACKAGE, Frame, InriaBackend
+from mipmap_plugin.backends.inria import NO_PACKAGE, OLDER, PACKAGE, Frame, InriaBackend, splats_of
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
@@ -60,6 +60,14 @@ def test_the_arguments_are_those_of_the_rasterizer(package):
     assert settings.viewmatrix[3, :3].tolist() == [0.0, 0.0, 0.0]  # row vectors, and the eye is the origin
     torch.testing.assert_close(settings.viewmatrix[:3, :3].T.double(), WIDE.viewmat[:3, :3], atol=1e-7, rtol=0)
     assert (settings._asdict().get("antialiasing", False)) is False
+
+
+def test_shapes_lie_row_by_row_in_memory():
+    """The rasterizer's backward pass does not ask how they lie."""
+    splats = gaussians(20, dtype=torch.float32)
+    turned = replace(splats, scales=splats.scales.T.contiguous().T, quats=splats.quats.T.contiguous().T)
+    passed, usual = splats_of(turned), splats_of(splats)
+    assert all(passed[name].is_contiguous() and torch.equal(passed[name], usual[name]) for name in ("scales", "rotations"))
 
 
 def test_a_point_projects_to_where_the_camera_says(package):
@@ -144,6 +152,7 @@ def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
         InriaBackend().render(gaussians(2, dtype=torch.float32), WIDE, Effects(1))
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available() or bool(InriaBackend().lacking(USUAL)), reason="there is no GPU, or no rasterizer for it")
 def test_the_rasterizer_itself_draws_the_reference():
     """Within what its footprint leaves out, a rim of at most exp(-9/2) of an opacity; so without the suite's tolerances."""

@@ -27,6 +27,7 @@ from mipmap_plugin.adaptation.views import remarks, showing
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
+from mipmap_plugin.cli import main
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.formats.images import write_image
@@ -225,3 +226,19 @@ def test_the_pretence_holds():
         with pytest.raises(RuntimeError, match="torch has it for processors alone"):
             torch.histogram(there.detach(), 2)
         assert float((2 * there.detach()).sum()) == 6 and device.waits
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "render BASE --output OUT --scale 1/2 --depth --normals --supersampling 2",
+        "adapt BASE --scale 1/2 --steps 2 --output OUT --report",
+    ],
+    ids=lambda words: words.split()[0],
+)
+def test_commands_work_there(words, tmp_path, monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.wrap.device_for", lambda name: pretended.DEVICE)
+    named = {"BASE": tiny.folder(tmp_path / "base", VIEWS, count=30), "OUT": tmp_path / "out"}
+    with pretended.pretending():
+        assert main([*(str(named.get(word, word)) for word in words.split()), "--backend", "reference"]) == 0
+    assert list(tmp_path.glob("out*"))

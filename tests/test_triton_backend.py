@@ -84,6 +84,7 @@ def test_it_is_listed_with_its_reasons_and_refuses(monkeypatch):
         TritonBackend().render(gaussians(2, dtype=torch.float32), camera(), Effects(1))
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 def test_on_a_gpu_every_hard_case_equals_the_reference():
     wrong = {outcome.case: outcome.message for outcome in check_backend(TritonBackend(), device="cuda") if not outcome.passed}

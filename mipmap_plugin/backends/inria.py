@@ -144,7 +144,8 @@ def splats_of(gaussians: Gaussians) -> dict[str, Tensor]:
     shape: dict[str, Tensor]
     if gaussians.covariances is None:
         quats = normalized(gaussians.quats)
-        shape = {"scales": gaussians.scales, "rotations": quats / quats.norm(dim=1, keepdim=True)}
+        units = quats / quats.norm(dim=1, keepdim=True)
+        shape = {"scales": gaussians.scales.contiguous(), "rotations": units.contiguous()}  # its backward pass reads them as they lie in memory
     else:
         shape = {"cov3D_precomp": gaussians.covariances.flatten(1)[:, [0, 1, 2, 4, 5, 8]]}
     means = gaussians.means

@@ -1,0 +1,151 @@
+"""Speed and memory of one image, forward and with gradients: generated splats, image sizes and screen filters."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Literal
+
+import torch
+from gpu_tables import Failure, Speed
+from gpu_timing import Clock
+from scenes import Scene as Generated
+from scenes import Spec, make_to
+from torch import Tensor
+from workloads import activated, effects_of
+
+from mipmap_plugin.adaptation.renderers import unrounded
+from mipmap_plugin.backends import get_backend
+from mipmap_plugin.backends.base import Backend, Needs
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.rotations import rotations
+from mipmap_plugin.splatting.viewers import find_viewer
+
+# Viewers by whose filter and cut-offs images are drawn, but not rounded: as in the steps of an adaptation.
+Mode = Literal["classic", "antialiased", "playcanvas"]
+MODES: tuple[Mode, ...] = ("classic", "antialiased", "playcanvas")
+
+SPREAD = 0.47  # as in scenes A and C: about 44 splats reach a pixel, more where they are smaller than one
+MOST_GENERATED = 1_000_000  # splats; numpy needs 4 s for so many, so more are made from these on the device
+
+Case = tuple[int, int, int]  # splats, width, height
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Raw parameters on a device, a view, and the gradient of a loss over its image."""
+
+    raw: dict[str, Tensor]
+    camera: Camera
+    weights: Tensor  # [H, W, 3]
+
+    @classmethod
+    def of(cls, splats: int, width: int, height: int, device: str, generated: Generated | None = None) -> Scene:
+        """`generated`: what `make_to(spec_of(...))` gave, in another process perhaps."""
+        generated = generated or make_to(spec_of(splats, width, height))
+        raw = {name: torch.from_numpy(array).to(device) for name, array in generated.raw.items()}
+        raw = denser(raw, -(-splats // len(raw["means"])))
+        raw = {name: tensor[:splats].clone().requires_grad_() for name, tensor in raw.items()}
+        weights = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0)).to(device)
+        return cls(raw, generated.camera.resized(width, height), weights)
+
+    @property
+    def parameter_bytes(self) -> int:
+        return sum(tensor.numel() * tensor.element_size() for tensor in self.raw.values())
+
+
+def spec_of(splats: int, width: int, height: int) -> Spec:
+    """What is generated for a case: the same for all images of one shape."""
+    return Spec(min(splats, MOST_GENERATED), *((1920, 1080) if width * 1080 == height * 1920 else (width, height)), SPREAD)
+
+
+def denser(raw: dict[str, Tensor], times: int) -> dict[str, Tensor]:
+    """`times` as many splats on the same surfaces: each becomes several, as much smaller, within the place that it filled."""
+    if times == 1:
+        return raw
+    raw = {name: tensor.repeat(times, *[1] * (tensor.dim() - 1)) for name, tensor in raw.items()}
+    rng = torch.Generator().manual_seed(0)
+    along = (2 * torch.rand(raw["means"].shape, generator=rng).to(raw["means"]) - 1) * raw["log_scales"].exp()
+    means = raw["means"] + (rotations(raw["quats"]) @ along[..., None])[..., 0]
+    return raw | {"means": means, "log_scales": raw["log_scales"] - 0.5 * torch.tensor(float(times)).log().item()}
+
+
+_made: dict[Spec, Generated] = {}
+
+
+def generated(cases: Sequence[Case]) -> dict[Spec, Generated]:
+    """The scenes of all cases, made once, by several processes at the same time."""
+    missing = list(dict.fromkeys(spec for case in cases if (spec := spec_of(*case)) not in _made))
+    if len(missing) < 2:
+        _made.update((spec, make_to(spec)) for spec in missing)
+    else:
+        with ProcessPoolExecutor(len(missing), get_context("spawn")) as workers:
+            _made.update(zip(missing, workers.map(make_to, missing), strict=True))
+    return _made
+
+
+def effects_in(mode: Mode, gaussians: Gaussians) -> Effects:
+    """Every SH band, and the filter and cut-offs of a viewer."""
+    effects = effects_of(gaussians)
+    return effects if mode == "classic" else unrounded(find_viewer(mode).effects(effects))
+
+
+def needs_of(mode: Mode, device: str) -> Needs:
+    """What a backend has to serve to be measured."""
+    empty = Gaussians(*(torch.zeros(0, *shape, device=device) for shape in ((3,), (4,), (3,), (), (16, 3))))
+    return Needs.of(empty, effects_in(mode, empty), gradients=True)
+
+
+def measure_all(
+    backends: Sequence[str], cases: Sequence[Case], device: str, runs: int, modes: Sequence[Mode] = ("classic",)
+) -> Iterator[Speed | Failure]:
+    """Every backend on every case in every mode. A failure of one, such as too little memory, does not end the others."""
+    lacks = {(name, mode): get_backend(name).lacking(needs_of(mode, device)) for name in backends for mode in modes}
+    yield from (Failure(name, f"as {mode}", "; ".join(reasons)) for (name, mode), reasons in lacks.items() if reasons)
+    made = generated(cases)
+    for case in cases:
+        scene = Scene.of(*case, device, made[spec_of(*case)])
+        for name, mode in (key for key, reasons in lacks.items() if not reasons):
+            try:
+                yield measure(get_backend(name), scene, device, runs, mode)
+            except Exception as error:  # a kernel that does not compile, or memory that does not suffice, is a finding
+                yield Failure.of(name, "{:,} splats at {} x {} px as {}".format(*case, mode), error)
+            gc.collect()
+        del scene
+
+
+def measure(backend: Backend, scene: Scene, device: str, runs: int, mode: Mode = "classic") -> Speed:
+    """Raw parameters -> image, without a graph; and -> image -> gradients of all of them."""
+    clock, (height, width) = Clock(device), scene.camera.size
+    forward, both = calls(backend, scene, mode)
+    both()  # compiles what is to be compiled
+    peak = clock.peak_mib(both)
+    forward_ms, both_ms = clock.milliseconds(forward, runs), clock.milliseconds(both, runs)
+    parameters, pixels = scene.parameter_bytes, 4 * width * height
+    # The least that has to move: parameters are read, image and alpha written; on the way back both are read again, gradients written.
+    least = (parameters + 4 * pixels, 3 * parameters + 2 * 4 * pixels)
+    return Speed(backend.name, mode, len(scene.raw["means"]), width, height, forward_ms, both_ms, peak, *least)
+
+
+def calls(backend: Backend, scene: Scene, mode: Mode) -> tuple[Callable[[], None], Callable[[], None]]:
+    """What draws an image, and what draws it and takes it back to the parameters."""
+
+    def image() -> Tensor:
+        gaussians = activated(scene.raw)
+        return backend.render(gaussians, scene.camera, effects_in(mode, gaussians)).image
+
+    def forward() -> None:
+        with torch.no_grad():
+            image()
+
+    def both() -> None:
+        for leaf in scene.raw.values():
+            leaf.grad = None
+        (image() * scene.weights).sum().backward()
+
+    return forward, both
