@@ -26,7 +26,7 @@ from typing import Any
 import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, UNTESTED, CachedCheck, finite_splats, normalized
+from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -43,7 +43,6 @@ class GsplatBackend:
     name = "gsplat"
     api_version = API_VERSION
     speed = 40
-    note = UNTESTED
     capabilities = Capabilities(
         devices=frozenset({"cuda"}), dtypes=frozenset({torch.float32}), screen_filters=frozenset({"classic", "antialiased", "mip"})
     )

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, UNTESTED, CachedCheck, finite_splats, normalized
+from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, Effects
@@ -55,7 +55,6 @@ class InriaBackend:
     name = "inria"
     api_version = API_VERSION
     speed = 20
-    note = UNTESTED
     capabilities = Capabilities(
         devices=frozenset({"cuda"}),
         dtypes=frozenset({torch.float32}),

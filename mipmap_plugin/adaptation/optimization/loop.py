@@ -112,9 +112,10 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
 def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     """A step by the backend, which sums the gradients of the views that are drawn and compared side by side."""
 
-    def compare(number: int, x: Tensor) -> tuple[Tensor, Tensor]:  # x: the student
-        target = run.costs.truth(views[number], task.truth)  # r(x̂): the frozen base, resized
-        return _compare(task, config, views[number], x, target)
+    def compare(numbers: Sequence[int], xs: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:  # x: the student
+        some = [views[number] for number in numbers]
+        targets = [run.costs.truth(view, task.truth) for view in some]  # r(x̂): the frozen base, resized
+        return _compare_all(task, config, some, xs, targets)
 
     square_errors = rows.differentiate([cameras[view] for view in views], run.step * config.views_per_step, compare)
     run.square_error = run.square_error + torch.stack(square_errors).mean()
@@ -135,7 +136,7 @@ def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence
         targets = [run.costs.truth(view, task.truth) for view in some]
         gaussians = splats(cameras[some[0]])
         images = task.images(gaussians, [cameras[view] for view in some], run.step * config.views_per_step + number)
-        compared = [_compare(task, config, *each) for each in zip(some, images, targets, strict=True)]
+        compared = _compare_all(task, config, some, images, targets)
         torch.autograd.backward(images, [gradient for gradient, _ in compared])
         run.square_error = run.square_error + sum(square_error for _, square_error in compared) / len(views)
         if run.gradients is not None:
@@ -146,6 +147,16 @@ def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence
         splats.backward()
         run.optimizer.step()
     run.optimizer.zero_grad()
+
+
+def _compare_all(
+    task: Task, config: AdaptConfig, views: Sequence[Camera], images: Sequence[Tensor], targets: Sequence[Tensor]
+) -> list[tuple[Tensor, Tensor]]:
+    """`_compare` of several views: in one operation where their images are of one size, since a GPU waits for each."""
+    if len(images) == 1 or task.detail is not None or len({image.shape for image in (*images, *targets)}) > 1:
+        return [_compare(task, config, *each) for each in zip(views, images, targets, strict=True)]
+    differences = torch.stack([image.detach() for image in images]) - torch.stack(list(targets))
+    return list(zip(*gradient_of(differences, config.loss), strict=True))
 
 
 def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
