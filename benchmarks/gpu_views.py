@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from gpu_gsplat import ITSELF, find, rasterized, with_itself
 from gpu_tables import Failure
 from gpu_timing import Clock
 from torch import Tensor
 from workloads import activated, effects_of
 
 from mipmap_plugin import Camera, Gaussians, load_model
-from mipmap_plugin.backends import get_backend
 from mipmap_plugin.wrap import own_cameras
 
 BASE = "lego_200"
@@ -47,7 +47,7 @@ def measure_views(data: Path, backends: Sequence[str], device: str, runs: int) -
     raw = raw_of(model.gaussians(cameras[0]).detach(), device)
     for width in WIDTHS:
         sized = [camera.resized(width, round(width * camera.height / camera.width)) for camera in cameras]
-        for name in backends:
+        for name in with_itself(backends):
             try:
                 for count in COUNTS:
                     yield measure(name, Shots(raw, sized[:count]), device, runs)
@@ -77,7 +77,7 @@ def _differentiated(shots: Shots, images: Callable[[Gaussians], list[Tensor]]) -
 
 
 def _alone(name: str, shots: Shots) -> Callable[[], None]:
-    backend = get_backend(name)
+    backend = find(name)
 
     def images(gaussians: Gaussians) -> list[Tensor]:
         return [backend.render(gaussians, camera, effects_of(gaussians)).image for camera in shots.cameras]
@@ -86,10 +86,10 @@ def _alone(name: str, shots: Shots) -> Callable[[], None]:
 
 
 def _together(name: str, shots: Shots) -> Callable[[], None] | None:
-    """gsplat, which draws several cameras at once, is called as its users do."""
-    backend = get_backend(name)
-    if name == "gsplat":
-        return lambda: _differentiated(shots, lambda gaussians: list(_of_gsplat(gaussians, shots.cameras)))
+    """gsplat itself draws several cameras at once."""
+    backend = find(name)
+    if name == ITSELF:
+        return lambda: _differentiated(shots, lambda gaussians: list(rasterized(gaussians, shots.cameras, effects_of(gaussians))[0]))
     if not hasattr(backend, "render_views"):
         return None
 
@@ -98,14 +98,3 @@ def _together(name: str, shots: Shots) -> Callable[[], None] | None:
         return [rendered.image for rendered in drawn]
 
     return lambda: _differentiated(shots, images)
-
-
-def _of_gsplat(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
-    from gsplat import rasterization
-
-    means, first = gaussians.means, cameras[0]
-    intrinsics = torch.tensor([[[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras])
-    viewmats = torch.stack([camera.viewmat for camera in cameras])
-    splats = (means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    lens = (viewmats.to(means), intrinsics.to(means), first.width, first.height)
-    return rasterization(*splats, *lens, sh_degree=gaussians.sh_degree, packed=False)[0]
