@@ -7,6 +7,8 @@ import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 from operator import index
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -25,7 +27,6 @@ DIGITS = 16
 # How far a pose may be from a rotation. One of three decimals is off by 1e-2, and a scene may be moved by another such transform; the usual
 # slips (one axis flipped, one stretched, intrinsics multiplied in) are off by far more.
 POSE_TOLERANCE = 3e-2
-
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -103,32 +104,34 @@ class Camera:
             raise ShapeError(f"viewmat: expected a tensor or an array of shape [4, 4], got {type(given).__name__}") from error
         if tuple(pose.shape) != (4, 4):
             raise ShapeError(f"viewmat: expected shape [4, 4], got {list(pose.shape)}")
-        if not pose.isfinite().all():
+        *rows, last = pose.tolist()  # numbers of Python: operations on tensors so small take several times as long
+        if not all(map(math.isfinite, (number for row in (*rows, last) for number in row))):
             raise SettingsError(f"camera {self.name!r}: the pose contains NaN or infinity")
-        if not torch.allclose(pose[3], pose.new_tensor([0, 0, 0, 1])):
+        if not all(math.isclose(number, right, rel_tol=1e-5, abs_tol=1e-8) for number, right in zip(last, (0, 0, 0, 1), strict=True)):
             raise SettingsError(f"camera {self.name!r}: the last row of viewmat must be 0 0 0 1; it may have to be transposed, as that of 3DGS has")
-        return self._rigid(pose)
+        scale = self._rigid([row[:3] for row in rows])
+        if abs(scale - 1) > POSE_TOLERANCE:  # the near plane and depths are measured in units of the world
+            pose[:3] /= scale
+        return pose
 
-    def _rigid(self, pose: Tensor) -> Tensor:
-        """The pose [4, 4] without a scale that its axes share. Raises SettingsError for one that mirrors, stretches or shears."""
-        determinant = torch.linalg.det(pose[:3, :3]).item()
+    def _rigid(self, axes: list[list[float]]) -> float:
+        """The scale that the pose's axes [3, 3] share. Raises SettingsError for a pose that mirrors, stretches or shears."""
+        (a, b, c), (d, e, f), (g, h, i) = axes
+        determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         if determinant == 0:
             raise SettingsError(f"camera {self.name!r}: viewmat cannot be inverted")
         if determinant < 0:
             slip = "as when one axis alone is flipped between OpenGL and OpenCV; flip y and z together"
             raise SettingsError(f"camera {self.name!r}: viewmat mirrors the scene (determinant {determinant:.3g}), {slip}")
-        scale = determinant ** (1 / 3)
-        rotation = pose[:3, :3] / scale
-        off = (rotation @ rotation.T - torch.eye(3, dtype=pose.dtype, device=pose.device)).abs().max().item()
+        scale: float = determinant ** (1 / 3)
+        off = max(abs(sum(x * y for x, y in zip(*pair, strict=True)) / scale**2 - (pair[0] is pair[1])) for pair in product(axes, axes))
         if not off <= POSE_TOLERANCE:
             advice = "give a rotation and a translation, and the intrinsics as fx, fy, cx and cy"
             wrong = f"the axes of viewmat are not at right angles or not of one length (off by {off:.2g})"
             raise SettingsError(f"camera {self.name!r}: {wrong}; {advice}")
-        if abs(scale - 1) > POSE_TOLERANCE:  # the near plane and depths are measured in units of the world
-            pose[:3] /= scale
-        return pose
+        return scale
 
-    @property
+    @cached_property
     def center(self) -> Tensor:
         """The camera's position in the world, [3] float64."""
         rotation, translation = self.viewmat[:3, :3], self.viewmat[:3, 3]

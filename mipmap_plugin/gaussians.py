@@ -50,6 +50,8 @@ class Gaussians:
 
     def __getitem__(self, rows: Tensor | slice) -> Gaussians:
         """The splats at `rows`, a boolean mask [N], indices or a slice."""
+        if isinstance(rows, Tensor) and rows.dtype == torch.bool:
+            rows = rows.nonzero()[:, 0]  # once for all tensors: a GPU is waited for
         return self._map(lambda tensor: tensor[rows])
 
     def joined(self, other: Gaussians) -> Gaussians:

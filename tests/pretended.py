@@ -60,6 +60,7 @@ class Device(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self.waits: Counter[str] = Counter()  # by the line of the package that asks
+        self.operations = 0
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         kwargs = dict(kwargs or {})
@@ -72,6 +73,7 @@ class Device(TorchDispatchMode):
         goes_there = there if target is None else torch.device(target).type == DEVICE
         if not there and not goes_there:
             return func(*args, **kwargs)
+        self.operations += 1
         if func.overloadpacket.__name__ in CPU_ONLY:
             raise RuntimeError(f"{func}: torch has it for processors alone")
         if there and func not in MOVES | TAKES_INDICES and any(not isinstance(tensor, Pretended) and tensor.dim() for tensor in tensors):
@@ -91,10 +93,12 @@ class Device(TorchDispatchMode):
 
 
 class Factories(TorchFunctionMode):
-    """Tensors from numbers, and indices from lists and tuples, which torch makes in one go where no mode looks."""
+    """Tensors from numbers, and indices from lists and tuples, which torch makes in one go where no mode looks; and lists from tensors."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
+        if func is torch.Tensor.tolist:
+            args = (args[0].cpu(),)
         if func is torch.Tensor.new_tensor and isinstance(args[0], Pretended):
             return torch.tensor(args[1], dtype=kwargs.get("dtype", args[0].dtype)).to(DEVICE)
         if func in (torch.Tensor.__getitem__, torch.Tensor.__setitem__) and isinstance(args[1], tuple):

@@ -16,12 +16,19 @@ import torch_checkpoints
 
 from mipmap_plugin import load_model, load_scene, wrap_model
 from mipmap_plugin.adaptation.optimization import run
+from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.start import merging
+from mipmap_plugin.adaptation.start.blend_weights import may_show
+from mipmap_plugin.adaptation.start.closed_form import closed_form
+from mipmap_plugin.adaptation.start.pixel_size import mean_pixel_size
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.adaptation.views import remarks, showing
 from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
+from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.cli import main
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.splatting.filters import USUAL_EPS2D
@@ -156,6 +163,58 @@ def test_no_step_waits_for_the_device(scale):
             wrapped.adapt(scale, steps=steps, **FEW, check_every=100, prune_every=100)
         counts.append({line: count for line, count in device.waits.items() if not line.startswith(("backends/", "splatting/"))})
     assert counts[0] == counts[1]
+
+
+def cost(work) -> tuple[int, int]:
+    """The operations that a work takes there, and how often the host waits for them."""
+    with pretended.pretending() as device:
+        work(tiny.gaussians(20).to(pretended.DEVICE))
+        return device.operations, device.waits.total()
+
+
+@pytest.mark.parametrize("scale", [1 / 4, 2])
+@pytest.mark.parametrize("filters", [("classic", "classic"), ("antialiased", "classic"), (SURFEL, SURFEL)])
+def test_the_closed_form_takes_as_many_operations_there_for_any_number_of_views(filters, scale):
+    base, target = (Effects(1, name, USUAL_EPS2D.get(name, 0.5)) for name in filters)
+    few, many = (cost(lambda splats, views=views: closed_form(splats, views, scale, base, target)) for views in map(tiny.cameras, (3, 9)))
+    assert few == many
+
+
+def test_views_are_looked_at_together_there():
+    model = tiny.model()
+    for look in (
+        lambda splats, views: showing(views, splats.means, 0.2),
+        lambda splats, views: remarks(views, model.to(pretended.DEVICE), 0.2, orbit=False),
+        lambda splats, views: may_show(splats.opacities, 1e9 * splats.opacities, splats.means, views, views[:2]),
+        lambda splats, views: mean_pixel_size(splats.means, views),
+    ):
+        few, many = (cost(lambda splats, views=views, look=look: look(splats, views)) for views in map(tiny.cameras, (3, 9)))
+        assert few == many
+
+
+def test_a_check_waits_once_there():
+    view = tiny.cameras()[0]
+    truth = torch.zeros(*view.size, 3)
+    waits = []
+    for count in (1, 5):
+        with pretended.pretending() as device:
+            there = truth.to(pretended.DEVICE)
+            validation = Validation([view] * count, [], 1.0, lambda _, there=there: there, lambda *_, there=there: there, "area")
+            validation.steer(tiny.model().to(pretended.DEVICE))
+            waits.append(device.waits.total())
+    assert waits == [1, 1]
+
+
+def test_pairs_for_merging_are_those_that_compiled_code_finds(monkeypatch):
+    """Bit by bit, for 300 splats along a line, in chunks of 128."""
+    monkeypatch.setattr(merging, "ROWS", 128)
+    splats = tiny.gaussians(300)
+    shapes = torch.eye(3, dtype=torch.float64) * splats.scales[:, :1, None] ** 2
+    arrays = splats.means, shapes, 20 * splats.sh[:, 0], 0.1 * splats.opacities, torch.full((300,), 0.5)
+    nearest, least = merging._nearest_along(*arrays)
+    known, costs = nearest_along(*arrays, reach=merging.NEIGHBORS, limits=(merging.MAX_DISTANCE**2, merging.MAX_COST))
+    found = costs.isfinite()
+    assert found.sum() > 10 and torch.equal(least, costs) and torch.equal(nearest[found], known[found])
 
 
 def test_the_pretence_holds():

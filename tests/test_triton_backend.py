@@ -27,7 +27,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
 FLOAT, INT32, INT64 = "*fp32", "*i32", "*i64"
 TYPES = {"splat_ids": INT32, "owners": INT32, "boxes": INT32, "counts": INT32, "tiles": "*i16"}
 TYPES |= dict.fromkeys(("tile_offsets", "places", "starts"), INT64)
-TYPES |= dict.fromkeys(("count", "width", "height", "tiles_x", "tiles_y", "no_tile"), "i32")
+TYPES |= dict.fromkeys(("count", "pairs", "views", "further", "most_tiles", "most_pixels", "no_tile"), "i32")
 
 
 def compile_for(capability: int, kernel, warps: int = 4, **constants) -> str:
@@ -47,19 +47,21 @@ def compile_for(capability: int, kernel, warps: int = 4, **constants) -> str:
 def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeypatch):
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     from mipmap_plugin.backends import triton_kernels as sizes
-    from mipmap_plugin.backends.triton_kernels import binning, compositing, compositing_back, projection, projection_back
+    from mipmap_plugin.backends.triton_kernels import adam, binning, compositing, compositing_back, projection, projection_back, weighing
 
-    splat = {"COMPENSATES": True, "DEGREE": 1, "BANDS": 4, "BLOCK": sizes.SPLATS}
+    splat, tile = {"RAW": True, "DEGREE": 1, "BANDS": 4, "BLOCK": sizes.SPLATS}, sizes.LARGE_TILE
     for has_covariances in (False, True):
-        compile_for(capability, projection.project_kernel, HAS_COVARIANCES=has_covariances, TILE=sizes.TILE, **splat)
+        compile_for(capability, projection.project_kernel, HAS_COVARIANCES=has_covariances, TILE=tile, **splat)
         compile_for(capability, projection_back.project_back_kernel, HAS_COVARIANCES=has_covariances, **splat)
-    compile_for(capability, binning.emit_kernel, TILE=sizes.TILE, BLOCK=sizes.PAIRS)
-    compile_for(capability, compositing.composite_kernel, sizes.WARPS_OF_MANY, TILE=sizes.TILE, BATCH=sizes.FORWARD_BATCH)
+    compile_for(capability, binning.emit_kernel, TILE=tile, BLOCK=sizes.PAIRS)
+    compile_for(capability, compositing.composite_kernel, sizes.WARPS[tile], TILE=tile, BATCH=sizes.BATCH)
     for in_order in (False, True):
-        back = {"TILE": sizes.TILE, "BATCH": sizes.BACKWARD_BATCH, "DETERMINISTIC": in_order}
-        ptx = compile_for(capability, compositing_back.composite_back_kernel, sizes.WARPS_OF_FEW, **back)
+        back = {"TILE": sizes.SMALL_TILE, "BATCH": sizes.BACK_BATCH, "DETERMINISTIC": in_order}
+        ptx = compile_for(capability, compositing_back.composite_back_kernel, sizes.BACK_WARPS, **back)
         assert ("atom" in ptx or "red.global" in ptx) != in_order
     compile_for(capability, compositing_back.gather_kernel, 1, ROWS=32)
+    compile_for(capability, weighing.weigh_kernel, sizes.BACK_WARPS, TILE=tile, BATCH=sizes.BATCH)
+    compile_for(capability, adam.adam_kernel, BANDS=4, BLOCK=sizes.NUMBERS_MOVED)
 
 
 def test_what_is_missing_is_reported(monkeypatch):

@@ -11,13 +11,15 @@ import torch
 from oracle import brute_force
 from samples import camera, gaussians
 
-from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.base import AdamStep, Needs
 from mipmap_plugin.backends.conformance import CASES, check_case
 from mipmap_plugin.backends.conformance.cases import covariances
+from mipmap_plugin.backends.conformance.checks import check_steps, check_views
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.triton import TritonBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.harmonics import C0
 
 MISSING = importlib.util.find_spec("triton") is None
 pytestmark = [
@@ -61,8 +63,12 @@ def assert_equal(actual, expected, relative=2e-5):
         assert (grad.double() - expected[2][name]).norm() <= relative * expected[2][name].norm(), name
 
 
+@pytest.mark.parametrize("tile", [8, 16])
 @pytest.mark.parametrize(("screen_filter", "eps2d"), [("classic", 0.3), ("classic", 2.4), ("antialiased", 0.3), ("mip", 0.1)])
-def test_equals_a_sum_over_every_pixel(screen_filter, eps2d):
+def test_equals_a_sum_over_every_pixel(screen_filter, eps2d, tile, monkeypatch):
+    from mipmap_plugin.backends.triton_kernels import drawing
+
+    monkeypatch.setattr(drawing, "tile_for", lambda pixels: tile)
     g = gaussians(30, dtype=torch.float32)
     effects = Effects(1, screen_filter, eps2d, (0.2, 0.5, 0.9))
     right = draw(lambda *scene: brute_force(*scene[:2], eps2d, effects.background, screen_filter), g.to(dtype=torch.float64), WIDE, effects)
@@ -130,16 +136,18 @@ def test_a_tile_lists_its_visible_splats_front_to_back_and_few_others():
 
     g, view = gaussians(150, dtype=torch.float32), camera(64, 48)
     splats = drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None)
-    drawn = drawing.draw(splats, view, Effects(1))[2]
-    x, y, along, shear, across, log2_opacity = drawn.records[:, :6].T[:, :, None, None]
-    assert drawn.records.shape[1] == WIDTH
+    drawn = drawing.project(splats, [(view, Effects(1))])
+    assert drawn.listed.shape[1] == WIDTH
+    records = torch.zeros(150, WIDTH).index_copy(0, drawn.bins.splat_ids.long(), drawn.listed)
+    x, y, along, shear, across, log2_opacity = records[:, :6].T[:, :, None, None]
     ys, xs = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     u = xs - x - shear * (ys - y)
     alpha = torch.exp2(along * (ys - y) ** 2 + across * u**2 + log2_opacity)
     seen = (alpha >= 1 / 255) & torch.isfinite(drawn.depths)[:, None, None]
-    needed = seen.unflatten(2, (4, 16)).unflatten(1, (3, 16)).any(4).any(2).flatten(1)  # [N, tiles]
+    tiles_x, tiles_y = 64 // drawn.tile, 48 // drawn.tile
+    needed = seen.unflatten(2, (tiles_x, drawn.tile)).unflatten(1, (tiles_y, drawn.tile)).any(4).any(2).flatten(1)  # [N, tiles]
     listed = torch.zeros_like(needed)
-    for tile in range(12):
+    for tile in range(tiles_x * tiles_y):
         ids = drawn.bins.splat_ids[drawn.bins.tile_offsets[tile] : drawn.bins.tile_offsets[tile + 1]].long()
         listed[ids, tile] = True
         assert (drawn.depths[ids].diff() >= 0).all()
@@ -158,3 +166,39 @@ def test_hard_cases_equal_the_reference(case):
 def test_under_the_interpreter_it_serves_the_cpu_and_is_never_chosen_by_auto():
     needs = Needs("cpu", torch.float32, gradients=True, sh_degree=3, screen_filter="classic")
     assert TritonBackend().lacking(needs) == [] and TritonBackend().speed < 0
+
+
+@pytest.mark.parametrize("check", [check_views, check_steps])
+@pytest.mark.parametrize("case", ["sh-degree-3", "sh-bands-left-out"])
+def test_views_in_one_call_and_steps_are_right(check, case):
+    outcome = check(TritonBackend(), CASES[case])
+    assert outcome.passed, outcome.message
+
+
+def test_views_of_a_step_are_summed_in_any_grouping():
+    """Views of two sizes, drawn in one call and one by one."""
+    g = gaussians(20, dtype=torch.float32)
+    shots = [(WIDE, Effects(1)), (camera(16, 24), Effects(1, "antialiased"))]
+    moments = []
+    for groups in ([shots], [shots[:1], shots[1:]]):
+        raw = {"means": g.means.clone(), "quats": 2 * g.quats, "scales": g.scales.log(), "opacities": g.opacities.logit(), "sh": g.sh.clone()}
+        first, second = ({name: torch.zeros_like(tensor) for name, tensor in raw.items()} for _ in range(2))
+        stepper = TritonBackend().stepper(raw)
+        for number, group in enumerate(groups):
+            stepper.differentiate_all([2 * rendered.image for rendered in stepper.render_all(group, number)], number=number)
+        rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
+        stepper.step(AdamStep(raw, first, second, rates, betas=(0.9, 0.999), correction=1.0, eps=1e-8, nesterov=True))
+        moments.append((raw, first))
+    for together, alone in zip(*moments, strict=True):
+        for name, tensor in together.items():
+            torch.testing.assert_close(tensor, alone[name], atol=1e-6, rtol=1e-4)
+
+
+def test_blend_weights_are_the_gradient_of_a_white_color():
+    g = gaussians(20, dtype=torch.float32)
+    colors = g.sh.detach().clone().requires_grad_()
+    white = replace(g, sh=colors)
+    image = ReferenceBackend().render(white, WIDE, Effects(0)).image
+    [gradient] = torch.autograd.grad(image[..., 0].sum(), colors)
+    weights = TritonBackend().blend_weights(g, WIDE, Effects(0))
+    torch.testing.assert_close(weights, gradient[:, 0, 0] / C0, atol=1e-5, rtol=1e-4)

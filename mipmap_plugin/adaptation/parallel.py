@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TypeVar
 
@@ -10,11 +10,15 @@ from torch import Tensor
 
 from mipmap_plugin import threads
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.splatting.camera_tensors import CameraTensors
 
 Result = TypeVar("Result")
 
 # Rows that a processor computes together, in bounded memory.
 CHUNK = 1 << 14
+
+# Rows times views that are computed together elsewhere, and pixels of views that are drawn together: each takes some hundred bytes.
+ROWS_OF_VIEWS = 1 << 22
 
 # Splats plus pixels of a view. Larger views are rendered one after the other: the kernels' own threads are as fast there, and only one view
 # needs memory at a time.
@@ -39,6 +43,16 @@ def views_at_once(cameras: Iterable[Camera]) -> int:
     return max(1, min(VIEWS_AT_ONCE, PIXELS_AT_ONCE // max(camera.width * camera.height for camera in cameras)))
 
 
+def together(means: Tensor, cameras: Iterable[Camera]) -> int:
+    """The number of views to draw in one call where nothing else is done meanwhile, if none is larger than the largest of `cameras`.
+
+    On a processor one: there it takes no less time, and threads draw others at the same time (`max_threads`).
+    """
+    if means.device.type == "cpu":
+        return 1
+    return max(1, ROWS_OF_VIEWS // max(len(means), *(camera.width * camera.height for camera in cameras)))
+
+
 def large_for_torch(means: Tensor) -> AbstractContextManager[None]:
     """Inside, torch has all threads if the splats with these `means` [N, 3] are many."""
     return threads.lent_to_torch() if means.device.type == "cpu" and len(means) >= LARGE_FOR_TORCH else nullcontext()
@@ -50,3 +64,11 @@ def in_chunks(function: Callable[[slice], Result], rows: Tensor) -> list[Result]
     size = CHUNK if on_cpu else count
     chunks = [slice(start, start + size) for start in range(0, count, size)]
     return list(threads.side_by_side(function, chunks, threads.for_views() if on_cpu else 1))
+
+
+def in_batches(views: Sequence[Camera], rows: Tensor) -> Iterator[CameraTensors]:
+    """All views, as many at a time as look at the `rows` together: a processor's caches hold few, and a GPU waits for each operation."""
+    most = CHUNK if rows.device.type == "cpu" else ROWS_OF_VIEWS
+    count = max(1, most // max(1, len(rows)))
+    for start in range(0, len(views), count):
+        yield CameraTensors.of(views[start : start + count], rows)

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin import threads
 from mipmap_plugin.backends.base import Backend, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.packing import in_two_steps, packed
+from mipmap_plugin.threads import side_by_side
 
 # For a rounding that does not depend on it.
 NO_CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
-# An image [h, w, 3] -> the gradient of its loss, [h, w, 3], and its mean square error, [].
-Comparison = Callable[[Tensor], tuple[Tensor, Tensor]]
+# The number of a view in a step and its image [h, w, 3] -> the gradient of its loss, [h, w, 3], and its mean square error, [].
+Comparison = Callable[[int, Tensor], tuple[Tensor, Tensor]]
 
 # Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
 ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
@@ -72,6 +76,7 @@ class SteppingRenderer:
 
     stepper: Callable[[Mapping[str, Tensor]], Stepper]  # `Backend.stepper`
     targets: Sequence[Effects]
+    together: ClassVar[bool] = True  # whether the views of a step may be drawn in one call
 
     @classmethod
     def of(cls, backend: Backend, targets: Sequence[Effects]) -> SteppingRenderer | None:
@@ -79,10 +84,19 @@ class SteppingRenderer:
         stepper = getattr(backend, "stepper", None)
         return None if stepper is None or any(target.settings.packing is not None for target in targets) else cls(stepper, targets)
 
-    def differentiate(self, stepper: Stepper, number: int, camera: Camera, draw: int, compare: Comparison) -> Tensor:
-        """Draw the view of that number in a step, the `draw`-th since the beginning, and compare its image; return the mean square error."""
-        drawn = stepper.render(number, camera, self.targets[draw % len(self.targets)])
-        gradient, square_error = compare(drawn.image)
+    def differentiate(self, stepper: Any, cameras: Sequence[Camera], draw: int, compare: Comparison) -> list[Tensor]:
+        """Draw the views of a step, whose first is the `draw`-th since the beginning, and compare their images; return the mean square errors."""
+        shots = _shots(cameras, self.targets, draw)
+        if self.together and hasattr(stepper, "render_all"):
+            compared = [compare(number, drawn.image) for number, drawn in enumerate(stepper.render_all(shots))]
+            stepper.differentiate_all([gradient for gradient, _ in compared])
+            return [square_error for _, square_error in compared]
+        at_once = math.gcd(len(shots), threads.for_views())
+        return list(side_by_side(lambda number: self.differentiate_one(stepper, number, shots[number], compare), range(len(shots)), at_once))
+
+    def differentiate_one(self, stepper: Stepper, number: int, shot: tuple[Camera, Effects], compare: Comparison) -> Tensor:
+        """The same for the view of that number in the step."""
+        gradient, square_error = compare(number, stepper.render(number, *shot).image)
         stepper.differentiate(number, gradient)
         return square_error
 

@@ -6,6 +6,7 @@ The gradients of a step then differ less from those of all views: worth 0.15 dB 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -21,19 +22,34 @@ def places(views: Sequence[Camera]) -> Tensor:
     return torch.cat([offsets / size if size > 0 else offsets, torch.stack([view.viewmat[2, :3] for view in views])], dim=1)
 
 
-def spread(members: Sequence[int], at: Tensor, generator: torch.Generator) -> list[int]:
-    """An order of the views `members` at the places `at` [V, 6], by halves.
+@dataclass(frozen=True)
+class Halves:
+    """The places of some views, by number, in two halves: each a number or halves again."""
 
-    The views are cut into two halves where they are most spread out, both are brought into such an order, and then take turns: so neighbors
-    are of different halves, any four of different quarters, and so on (as in van der Corput's sequence, 1935). Chance decides which comes first.
+    low: Halves | int
+    high: Halves | int  # may have one more
+
+    @classmethod
+    def of(cls, members: Sequence[int], at: Tensor) -> Halves | int:
+        """The `members`, one or more, at the places `at` [V, 6], cut where they are most spread out."""
+        if len(members) < 2:
+            return members[0]
+        rows = at[list(members)]
+        axis = int(rows.var(0, unbiased=False).argmax())
+        ordered = [members[place] for place in rows[:, axis].argsort(stable=True).tolist()]
+        half = len(members) // 2
+        return cls(cls.of(ordered[:half], at), cls.of(ordered[half:], at))
+
+
+def spread(halves: Halves | int, generator: torch.Generator) -> list[int]:
+    """An order of the views of `halves`, in which these take turns, each in such an order itself.
+
+    So neighbors are of different halves, any four of different quarters, and so on (as in van der Corput's sequence, 1935). Chance decides
+    which comes first.
     """
-    if len(members) < 2:
-        return list(members)
-    rows = at[list(members)]
-    axis = int(rows.var(0, unbiased=False).argmax())
-    sorted_members = [members[place] for place in rows[:, axis].argsort(stable=True).tolist()]
-    half = len(members) // 2
-    low, high = (spread(part, at, generator) for part in (sorted_members[:half], sorted_members[half:]))  # `high` may have one more
+    if isinstance(halves, int):
+        return [halves]
+    low, high = spread(halves.low, generator), spread(halves.high, generator)
     first, second = (low, high) if len(low) == len(high) and int(torch.randint(2, (), generator=generator)) else (high, low)
     order = [view for pair in zip(first, second, strict=False) for view in pair]
     return order + first[len(second) :]

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import accumulate
+from itertools import accumulate, compress
 from pathlib import Path
 from statistics import fmean
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.spreading import places, spread
+from mipmap_plugin.adaptation.parallel import in_batches
+from mipmap_plugin.adaptation.spreading import Halves, places, spread
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
@@ -106,7 +107,7 @@ class Rounds:
     def __init__(self, views: Sequence[Camera], seed: int, *, spread_out: bool = False) -> None:
         """`spread_out`: neighbors look from all sides; otherwise the order is shuffled."""
         self.views, self._seed = list(views), seed
-        self._places = places(views) if spread_out and views else None
+        self._halves = Halves.of(range(len(views)), places(views)) if spread_out and views else None
         self._round = -1
         self._order: list[int] = []
 
@@ -119,8 +120,8 @@ class Rounds:
 
     def _order_of(self, round_number: int) -> list[int]:
         generator = torch.Generator().manual_seed(derived_seed(self._seed, round_number))
-        if self._places is not None:
-            return spread(range(len(self.views)), self._places, generator)
+        if self._halves is not None:
+            return spread(self._halves, generator)
         return torch.randperm(len(self.views), generator=generator).tolist()
 
 
@@ -172,7 +173,14 @@ def choose_views(cameras: Sequence[Camera], around: Tensor | Orbit, config: Adap
 
 def showing(views: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
     """The views that show one of the `means` [N, 3], farther than the near plane (world units)."""
-    return [view for view in views if view.in_picture(view.to_camera(means.detach()), near).any()]
+    shown = [inside.any(1) for inside in _inside(views, means, near)]
+    return list(compress(views, torch.cat(shown).tolist())) if shown else []
+
+
+def _inside(views: Sequence[Camera], means: Tensor, near: float) -> Iterator[Tensor]:
+    """Which `means` [N, 3] lie in the pictures of views, farther than the near plane: [V, N] bool, for some views after the others."""
+    for view in in_batches(views, means):
+        yield view.in_picture(view.to_camera(means.detach()), near)
 
 
 def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_of: Callable[[Camera], Tensor]) -> None:
@@ -214,11 +222,9 @@ def too_near(views: Sequence[Camera], means: Tensor, near: float) -> str:
 
     `near`: the near plane, in world units.
     """
-    lost: list[float] = []
-    for view in evenly(views, LOOKED_AT):
-        points = view.to_camera(means.detach())
-        if count := int(view.in_picture(points).sum()):
-            lost.append(1 - int(view.in_picture(points, near).sum()) / count)
+    some = evenly(views, LOOKED_AT)
+    counts = [torch.cat([inside.sum(1) for inside in _inside(some, means, plane)]).tolist() for plane in (0.0, near)]
+    lost = [1 - drawn / count for count, drawn in zip(*counts, strict=True) if count]
     if not lost or fmean(lost) <= TOO_MANY:
         return ""
     where = f"{fmean(lost):.0%} of the splats in a view's picture lie nearer than {near:g} units"
@@ -233,7 +239,8 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     center = splats.means.median(dim=0).values
     reach = (splats.means - center).norm(dim=1) + SEEN * splats.scales.abs().amax(1)
     width = 2 * float(reach.kthvalue(max(1, round(FRAMED * len(reach)))).values)
-    most = max(width * view.fx / max(float((view.center - center.to(view.center)).norm()), near) for view in views)
+    middle = center.tolist()
+    most = max(width * view.fx / max(math.dist(view.center.tolist(), middle), near) for view in views)
     if not most < least:
         return ""
     wrong = "the cameras seem to be in other units; give those of this scene"

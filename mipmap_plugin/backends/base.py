@@ -188,7 +188,10 @@ class AdamStep:
 
 
 class Stepper(Protocol):
-    """Draws splats of 3DGS and moves them, by their raw parameters, which only it changes."""
+    """Draws splats of 3DGS and moves them, by their raw parameters, which only it changes.
+
+    Optional: `render_all(shots) -> list[Rendered]` and `differentiate_all(d_images)` draw and differentiate all views of a step in one call each.
+    """
 
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
         """The view of that number in the next step, without gradients. Several threads may each draw and differentiate one."""

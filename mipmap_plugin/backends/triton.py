@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.backends.external import NO_CUDA, UNTESTED, CachedCheck
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -56,10 +57,33 @@ class TritonBackend:
 
         The host synchronizes with the GPU once, for the number of (splat, tile) pairs, and not in the backward pass.
         """
-        self._check.require(Needs.of(gaussians, effects, gradients=True))
+        return self.render_views(gaussians, [(camera, effects)])[0]
+
+    def render_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
+        """Several views of the same splats, each with effects of its own, by one launch of each kernel. Raises as `render`."""
+        if len({effects.sh_degree for _, effects in shots}) > 1:  # which kernels are compiled for
+            return [self.render(gaussians, *shot) for shot in shots]
+        for _, effects in shots:
+            self._check.require(Needs.of(gaussians, effects, gradients=True))
         g = gaussians
-        image, alpha = _Draw.apply(camera, effects, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)  # type: ignore[no-untyped-call]  # torch's
-        return Rendered(image, alpha)
+        outputs = _Draw.apply(shots, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)  # type: ignore[no-untyped-call]  # torch's
+        return [Rendered(image, alpha) for image, alpha in zip(outputs[::2], outputs[1::2], strict=True)]
+
+    @torch.no_grad()
+    def blend_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor:
+        """The sum of each splat's blend weights over the image, [N]. Raises as `render`."""
+        self._check.require(Needs.of(gaussians, effects, gradients=True))
+        from mipmap_plugin.backends.triton_kernels import drawing
+
+        g = gaussians
+        with torch.cuda.device_of(g.means):
+            return drawing.weigh(drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), [(camera, effects)])
+
+    def stepper(self, raw: Mapping[str, Tensor]) -> Stepper:
+        """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`."""
+        from mipmap_plugin.backends.triton_kernels.stepping import TritonStepper
+
+        return TritonStepper(raw)
 
 
 def missing() -> list[str]:
@@ -70,23 +94,28 @@ def missing() -> list[str]:
 
 
 class _Draw(torch.autograd.Function):
+    """The image and the alpha of each shot, one after the other."""
+
     @staticmethod
-    def forward(ctx: Any, camera: Camera, effects: Effects, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, shots: Sequence[tuple[Camera, Effects]], *tensors: Tensor) -> tuple[Tensor, ...]:
         from mipmap_plugin.backends.triton_kernels import drawing
 
         with torch.cuda.device_of(tensors[0]):  # kernels are launched on the current GPU, which may be another
-            image, transmittance, ctx.drawing = drawing.draw(drawing.KernelSplats.of(*tensors), camera, effects)
-        ctx.save_for_backward(*tensors, image, transmittance)
-        return image, 1 - transmittance
+            drawn = drawing.draw(drawing.KernelSplats.of(*tensors), shots)
+        ctx.projected = drawn.projected
+        ctx.save_for_backward(*tensors, drawn.images, drawn.transmittances)
+        images, alphas = drawn.views_of(drawn.images), drawn.views_of(1 - drawn.transmittances)
+        return tuple(output for pair in zip(images, alphas, strict=True) for output in pair)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, d_image: Tensor, d_alpha: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *d_outputs: Tensor) -> tuple[Tensor | None, ...]:
         from mipmap_plugin.backends.triton_kernels import drawing
 
-        *tensors, image, transmittance = ctx.saved_tensors
-        in_order = torch.are_deterministic_algorithms_enabled()
-        with torch.cuda.device_of(image):
-            splats = drawing.KernelSplats.of(*tensors)
-            grads = drawing.draw_back(ctx.drawing, splats, image, transmittance, d_image, d_alpha, deterministic=in_order)
-        return None, None, *grads
+        *tensors, images, transmittances = ctx.saved_tensors
+        splats, drawn = drawing.KernelSplats.of(*tensors), drawing.Drawing(ctx.projected, images, transmittances)
+        grads, in_order = splats.new_gradients(), torch.are_deterministic_algorithms_enabled()
+        with torch.cuda.device_of(images):
+            d_records = drawing.draw_back(drawn, drawn.packed(d_outputs[::2]), drawn.packed(d_outputs[1::2]), deterministic=in_order)
+            drawing.project_back(splats, drawn.projected, d_records, grads)
+        return None, *grads[:-1]

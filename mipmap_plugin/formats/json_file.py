@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,8 @@ def numbers(value: Any, shape: tuple[int, ...], where: str) -> Tensor:
 
 def positive(value: Any, where: str) -> float:
     """`value` as a positive float. Raises SceneError, beginning with `where`."""
+    if type(value) in (int, float) and 0 < value <= sys.float_info.max:  # without a tensor for each of a thousand numbers
+        return float(value)
     number = numbers(value, (), where).item()
     if number <= 0:
         raise SceneError(f"{where}: is {number:g} but must be above 0; correct the file")

@@ -10,6 +10,7 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import FRUSTUM_MARGIN
+from mipmap_plugin.splatting.camera_tensors import CameraTensors
 from mipmap_plugin.splatting.rotations import rotations
 
 
@@ -36,19 +37,21 @@ def axes_of(quats: Tensor, scales: Tensor) -> Tensor:
     return rotations(quats) * scales[:, None, :]
 
 
-def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: float = FRUSTUM_MARGIN, axes: Tensor | None = None) -> Projected:
+def project(
+    gaussians: Gaussians, camera: Camera | CameraTensors, near: float, frozen_beyond: float = FRUSTUM_MARGIN, axes: Tensor | None = None
+) -> Projected:
     """Project splats to the image plane. The values of splats nearer than `near` are finite but meaningless.
 
-    `axes` [N, 3, 3]: those of the splats, if they are known (`axes_of`), a third of the time.
+    `camera`: of several, what is returned has a row for each in front of the others. `axes` [N, 3, 3]: those of the splats, if they are
+    known (`axes_of`), a third of the time.
     """
-    viewmat = camera.viewmat.to(gaussians.means)
-    in_camera = camera.to_camera(gaussians.means)
-    depths = in_camera[:, 2]
-    safe = depths.clamp_min(near)
-    slopes = in_camera[:, :2] / safe[:, None]
-    focal = slopes.new_tensor([camera.fx, camera.fy])
-    means2d = slopes * focal + slopes.new_tensor([camera.cx, camera.cy])
-    to_image = _jacobian(slopes, safe, camera, frozen_beyond) @ viewmat[:3, :3]
+    view = CameraTensors.of(camera, gaussians.means) if isinstance(camera, Camera) else camera
+    in_camera = view.to_camera(gaussians.means)
+    depths = in_camera[..., 2]
+    safe = depths.clamp_min(near)[..., None]
+    slopes = in_camera[..., :2] / safe
+    means2d = slopes * view.focal + view.middle
+    to_image = _jacobian(slopes, safe, view, frozen_beyond)
     if gaussians.covariances is not None:
         shapes = _from_covariances(to_image, gaussians.covariances)
     else:
@@ -56,28 +59,26 @@ def project(gaussians: Gaussians, camera: Camera, near: float, frozen_beyond: fl
     return Projected(means2d, depths, *shapes, to_image)
 
 
-def _jacobian(slopes: Tensor, depths: Tensor, camera: Camera, frozen_beyond: float) -> Tensor:
-    """Jacobian of the projection at each center, [N, 2, 3]; slopes are clamped to the frustum widened by `frozen_beyond` on each side."""
-    half = slopes.new_tensor([camera.width / camera.fx, camera.height / camera.fy]) / 2
-    left = slopes.new_tensor([camera.cx / camera.fx, camera.cy / camera.fy])
-    margin = frozen_beyond * half
-    u, v = torch.minimum(torch.maximum(slopes, -left - margin), 2 * half - left + margin).unbind(-1)
-    per_x, per_y, zero = camera.fx / depths, camera.fy / depths, torch.zeros_like(depths)
-    return torch.unflatten(torch.stack([per_x, zero, -per_x * u, zero, per_y, -per_y * v], -1), -1, (2, 3))
+def _jacobian(slopes: Tensor, depths: Tensor, view: CameraTensors, frozen_beyond: float) -> Tensor:
+    """The derivative of the projection at each center, [..., N, 2, 3]; slopes are clamped to the frustum widened by `frozen_beyond` on each side."""
+    left, right = view.first - frozen_beyond * view.half, view.first + (2 + frozen_beyond) * view.half
+    clamped = torch.minimum(torch.maximum(slopes, left), right)
+    across, ahead = view.rotation[..., None, :2, :], view.rotation[..., None, 2:, :]
+    return (view.focal / depths)[..., None] * (across - clamped[..., None] * ahead)
 
 
 def _from_factors(factor: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Covariance entries and determinant of F Fᵀ for F [N, 2, 3].
+    """Covariance entries and determinant of F Fᵀ for F [..., N, 2, 3].
 
     The determinant is the sum of F's squared minors (Cauchy-Binet): unlike xx·yy - xy² it cannot become negative when the
     axes of a splat differ by many orders of magnitude.
     """
-    first, second = factor.unbind(1)
+    first, second = factor.unbind(-2)
     det = torch.linalg.cross(first, second).square().sum(-1)
     return first.square().sum(-1), (first * second).sum(-1), second.square().sum(-1), det
 
 
 def _from_covariances(to_image: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     flat = to_image @ covariances @ to_image.mT
-    xx, xy, yy = flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1]
+    xx, xy, yy = flat[..., 0, 0], flat[..., 0, 1], flat[..., 1, 1]
     return xx, xy, yy, (xx * yy - xy * xy).clamp_min(0)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Lock
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from mipmap_plugin.adaptation.renderers import Comparison, SteppingRenderer
 from mipmap_plugin.adaptation.target.image_store import from_16_bits
 from mipmap_plugin.backends.base import Rendered, Stepper
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.tiles.folder import halo_file, layer_file
 from mipmap_plugin.tiles.halo import FINE
@@ -131,15 +133,17 @@ class _InHalo(SteppingRenderer):
     """Draws a core with its surroundings by what moves it afterwards."""
 
     around: Surroundings
+    together: ClassVar[bool] = False
 
-    def differentiate(self, stepper: Stepper, number: int, camera: Camera, draw: int, compare: Comparison) -> Tensor:
+    def differentiate_one(self, stepper: Stepper, number: int, shot: tuple[Camera, Effects], compare: Comparison) -> Tensor:
         """See `SteppingRenderer`. The first view of a step is drawn whatever it shows, so that every step has gradients."""
+        camera, _ = shot
         if camera.name == NOTHING and number > 0:
             return torch.zeros(())
-        core = stepper.render(number, camera, *self.targets)
+        core = stepper.render(number, *shot)
         image, alpha = core.image.requires_grad_(), core.alpha.requires_grad_()
         whole = self.around.whole(camera, core)
-        gradient, square_error = compare(whole.detach())
+        gradient, square_error = compare(number, whole.detach())
         whole.backward(gradient)
         assert image.grad is not None  # since the whole contains it
         stepper.differentiate(number, image.grad, alpha.grad)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,9 +47,9 @@ class ByRows:
         same = parameters.keys() == self.parameters.keys() and all(tensor is self.parameters[name] for name, tensor in parameters.items())
         return same and self.versions == _versions(parameters)
 
-    def differentiate(self, number: int, camera: Camera, draw: int, compare: Comparison) -> Tensor:
-        """Draw the view of that number in a step, the `draw`-th since the beginning, and compare its image; return the mean square error."""
-        return self.draw.differentiate(self.stepper, number, camera, draw, compare)
+    def differentiate(self, cameras: Sequence[Camera], draw: int, compare: Comparison) -> list[Tensor]:
+        """Draw the views of a step, whose first is the `draw`-th since the beginning, and compare their images; return the mean square errors."""
+        return self.draw.differentiate(self.stepper, cameras, draw, compare)
 
     def step(self, optimizer: Adam) -> None:
         """Move the parameters, once some views are differentiated."""

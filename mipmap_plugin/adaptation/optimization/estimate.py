@@ -40,6 +40,14 @@ class Costs:
         self.truths.setdefault(view, (time.perf_counter() - self.motion() - began) / threads.side_by_side_now())
         return image
 
+    def prepare(self, views: Sequence[Camera], make: Callable[[Sequence[Camera]], object]) -> None:
+        """Make the truths of `views`, which have none yet, together; note how long that took."""
+        began = time.perf_counter() - self.motion()
+        make(views)
+        each = (time.perf_counter() - self.motion() - began) / len(views)
+        for view in views:
+            self.truths.setdefault(view, each)
+
     def check(self, validate: Callable[[], Result]) -> Result:
         """Return the result of a validation, and note how long it took."""
         began = time.perf_counter() - self.motion()

@@ -36,7 +36,7 @@ class Evaluations:
 
         `ceiling`: of the rates' factor (`Steering`).
         """
-        self._squares += float(self._rates(step - 1, ceiling)[0]) ** 2
+        self._squares += (self._config.rates.means * min(float(self._factors[step - 1]), ceiling)) ** 2
         if not self._follow.moments or step >= self._config.steps:
             return 0.0
         return self._follow.evaluation * self._count(step, ceiling, draws + checks * self._checked)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.curve import CurvePoint, decibel
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
@@ -113,13 +112,11 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
 def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     """A step by the backend, which sums the gradients of the views that are drawn and compared side by side."""
 
-    def differentiate(number: int) -> Tensor:
-        view = views[number]
-        target = run.costs.truth(view, task.truth)  # r(x̂): the frozen base, resized
-        draw = run.step * config.views_per_step + number
-        return rows.differentiate(number, cameras[view], draw, lambda x: _compare(task, config, view, x, target))  # x: the student
+    def compare(number: int, x: Tensor) -> tuple[Tensor, Tensor]:  # x: the student
+        target = run.costs.truth(views[number], task.truth)  # r(x̂): the frozen base, resized
+        return _compare(task, config, views[number], x, target)
 
-    square_errors = list(side_by_side(differentiate, range(len(views)), math.gcd(len(views), threads.for_views())))
+    square_errors = rows.differentiate([cameras[view] for view in views], run.step * config.views_per_step, compare)
     run.square_error = run.square_error + torch.stack(square_errors).mean()
     rows.step(run.optimizer)
 

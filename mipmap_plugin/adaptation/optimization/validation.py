@@ -18,7 +18,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.curve import decibel
 from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
-from mipmap_plugin.adaptation.parallel import max_threads
+from mipmap_plugin.adaptation.parallel import max_threads, together
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.target.resize import difference_from
 from mipmap_plugin.adaptation.views import choose_views
@@ -91,15 +91,20 @@ class Validation:
     @torch.no_grad()
     def _errors(self, model: SplatModel, views: Sequence[Camera]) -> list[list[float]]:
         """The mean square error of each view, per viewer."""
-        shared = model.gaussians(views[0]) if views and model.traits.same_for_all_views else None
-        threads = max_threads(model.parameters()["means"], views[0].zoomed(self.scale)) if views else 1
+        renders = (self.render, *self.further_renders)
+        if not views:
+            return [[] for _ in renders]
+        shared = model.gaussians(views[0]) if model.traits.same_for_all_views else None
+        cameras = [view.zoomed(self.scale) for view in views]
+        threads = max_threads(model.parameters()["means"], cameras[0])
 
-        def error(draw: Callable[[Camera], Tensor], view: Camera) -> float:
-            image = draw(view.zoomed(self.scale)).clamp(0, 1)
-            return float(difference_from(self.truth(view), image, self.resize).square().mean())
+        def error(draw: Callable[[Camera], Tensor], number: int) -> Tensor:
+            image = draw(cameras[number]).clamp(0, 1)
+            return difference_from(self.truth(views[number]), image, self.resize).square().mean()
 
-        draws = [_drawing(render, model, shared) for render in (self.render, *self.further_renders)]
-        return [list(side_by_side(partial(error, draw), views, threads)) for draw in draws]
+        draws = [_drawing(render, model, shared, cameras) for render in renders]
+        errors = [list(side_by_side(partial(error, draw), range(len(views)), threads)) for draw in draws]
+        return [torch.stack(each).tolist() for each in errors]  # a GPU is waited for once, and not for each view
 
     def steer(self, model: SplatModel) -> float:
         """The visible quality (dB) on the steering views."""
@@ -126,11 +131,19 @@ class Validation:
         return [name for name in among if quality[name] >= least][-1], {name: min(map(mean_db, each)) for name, each in errors.items()}
 
 
-def _drawing(render: Callable[[Gaussians, Camera], Tensor], model: SplatModel, shared: Gaussians | None) -> Callable[[Camera], Tensor]:
-    """What draws a model, whose splats are `shared` by all cameras, if they are."""
+def _drawing(
+    render: Callable[[Gaussians, Camera], Tensor], model: SplatModel, shared: Gaussians | None, cameras: Sequence[Camera]
+) -> Callable[[Camera], Tensor]:
+    """What draws a model for each of `cameras`; its splats are `shared` by all of them, if they are."""
     if shared is None:
         return lambda camera: render(model.gaussians(camera), camera)
-    return render.of(shared) if isinstance(render, Renderer) else partial(render, shared)
+    if not isinstance(render, Renderer):
+        return partial(render, shared)
+    render_views = getattr(render.backend, "render_views", None)
+    if render_views is None or render.effects.settings.packing is not None or together(shared.means, cameras) < len(cameras):
+        return render.of(shared)
+    drawn = dict(zip(cameras, render_views(shared, [(camera, render.effects) for camera in cameras]), strict=True))
+    return lambda camera: drawn[camera].image
 
 
 def mean_db(errors: Sequence[float]) -> float:

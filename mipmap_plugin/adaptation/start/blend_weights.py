@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.parallel import max_threads
+from mipmap_plugin.adaptation.parallel import in_batches, max_threads, together
 from mipmap_plugin.adaptation.start.closed_form import filter_variance
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
@@ -28,28 +28,40 @@ UNSEEN = 1e-3
 
 def blend_weights(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Tensor:
     """The blend weight of each splat, summed over the pixels of a view and averaged over `views`: [N] in pixels; 0 for an invisible splat."""
-    return weighed(gaussians, views, backend, effects)[0]
+    total = torch.zeros_like(gaussians.opacities)
+    for some in _of_views(gaussians, views, backend, effects):
+        total += some.sum(0)
+    return total / len(views)
 
 
 def weighed(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> tuple[Tensor, float]:
-    """`blend_weights`, and the fraction of the splats that a view shows, mean over `views`; what is hidden behind others does not count.
+    """`blend_weights`, and the fraction of the splats that a view shows, mean over `views`; what is hidden behind others does not count."""
+    total, shown = (torch.zeros_like(gaussians.opacities) for _ in range(2))
+    for some in _of_views(gaussians, views, backend, effects):
+        total += some.sum(0)
+        shown += (some > SHOWN).sum(0)
+    return total / len(views), float(shown.mean()) / len(views)
+
+
+def _of_views(gaussians: Gaussians, views: Sequence[Camera], backend: Backend, effects: Effects) -> Iterator[Tensor]:
+    """The sum of each splat's blend weights over each view, [V, N], of some views after the others.
 
     An image is linear in the splats' colors, so that the weights are the gradient of the image's sum with respect to the colors. Works
-    with any backend that has gradients, and faster with one that computes them itself (`Backend.blend_weights`).
+    with any backend that has gradients, and faster with one that computes them itself, for a view (`Backend.blend_weights`) or for several
+    (`Backend.weigh_views`).
     """
     plain = replace(effects, sh_degree=0, settings=effects.settings.without_color_rounding())
     weigh = getattr(backend, "blend_weights", None)
+    gray = replace(gaussians, sh=torch.zeros_like(gaussians.sh[:, :1]))
 
     def weights(view: Camera) -> Tensor:
-        gray = replace(gaussians, sh=torch.zeros_like(gaussians.sh[:, :1]))
         known: Tensor | None = None if weigh is None else weigh(gray, view, plain)
-        return _color_gradient(gray, view, backend, plain) if known is None else known
+        return (_color_gradient(gray, view, backend, plain) if known is None else known)[None]
 
-    total, shown = torch.zeros_like(gaussians.opacities), 0.0
-    for each in side_by_side(weights, views, max_threads(gaussians.means, views[0])):
-        total += each
-        shown += float((each > SHOWN).float().mean())
-    return total / len(views), shown / len(views)
+    if (weigh_views := getattr(backend, "weigh_views", None)) is None:
+        return side_by_side(weights, views, max_threads(gaussians.means, views[0]))
+    size = together(gaussians.means, views)
+    return (weigh_views(gray, [(view, plain) for view in views[start : start + size]]) for start in range(0, len(views), size))
 
 
 def whole_weights(gaussians: Gaussians, pixel: Tensor, views: Sequence[Camera], base: Effects, scale: float) -> Tensor:
@@ -78,8 +90,8 @@ def may_show(weights: Tensor, whole: Tensor, means: Tensor, views: Sequence[Came
 def _pictured(means: Tensor, views: Sequence[Camera]) -> Tensor:
     """[N] bool: which means [N, 3] lie in the picture of a view."""
     found = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-    for view in views:
-        found |= view.in_picture(view.to_camera(means))
+    for view in in_batches(views, means):
+        found |= view.in_picture(view.to_camera(means)).any(0)
     return found
 
 

@@ -38,12 +38,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.parallel import in_chunks
+from mipmap_plugin.adaptation.parallel import in_batches, in_chunks
 from mipmap_plugin.adaptation.start.pixel_size import enough_views, mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant, widened_to_filter
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.camera_tensors import CameraTensors
 from mipmap_plugin.splatting.filters import INTEGRALS, SQUARE_VARIANCE, compensates, footprint, widening
 from mipmap_plugin.splatting.projection import Projected, axes_of, project
 
@@ -138,7 +139,7 @@ def _of_surfels(
         """[N]: the visible area of splats of these scales in the target over their visible area in the base."""
         new = replace(gaussians, scales=scales)
 
-        def ratio(camera: Camera, projected: Projected) -> Tensor:
+        def ratio(camera: CameraTensors, projected: Projected) -> Tensor:
             return visible_area(project(new, camera, target.near_plane), target.eps2d) / visible_area(projected, base.eps2d * scale**2)
 
         return _mean_in_front(gaussians, zoomed, base.near_plane, ratio)
@@ -189,7 +190,7 @@ def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: 
     base, target = effects
     new_axes = axes_of(new.quats, new.scales)
 
-    def areas(_: Camera, projected: Projected) -> Tensor:
+    def areas(_: CameraTensors, projected: Projected) -> Tensor:
         new_projected = projected.with_axes(new_axes) if new.covariances is None else projected
         dets = _det(projected, filter_variance(base) * scale**2), _det(new_projected, filter_variance(target))
         return torch.stack(dets).sqrt()
@@ -199,14 +200,14 @@ def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: 
     return torch.where(ratio.isfinite(), ratio, 1.0).clamp_max(limit)  # areas beyond the type's range: the splat keeps its opacity
 
 
-def _mean_in_front(gaussians: Gaussians, views: Sequence[Camera], near: float, quantity: Callable[[Camera, Projected], Tensor]) -> Tensor:
+def _mean_in_front(gaussians: Gaussians, views: Sequence[Camera], near: float, quantity: Callable[[CameraTensors, Projected], Tensor]) -> Tensor:
     """[..., N]: the mean of `quantity(view, projection)` over the views that a splat lies in front of; 1 where there is none."""
     total, count = torch.zeros_like(gaussians.opacities), torch.zeros_like(gaussians.opacities)
     axes = axes_of(gaussians.quats, gaussians.scales)
-    for view in views:
+    for view in in_batches(views, gaussians.means):
         projected = project(gaussians, view, near, axes=axes)
         in_front = projected.depths > near
-        total, count = total + torch.where(in_front, quantity(view, projected), 0.0), count + in_front
+        total, count = total + torch.where(in_front, quantity(view, projected), 0.0).sum(-2), count + in_front.sum(0)
     return torch.where(count > 0, total / count.clamp_min(1), 1.0)
 
 

@@ -40,6 +40,9 @@ UNSEEN_WEIGHT = 1e-6
 # A splat's partner is searched among this many next splats along a space-filling curve.
 NEIGHBORS = 8
 
+# Splats whose neighbors are compared together, where that is not compiled: each takes a kilobyte or two.
+ROWS = 1 << 17
+
 # The fraction of a round's pairs that is merged: the splats of the other pairs may find better partners among the merged ones.
 MERGED_PER_ROUND = 0.7
 
@@ -182,9 +185,9 @@ class _Moments:
             self.weights[first] + self.weights[second], mean(self.pixel),
         )  # fmt: skip
         unpaired = torch.ones_like(self.weights, dtype=torch.bool).index_fill_(0, torch.cat([first, second]), False)
-        rows = unpaired.cumsum(0) - 1
-        rows[first] = rows[second] = torch.arange(len(first), device=rows.device) + int(unpaired.sum())
-        return _Moments(*(torch.cat([getattr(self, field.name)[unpaired], getattr(pairs, field.name)]) for field in fields(self))), rows
+        rows, kept = unpaired.cumsum(0) - 1, unpaired.nonzero()[:, 0]
+        rows[first] = rows[second] = torch.arange(len(first), device=rows.device) + len(kept)
+        return _Moments(*(torch.cat([getattr(self, field.name)[kept], getattr(pairs, field.name)]) for field in fields(self))), rows
 
     def gaussians(self, before: Gaussians, rows: Tensor, old_weights: Tensor) -> Gaussians:
         """Return the merged splats. `rows` [N0]: the new row of each splat of `before`. Splats that were not merged stay bit-identical."""
@@ -228,22 +231,27 @@ class _Moments:
         return sh
 
 
-def _nearest_along(means: Tensor, shapes: Tensor, color: Tensor, weights: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
-    """What `nearest_along` returns, on any device."""
-    position = torch.arange(len(weights), device=weights.device)
-    least, nearest = torch.full_like(weights, torch.inf), torch.zeros_like(position)
-    for step in range(1, min(NEIGHBORS + 1, len(position))):
-        one, other = slice(None, -step), slice(step, None)
-        square = (means[one] - means[other]).square().sum(1)
-        square = square + (shapes[one] - shapes[other]).flatten(1).norm(dim=1).to(square)
-        distance = square / (pixel[one] * pixel[other]) + (color[one] - color[other]).square().sum(1)  # squared
-        cost = distance * weights[one] * (weights[other] / (weights[one] + weights[other]))
-        cost = torch.where((distance < MAX_DISTANCE**2) & (cost < MAX_COST), cost, torch.inf)
-        for here, there in ((one, other), (other, one)):
-            nearer = cost < least[here]
-            nearest[here] = torch.where(nearer, position[there], nearest[here])
-            least[here] = torch.where(nearer, cost, least[here])
-    return nearest, least
+def _nearest_along(means: Tensor, *further: Tensor) -> tuple[Tensor, Tensor]:
+    """What `nearest_along` returns, on any device. Each operation is one for all steps to a neighbor."""
+    position = torch.arange(len(means), device=means.device)
+    costs = torch.cat([_costs_after(rows, means, *further) for rows in position.split(ROWS)])
+    steps = torch.arange(1, NEIGHBORS + 1, device=means.device)
+    first = position[:, None] - steps  # of the pairs that end at each splat
+    before = torch.where(first < 0, torch.inf, costs.gather(0, first.clamp_min(0)))
+    least, number = torch.stack([costs, before], 2).flatten(1).min(1)
+    nearest = position + torch.stack([steps, -steps], 1).flatten()[number]
+    return nearest.clamp(0, len(means) - 1), least  # where no cost is finite, it may lie beyond the end
+
+
+def _costs_after(rows: Tensor, means: Tensor, shapes: Tensor, color: Tensor, weights: Tensor, pixel: Tensor) -> Tensor:
+    """The cost of merging each of the `rows` [n] with each of the next along the curve, [n, NEIGHBORS]; infinite above a limit and at the end."""
+    others = rows[:, None] + torch.arange(1, NEIGHBORS + 1, device=rows.device)
+    inside, others, rows = others < len(means), others.clamp_max(len(means) - 1), rows[:, None]
+    square = (means[rows] - means[others]).square().sum(2)
+    square = square + (shapes[rows] - shapes[others]).flatten(2).norm(dim=2).to(square)
+    distance = square / (pixel[rows] * pixel[others]) + (color[rows] - color[others]).square().sum(2)  # squared
+    cost = distance * weights[rows] * (weights[others] / (weights[rows] + weights[others]))
+    return torch.where(inside & (distance < MAX_DISTANCE**2) & (cost < MAX_COST), cost, torch.inf)
 
 
 def _surface(covariances: Tensor) -> Tensor:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from functools import reduce
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.parallel import in_chunks
+from mipmap_plugin.adaptation.parallel import in_batches, in_chunks
 from mipmap_plugin.camera import Camera, every_nth
 
 # Number of views from which the area and the blend weight of a splat are computed: doubled, up to a limit, until a splat is in SEEN of them on
@@ -32,8 +30,8 @@ COUNTED = 1 << 14
 def enough_views(means: Tensor, views: Sequence[Camera]) -> int:
     """How many of the views, evenly spread, have enough of the splats at `means` [N, 3] in their pictures."""
     some, points = every_nth(views, LEAST_VIEWS), means[:: max(1, len(means) // COUNTED)]
-    shares = [float(view.in_picture(view.to_camera(points)).float().mean()) for view in some]
-    return views_for(sum(shares) / max(1, len(shares)))
+    shares = [view.in_picture(view.to_camera(points)).float().mean(1) for view in in_batches(some, points)]
+    return views_for(float(torch.cat(shares).mean()) if some else 0.0)
 
 
 def views_for(share: float) -> int:
@@ -69,10 +67,10 @@ def mean_pixel_size(means: Tensor, views: Sequence[Camera], count: int | None = 
 
     def of_chunk(chunk: slice) -> Tensor:
         squares, fourths = torch.zeros(2, len(means[chunk]), dtype=torch.float64, device=means.device)  # whose range powers do not leave
-        for view in some:
+        for view in in_batches(some, means[chunk]):
             points = view.to_camera(means[chunk])
-            rates = torch.where(view.in_picture(points), _focal(view) / points[:, 2], 0.0).double()
-            squares, fourths = squares + rates.square(), fourths + rates.square().square()
+            rates = torch.where(view.in_picture(points), view.mean_focal / points[..., 2], 0.0).double().square()
+            squares, fourths = squares + rates.sum(0), fourths + rates.square().sum(0)
         mean: Tensor = (squares / fourths).sqrt().to(means)
         return mean
 
@@ -99,10 +97,12 @@ def _finest(means: Tensor, views: Sequence[Camera], near: float = 0.0) -> tuple[
 
     def of_chunk(chunk: slice) -> tuple[Tensor, Tensor]:
         finest, seeing = torch.full_like(means[chunk, 0], torch.inf), torch.zeros_like(means[chunk, 0])
-        for view in views:
-            points = view.to_camera(means[chunk])
+        rows = means[chunk].T.contiguous().T  # whose coordinates lie one after the other, as they are read
+        for view in in_batches(views, rows):
+            points = view.to_camera(rows)
             seen = view.in_picture(points, near)
-            finest, seeing = torch.where(seen, torch.minimum(finest, points[:, 2] / _focal(view)), finest), seeing + seen
+            sizes = torch.where(seen, points[..., 2] / view.mean_focal, torch.inf)
+            finest, seeing = torch.minimum(finest, sizes.amin(0)), seeing + seen.sum(0)
         return finest, seeing
 
     finest, seeing = zip(*in_chunks(of_chunk, means), strict=True)
@@ -112,9 +112,6 @@ def _finest(means: Tensor, views: Sequence[Camera], near: float = 0.0) -> tuple[
 def _nearest(means: Tensor, views: Sequence[Camera]) -> Tensor:
     """The size of a pixel at each mean in the closest of all views, by its distance, for in the camera's own plane a depth is 0: [N]."""
     least = torch.finfo(means.dtype).eps
-    nearest: Tensor = reduce(torch.minimum, (view.to_camera(means).norm(dim=1).clamp_min(least) / _focal(view) for view in views))
-    return nearest
-
-
-def _focal(view: Camera) -> float:
-    return math.sqrt(view.fx * view.fy)
+    batches = in_batches(views, means)
+    nearest = [((means - view.center).norm(dim=-1).clamp_min(least) / view.mean_focal).amin(0) for view in batches]
+    return torch.stack(nearest).amin(0)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -37,6 +38,16 @@ class BaseImages:
         """
         return self._store((facts(view), fraction), lambda: self._render(view, fraction))
 
+    def of_one_size(self, views: Sequence[Camera], fraction: float = 1.0) -> Tensor:
+        """The same of several views whose images are of one size, [V, H, W, 3]: those that are not known are drawn in one call."""
+        keys = [(facts(view), fraction) for view in views]
+        return self._store.of_one_size(keys, lambda numbers: self._render_together([views[number] for number in numbers], fraction))
+
+    @property
+    def draws_together(self) -> bool:
+        """Whether several images can be drawn in one call."""
+        return self.model.traits.same_for_all_views and hasattr(self.backend, "render_views")
+
     def are_of(self, model: SplatModel, backend: Backend, effects: Effects) -> bool:
         """Whether these are the images of this model, as it is now, by such a backend."""
         same = self.model is model and self._versions == _versions(model)  # its owner may change a model that is not of a file
@@ -49,12 +60,22 @@ class BaseImages:
 
     @torch.no_grad()
     def _render(self, view: Camera, fraction: float) -> Tensor:
+        camera, effects = self._shot(view, fraction)
+        return self.backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
+
+    @torch.no_grad()
+    def _render_together(self, views: Sequence[Camera], fraction: float) -> Tensor:
+        shots = [self._shot(view, fraction) for view in views]
+        drawn = cast(Any, self.backend).render_views(self._splats(shots[0][0]), shots)
+        return torch.stack([rendered.image for rendered in drawn]).clamp_(0, 1)
+
+    def _shot(self, view: Camera, fraction: float) -> tuple[Camera, Effects]:
+        """The camera of an image, and how it is rendered."""
         # Resized, not zoomed: the model sees the `zoom` of its training, so that it shows the same splats, only with fewer pixels.
         factor = fraction / view.zoom  # a view of a band (`over_band`) samples `zoom` times as finely as the base
         size = (view.width, view.height) if factor == 1 else (max(1, round(view.width * factor)), max(1, round(view.height * factor)))
         camera = view if (factor, view.zoom) == (1, 1) else replace(view.resized(*size), zoom=1.0)
-        effects = replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
-        return self.backend.render(self._splats(camera), camera, effects).image.clamp(0, 1)
+        return camera, replace(self.effects, eps2d=self.effects.eps2d * fraction**2)
 
     def _splats(self, camera: Camera) -> Gaussians:
         """The splats, activated once if all cameras see the same ones: activation takes a fifth of a small image's time."""

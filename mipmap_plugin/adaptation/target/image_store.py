@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import torch
@@ -21,12 +21,12 @@ LEFT_FREE = 0.5
 
 def in_16_bits(image: Tensor) -> Tensor:
     """An image of -2..2 as it is stored."""
-    return (image * STEPS).round().clamp(-MOST, MOST).to(torch.int16)
+    return (image * STEPS).round_().clamp_(-MOST, MOST).to(torch.int16)
 
 
-def from_16_bits(stored: Tensor) -> Tensor:
+def from_16_bits(stored: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """An image that was stored, of floats or whole numbers."""
-    return stored / STEPS
+    return stored / torch.tensor(STEPS, dtype=dtype)  # on the processor: a number to a GPU, whose type the image gets in the same operation
 
 
 class ImageStore:
@@ -44,7 +44,21 @@ class ImageStore:
         if stored is None:
             stored = in_16_bits(make())
             self._keep(key, stored)
-        return from_16_bits(stored.to(self._like, non_blocking=True))
+        return from_16_bits(stored.to(self._like.device, non_blocking=True), self._like.dtype)
+
+    def of_one_size(self, keys: Sequence[Hashable], make: Callable[[list[int]], Tensor]) -> Tensor:
+        """Return several images, [V, H, W, 3]; those that are not there are made together, by the numbers of their keys."""
+        stored = {number: self._images[key] for number, key in enumerate(keys) if key in self._images}
+        if new := [number for number in range(len(keys)) if number not in stored]:
+            made = in_16_bits(make(new))
+            stored |= dict(zip(new, made.unbind(), strict=True))
+            for number in new:
+                self._keep(keys[number], stored[number])
+        all_of_them = torch.stack([stored[number].to(self._like.device, non_blocking=True) for number in range(len(keys))])
+        return from_16_bits(all_of_them, self._like.dtype)
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._images
 
     def _keep(self, key: Hashable, image: Tensor) -> None:
         if self._bytes + image.nbytes <= self._limit:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Sequence
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.resize import resize, resize_all
 from mipmap_plugin.adaptation.target.upsamplers import Upsampler, check_upsampler, find_upsampler
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -43,6 +44,19 @@ class PseudoTruth:
         """Return the pseudo truth of a camera of the base scale."""
         return self._store(view, lambda: self._make(view))
 
+    def prepare(self, views: Sequence[Camera]) -> None:
+        """Make the truths of `views` that are not known: those of one size together, as a GPU waits for each operation."""
+        new = {view: None for view in views if view not in self._store}
+        if self._photographs or enlarges(self._config, self._scale) or not self._base.draws_together:
+            for view in new:
+                self(view)
+            return
+        sizes: dict[tuple[int, int, float], list[Camera]] = {}
+        for view in new:
+            sizes.setdefault((view.width, view.height, view.zoom), []).append(view)
+        for same in sizes.values():
+            self._store.of_one_size(same, partial(self._make_together, same))
+
     @cached_property
     def _enlarge(self) -> Upsampler:
         """The upsampler, loaded when it is first needed."""
@@ -58,6 +72,16 @@ class PseudoTruth:
             target = self._base(view) if photograph is None else photograph
         else:
             target = resize(self._base(view, self._resolution(view)), size, self._config.resize)
+        return self._quantized(target)
+
+    @torch.no_grad()
+    def _make_together(self, same: Sequence[Camera], numbers: Sequence[int]) -> Tensor:
+        """The truths [V, h, w, 3] of some of the views of one size, by their numbers."""
+        views = [same[number] for number in numbers]
+        images = self._base.of_one_size(views, 1.0 if self._scale > 1 else self._resolution(views[0]))
+        return self._quantized(images if self._scale > 1 else resize_all(images, views[0].zoomed(self._scale).size, self._config.resize))
+
+    def _quantized(self, target: Tensor) -> Tensor:
         return target.clamp(0, 1).mul(255).round().div(255) if self._config.quantize_truth else target
 
     def _resolution(self, view: Camera) -> float:

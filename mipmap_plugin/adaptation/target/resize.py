@@ -25,6 +25,13 @@ def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
     return resample(image, size, method)
 
 
+def resize_all(images: Tensor, size: tuple[int, int], method: str) -> Tensor:
+    """`resize` of images [V, H, W, 3] at once, as channels of one: [V, size[0], size[1], 3], contiguous."""
+    channels = resize(images.permute(1, 2, 0, 3).flatten(2), size, method)
+    resized: Tensor = channels.unflatten(2, images.shape[::3]).permute(2, 0, 1, 3).contiguous()
+    return resized
+
+
 def _check_box(image: Tensor, size: tuple[int, int]) -> None:
     old = list(image.shape[:2])
     if any(pixels % new for pixels, new in zip(old, size, strict=True)):

@@ -12,10 +12,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from mipmap_plugin.backends.triton_kernels import PAIRS, TILE, views
+from mipmap_plugin.backends.triton_kernels import PAIRS, views
 from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, falloff
 
-LOG2_MIN_ALPHA = views.LOG2_MIN_ALPHA
+LOG2_MIN_ALPHA, TILES_X, NUMBERS = views.LOG2_MIN_ALPHA, views.TILES_X, views.NUMBERS
 
 # px from a tile's edge to the outermost pixel centers, less a margin for rounding.
 EDGE = tl.constexpr(0.49)
@@ -23,23 +23,24 @@ EDGE = tl.constexpr(0.49)
 
 @dataclass(frozen=True, eq=False)
 class Bins:
-    """(splat, tile) pairs, sorted by tile and then by depth."""
+    """(splat, tile) pairs of V views, sorted by tile and then by depth. A splat's number in view v is v · N + n, a tile's v · tiles + t."""
 
     splat_ids: Tensor  # [pairs] int32
-    tile_offsets: Tensor  # [tiles + 1] int64, where each tile's pairs begin and end; pairs in no tile follow after the last
+    tile_offsets: Tensor  # [V · tiles + 1] int64, where each tile's pairs begin and end; pairs in no tile follow after the last
     places: Tensor  # [pairs] int64, index of each pair when the pairs of each splat lie side by side
-    starts: Tensor  # [N] int64, first index of each splat in that order
-    counts: Tensor  # [N] int32, number of its pairs
+    starts: Tensor  # [V · N] int64, first index of each splat in that order
+    counts: Tensor  # [V · N] int32, number of its pairs
 
 
-@triton.jit
-def emit_kernel(records, boxes, starts, owners, tiles, view, count, tiles_x, no_tile, TILE: tl.constexpr, BLOCK: tl.constexpr):
+@triton.jit(do_not_specialize=["pairs", "count", "most_tiles", "no_tile"])
+def emit_kernel(records, boxes, starts, owners, tiles, shots, pairs, count, most_tiles, no_tile, TILE: tl.constexpr, BLOCK: tl.constexpr):
     """Write the tile of each pair, or `no_tile` where the splat's ellipse does not reach that tile of its box."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    inside = at < count
+    inside = at < pairs
     owner = tl.load(owners + at, inside, 0).to(tl.int64)
     nth = (at - tl.load(starts + owner, inside, 0)).to(tl.int32)
-    box = boxes + 4 * owner
+    box, number = boxes + 4 * owner, (owner // count).to(tl.int32)
+    view = shots + number * NUMBERS
     wide = tl.load(box + 2, inside, 1)
     tile_x, tile_y = tl.load(box, inside, 0) + nth % wide, tl.load(box + 1, inside, 0) + nth // wide
     x, y, along, shear, across, log2_opacity = falloff(records, owner, inside)
@@ -54,23 +55,28 @@ def emit_kernel(records, boxes, starts, owners, tiles, view, count, tiles_x, no_
     right = shear * at_right + tl.sqrt(tl.maximum(level + along * at_right * at_right, 0.0) / -across)
     left = shear * at_left - tl.sqrt(tl.maximum(level + along * at_left * at_left, 0.0) / -across)
     outside = (top > bottom) | (x + right < tile_x * TILE + EDGE) | (x + left > tile_x * TILE + TILE - EDGE)
-    tl.store(tiles + at, tl.where(outside, no_tile, tile_y * tiles_x + tile_x), inside)
+    tile = number * most_tiles + tile_y * tl.load(view + TILES_X).to(tl.int32) + tile_x
+    tl.store(tiles + at, tl.where(outside, no_tile, tile), inside)
 
 
-def bin_splats(records: Tensor, depths: Tensor, boxes: Tensor, view: Tensor, tiles_x: int, tiles_y: int) -> Bins:
-    """Pair `records` [N, 9] with the tiles in their `boxes` [N, 4]. The host synchronizes once, for the number of pairs."""
+def bin_splats(records: Tensor, depths: Tensor, boxes: Tensor, shots: Tensor, most_tiles: int, tile: int) -> Bins:
+    """Pair the records [V · N, 9] with the tiles in their boxes [V · N, 4]. The host synchronizes once, for the number of pairs.
+
+    most_tiles: of a view. tile: px.
+    """
     order = depths.argsort(stable=True)
     counts = boxes[:, 3]
-    ends = counts[order].cumsum(0, dtype=torch.int64)
-    starts = torch.empty_like(ends).scatter_(0, order, ends - counts[order])
+    in_order = counts[order]
+    ends = in_order.cumsum(0, dtype=torch.int64)
+    starts = torch.empty_like(ends).scatter_(0, order, ends - in_order)
     pairs = int(ends[-1]) if len(ends) else 0
-    owners = order.int().repeat_interleave(counts[order], output_size=pairs)
-    no_tile = tiles_x * tiles_y
+    owners = order.int().repeat_interleave(in_order, output_size=pairs)
+    no_tile = len(shots) * most_tiles
     # A radix sort takes one pass per byte of the key.
     tiles = torch.empty(pairs, dtype=torch.int16 if no_tile < 1 << 15 else torch.int32, device=depths.device)
     if pairs:
-        grid = (triton.cdiv(pairs, PAIRS),)
-        emit_kernel[grid](records, boxes, starts, owners, tiles, view, pairs, tiles_x, no_tile, TILE=TILE, BLOCK=PAIRS)
+        grid, count = (triton.cdiv(pairs, PAIRS),), len(records) // len(shots)
+        emit_kernel[grid](records, boxes, starts, owners, tiles, shots, pairs, count, most_tiles, no_tile, TILE=tile, BLOCK=PAIRS)
     by_tile, places = tiles.sort(stable=True)
     tile_offsets = torch.searchsorted(by_tile, torch.arange(no_tile + 1, dtype=tiles.dtype, device=tiles.device))
     return Bins(owners[places], tile_offsets, places, starts, counts)

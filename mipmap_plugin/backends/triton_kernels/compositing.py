@@ -16,56 +16,73 @@ from mipmap_plugin.backends.triton_kernels.records import RECORD
 MAX_ALPHA = tl.constexpr(render_settings.MAX_ALPHA)
 MIN_ALPHA, MIN_TRANSMITTANCE = views.MIN_ALPHA, views.MIN_TRANSMITTANCE
 RED, GREEN, BLUE = views.RED, views.GREEN, views.BLUE
+WIDTH, HEIGHT, TILES_X, NUMBERS = views.WIDTH, views.HEIGHT, views.TILES_X, views.NUMBERS
 
 
 @triton.jit
-def pixels(tiles_x, width, height, TILE: tl.constexpr):
-    """This program's pixels [TILE²]: their centers in px, their index in the image, and whether they lie inside it."""
-    tile = tl.program_id(0)
+def pixels(view, most_pixels, TILE: tl.constexpr):
+    """This program's pixels [TILE²] in its view: their centers in px, their index in the images, and whether they lie inside."""
+    tile, tiles_x = tl.program_id(0), tl.load(view + TILES_X).to(tl.int32)
+    width, height = tl.load(view + WIDTH).to(tl.int32), tl.load(view + HEIGHT).to(tl.int32)
     nth = tl.arange(0, TILE * TILE)
     x, y = tile % tiles_x * TILE + nth % TILE, tile // tiles_x * TILE + nth // TILE
-    return x + 0.5, y + 0.5, (y * width + x).to(tl.int64), (x < width) & (y < height)
+    return x + 0.5, y + 0.5, tl.program_id(1).to(tl.int64) * most_pixels + y * width + x, (x < width) & (y < height)
 
 
 @triton.jit
-def splat_at(records, splat_ids, slot, end):
-    """The splat in a slot and a pointer to its record. Past the end those of the last slot, which the caller has to ignore."""
-    splat = tl.load(splat_ids + tl.minimum(slot, end - 1)).to(tl.int64)
-    return splat, records + splat * RECORD
+def slots(tile_offsets):
+    """Where the list of this program's tile begins and ends."""
+    tile = tile_offsets + tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)
+    return tl.load(tile), tl.load(tile + 1)
 
 
 @triton.jit
-def alpha_at(row, valid, px, py, least):
-    """For the record at `row` and the pixels [P]: dy, u = dx - shear · dy, and alpha before and after its cut-offs."""
-    dy = py - tl.load(row + 1)
-    u = px - tl.load(row) - tl.load(row + 3) * dy
-    log2_opacity = tl.where(valid, tl.load(row + 5), float("-inf"))
-    raw = tl.exp2(tl.load(row + 2) * dy * dy + tl.load(row + 4) * u * u + log2_opacity)
+def largest(values):
+    """The bits of the largest of `values`, none of which is negative: the maximum of integers over a warp is one instruction."""
+    return tl.max(values.to(tl.int32, bitcast=True), axis=0)
+
+
+@triton.jit
+def record_at(records, slot, end):
+    """The nine numbers in a slot; past the `end` those of a splat that is not there."""
+    row, valid = records + slot * RECORD, slot < end
+    x, y, along, shear = tl.load(row, valid, 0.0), tl.load(row + 1, valid, 0.0), tl.load(row + 2, valid, 0.0), tl.load(row + 3, valid, 0.0)
+    across, log2_opacity = tl.load(row + 4, valid, 0.0), tl.load(row + 5, valid, float("-inf"))
+    red, green, blue = tl.load(row + 6, valid, 0.0), tl.load(row + 7, valid, 0.0), tl.load(row + 8, valid, 0.0)
+    return x, y, along, shear, across, log2_opacity, red, green, blue
+
+
+@triton.jit
+def alpha_at(record, px, py, least):
+    """For the pixels [P]: dy, u = dx - shear · dy, and alpha before and after its cut-offs."""
+    x, y, along, shear, across, log2_opacity, _red, _green, _blue = record
+    dy = py - y
+    u = px - x - shear * dy
+    raw = tl.exp2(along * dy * dy + across * u * u + log2_opacity)
     return dy, u, raw, tl.where(raw >= least, tl.minimum(raw, MAX_ALPHA), 0.0)
 
 
-@triton.jit
-def composite_kernel(records, splat_ids, tile_offsets, view, image, transmittances, tiles_x, width, height, TILE: tl.constexpr, BATCH: tl.constexpr):
-    """Composite one tile into `image` and `transmittances`."""
-    px, py, at, inside = pixels(tiles_x, width, height, TILE)
-    slot, end = tl.load(tile_offsets + tl.program_id(0)), tl.load(tile_offsets + tl.program_id(0) + 1)
+@triton.jit(do_not_specialize=["most_pixels"])
+def composite_kernel(records, tile_offsets, shots, images, transmittances, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr):
+    """Composite one tile of one view into `images` and `transmittances`."""
+    view = shots + tl.program_id(1) * NUMBERS
+    px, py, at, inside = pixels(view, most_pixels, TILE)
+    slot, end = slots(tile_offsets)
     least, stop = tl.load(view + MIN_ALPHA), tl.load(view + MIN_TRANSMITTANCE)
     running = tl.where(inside, 1.0, 0.0)  # transmittance if pixels never stopped; once it is below `stop`, the pixel is finished
     transmittance = tl.zeros_like(running) + 1
     red, green, blue = tl.zeros_like(running), tl.zeros_like(running), tl.zeros_like(running)
-    while (slot < end) & (tl.max(running, axis=0) >= stop):
+    while (slot < end) & (largest(running) >= stop.to(tl.int32, bitcast=True)):
         for _ in tl.static_range(BATCH):
-            _, row = splat_at(records, splat_ids, slot, end)
-            _, _, _, alpha = alpha_at(row, slot < end, px, py, least)
+            record = record_at(records, slot, end)
+            _dy, _u, _raw, alpha = alpha_at(record, px, py, least)
             behind = running * (1 - alpha)
             weight = tl.where(behind >= stop, running * alpha, 0.0)
-            red += weight * tl.load(row + 6)
-            green += weight * tl.load(row + 7)
-            blue += weight * tl.load(row + 8)
+            red, green, blue = red + weight * record[6], green + weight * record[7], blue + weight * record[8]
             transmittance = tl.where(behind >= stop, behind, transmittance)
             running = behind
             slot += 1
-    tl.store(image + 3 * at, red + transmittance * tl.load(view + RED), inside)
-    tl.store(image + 3 * at + 1, green + transmittance * tl.load(view + GREEN), inside)
-    tl.store(image + 3 * at + 2, blue + transmittance * tl.load(view + BLUE), inside)
+    tl.store(images + 3 * at, red + transmittance * tl.load(view + RED), inside)
+    tl.store(images + 3 * at + 1, green + transmittance * tl.load(view + GREEN), inside)
+    tl.store(images + 3 * at + 2, blue + transmittance * tl.load(view + BLUE), inside)
     tl.store(transmittances + at, transmittance, inside)

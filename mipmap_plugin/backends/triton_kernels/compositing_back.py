@@ -11,62 +11,70 @@ import triton
 import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
-from mipmap_plugin.backends.triton_kernels.compositing import MAX_ALPHA, alpha_at, pixels, splat_at
+from mipmap_plugin.backends.triton_kernels.compositing import MAX_ALPHA, alpha_at, largest, pixels, record_at, slots
 from mipmap_plugin.backends.triton_kernels.records import LN_2, RECORD
 from mipmap_plugin.backends.triton_kernels.vectors import load3
 
-MIN_ALPHA, MIN_TRANSMITTANCE = views.MIN_ALPHA, views.MIN_TRANSMITTANCE
+MIN_ALPHA, MIN_TRANSMITTANCE, NUMBERS = views.MIN_ALPHA, views.MIN_TRANSMITTANCE, views.NUMBERS
 
 
 @triton.jit
-def accumulate(at, value, DETERMINISTIC: tl.constexpr):
-    """Store a sum over a tile's pixels at `at`, or add it to those of other tiles."""
-    if DETERMINISTIC:
-        tl.store(at, value)
-    else:
-        tl.atomic_add(at, value, sem="relaxed")
+def nine(a, b, c, d, e, f, g, h, i):
+    """Nine numbers side by side in [16], so that one instruction adds them to memory."""
+    field = tl.arange(0, 16)
+    row = tl.where(field == 0, a, tl.where(field == 1, b, tl.where(field == 2, c, tl.where(field == 3, d, tl.where(field == 4, e, f)))))
+    return field, tl.where(field == 6, g, tl.where(field == 7, h, tl.where(field == 8, i, row)))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["most_pixels"])
 def composite_back_kernel(
-    records, splat_ids, tile_offsets, places, view, image, transmittances, d_image, d_alpha, d_records, tiles_x, width, height,
+    records, tile_offsets, splat_ids, places, shots, images, transmittances, d_images, d_alphas, d_records, most_pixels,
     TILE: tl.constexpr, BATCH: tl.constexpr, DETERMINISTIC: tl.constexpr,
 ):  # fmt: skip
-    """Add the gradients of one tile's pixels to `d_records`."""
-    px, py, at, inside = pixels(tiles_x, width, height, TILE)
-    slot, end = tl.load(tile_offsets + tl.program_id(0)), tl.load(tile_offsets + tl.program_id(0) + 1)
+    """Add the gradients of one tile's pixels to `d_records`, which are in the order of the splats; the `records` are in that of the lists."""
+    view = shots + tl.program_id(1) * NUMBERS
+    px, py, at, inside = pixels(view, most_pixels, TILE)
+    slot, end = slots(tile_offsets)
     least, stop = tl.load(view + MIN_ALPHA), tl.load(view + MIN_TRANSMITTANCE)
     running = tl.where(inside, 1.0, 0.0)
-    d_red, d_green, d_blue = load3(d_image + 3 * at, inside)
-    red, green, blue = load3(image + 3 * at, inside)
+    d_red, d_green, d_blue = load3(d_images + 3 * at, inside)
+    shown = load3(images + 3 * at, inside)
     # What the remaining splats and the background contribute to the loss. The gradient of alpha acts like a color of the background.
-    rest = d_red * red + d_green * green + d_blue * blue - tl.load(d_alpha + at, inside, 0.0) * tl.load(transmittances + at, inside, 0.0)
-    while (slot < end) & (tl.max(running, axis=0) >= stop):
-        for _ in tl.static_range(BATCH):
-            splat, row = splat_at(records, splat_ids, slot, end)
-            dy, u, raw, alpha = alpha_at(row, slot < end, px, py, least)
+    rest = d_red * shown[0] + d_green * shown[1] + d_blue * shown[2] - tl.load(d_alphas + at, inside, 0.0) * tl.load(transmittances + at, inside, 0.0)
+    while (slot < end) & (largest(running) >= stop.to(tl.int32, bitcast=True)):
+        batch, heaviest = (), tl.zeros_like(running)
+        for nth in tl.static_range(BATCH):
+            record = record_at(records, slot + nth, end)
+            dy, u, raw, alpha = alpha_at(record, px, py, least)
             behind = running * (1 - alpha)
             weight = tl.where(behind >= stop, running * alpha, 0.0)
-            if tl.max(weight, axis=0) > 0:
-                d_weight = d_red * tl.load(row + 6) + d_green * tl.load(row + 7) + d_blue * tl.load(row + 8)
+            batch += ((record, dy, u, raw, alpha, weight),)
+            heaviest, running = tl.maximum(heaviest, weight), behind
+        if largest(heaviest) > 0:
+            for nth in tl.static_range(BATCH):
+                record, dy, u, raw, alpha, weight = batch[nth]
+                _x, _y, along, shear, across, _opacity, red, green, blue = record
+                d_weight = d_red * red + d_green * green + d_blue * blue
                 rest -= weight * d_weight
-                # The gradient of log2 alpha is alpha · d_alpha · ln 2, and 0 where alpha was cut off or the pixel had stopped.
-                d_log2 = (weight * d_weight - alpha / (1 - alpha) * rest) * LN_2
-                d_log2 = tl.where((weight > 0) & (raw <= MAX_ALPHA), d_log2, 0.0)
-                d_u = -2 * tl.load(row + 4) * tl.sum(d_log2 * u, axis=0)
-                d_y = -2 * tl.load(row + 2) * tl.sum(d_log2 * dy, axis=0) - tl.load(row + 3) * d_u
-                out = d_records + (tl.load(places + slot) if DETERMINISTIC else splat) * RECORD
-                accumulate(out, d_u, DETERMINISTIC)
-                accumulate(out + 1, d_y, DETERMINISTIC)
-                accumulate(out + 2, tl.sum(d_log2 * dy * dy, axis=0), DETERMINISTIC)
-                accumulate(out + 3, -2 * tl.load(row + 4) * tl.sum(d_log2 * u * dy, axis=0), DETERMINISTIC)
-                accumulate(out + 4, tl.sum(d_log2 * u * u, axis=0), DETERMINISTIC)
-                accumulate(out + 5, tl.sum(d_log2, axis=0), DETERMINISTIC)
-                accumulate(out + 6, tl.sum(weight * d_red, axis=0), DETERMINISTIC)
-                accumulate(out + 7, tl.sum(weight * d_green, axis=0), DETERMINISTIC)
-                accumulate(out + 8, tl.sum(weight * d_blue, axis=0), DETERMINISTIC)
-            running = behind
-            slot += 1
+                # The gradient of ln alpha is alpha · d_alpha, and 0 where alpha was cut off or the pixel had stopped.
+                root = tl.rsqrt(1 - alpha)  # a division takes several instructions more
+                d_log = weight * d_weight - alpha * rest * (root * root)
+                d_log = tl.where((weight > 0) & (raw <= MAX_ALPHA), d_log, 0.0)
+                d_log_u, d_log_y = d_log * u, d_log * dy
+                along, across = -2 * LN_2 * along, -2 * LN_2 * across
+                d_u = across * tl.sum(d_log_u, axis=0)
+                field, sums = nine(
+                    d_u, along * tl.sum(d_log_y, axis=0) - shear * d_u, LN_2 * tl.sum(d_log_y * dy, axis=0),
+                    across * tl.sum(d_log_u * dy, axis=0), LN_2 * tl.sum(d_log_u * u, axis=0), LN_2 * tl.sum(d_log, axis=0),
+                    tl.sum(weight * d_red, axis=0), tl.sum(weight * d_green, axis=0), tl.sum(weight * d_blue, axis=0),
+                )  # fmt: skip
+                mask = (field < RECORD) & (slot + nth < end)
+                if DETERMINISTIC:
+                    tl.store(d_records + tl.load(places + slot + nth, slot + nth < end, 0) * RECORD + field, sums, mask)
+                else:
+                    splat = tl.load(splat_ids + slot + nth, slot + nth < end, 0).to(tl.int64)
+                    tl.atomic_add(d_records + splat * RECORD + field, sums, mask, sem="relaxed")
+        slot += BATCH
 
 
 @triton.jit

@@ -1,30 +1,33 @@
-"""The forward and backward pass: which kernels run, on which arrays, and in which order."""
+"""The forward and backward pass: which kernels run, on which arrays, and in which order. Several views are drawn by one launch of each."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import triton
 from torch import Tensor
 
-from mipmap_plugin.backends.triton_kernels import BACKWARD_BATCH, FORWARD_BATCH, MANY_TILES, RECORD, SPLATS, TILE, WARPS_OF_FEW, WARPS_OF_MANY
+from mipmap_plugin.backends.triton_kernels import BACK_BATCH, BACK_WARPS, BATCH, RECORD, SPLATS, WARPS, tile_for
 from mipmap_plugin.backends.triton_kernels.binning import Bins, bin_splats
 from mipmap_plugin.backends.triton_kernels.compositing import composite_kernel
 from mipmap_plugin.backends.triton_kernels.compositing_back import composite_back_kernel, gather_kernel
 from mipmap_plugin.backends.triton_kernels.projection import project_kernel
 from mipmap_plugin.backends.triton_kernels.projection_back import project_back_kernel
 from mipmap_plugin.backends.triton_kernels.views import view_parameters
+from mipmap_plugin.backends.triton_kernels.weighing import weigh_kernel
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.splatting.filters import compensates
 
 # Rows of one splat that are summed at a time: one per lane of a warp.
 ROWS = 32
 
+Shots = Sequence[tuple[Camera, Effects]]
 
-@dataclass(frozen=True)
-class KernelSplats:
+
+class KernelSplats(NamedTuple):
     """N splats as the kernels read them; each tensor is contiguous."""
 
     means: Tensor
@@ -33,95 +36,146 @@ class KernelSplats:
     opacities: Tensor
     sh: Tensor
     covariances: Tensor | None
+    raw: bool = False  # scales are logarithms, opacities logits
 
     @classmethod
     def of(cls, *tensors: Tensor | None) -> KernelSplats:
-        """Splats of tensors in the order of the fields above."""
+        """Activated splats of tensors in the order of the fields above."""
         return cls(*(tensor if tensor is None else tensor.contiguous() for tensor in tensors))  # type: ignore[arg-type]  # only the last is None
 
     @property
-    def shapes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Quaternions, scales and covariances. Without covariances the last is a placeholder, which no kernel reads."""
-        return self.quats, self.scales, self.quats if self.covariances is None else self.covariances
+    def arrays(self) -> tuple[Tensor, ...]:
+        """The kernels' first arguments. Without covariances their place is taken by an array that no kernel reads."""
+        covariances = self.quats if self.covariances is None else self.covariances
+        return self.means, self.quats, self.scales, covariances, self.opacities, self.sh
+
+    def constants(self, effects: Effects) -> dict[str, int | bool]:
+        """What the projection kernels are compiled for."""
+        bands = self.sh.shape[1]
+        degree = min(effects.sh_degree, round(bands**0.5) - 1)
+        return {"HAS_COVARIANCES": self.covariances is not None, "RAW": self.raw, "DEGREE": degree, "BANDS": bands, "BLOCK": SPLATS}
+
+    def new_gradients(self) -> KernelSplats:
+        """Arrays for the gradients; None for the shape that is not in use."""
+        without = ("quats", "scales") if self.covariances is not None else ("covariances",)
+        tensors = {name: getattr(self, name) for name in self._fields if name != "raw"}
+        return KernelSplats(**{name: None if name in without else torch.empty_like(tensor) for name, tensor in tensors.items()})
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
-    """What the backward pass needs of the forward pass, besides the splats."""
+class Projected:
+    """N splats in V views, and the tiles that they reach."""
 
-    camera: Camera
-    constants: dict[str, int | bool]  # that the projection kernels are compiled for
-    view: Tensor
-    records: Tensor  # [N, 9]
-    depths: Tensor  # [N], infinite where a splat is not drawn
+    shots: Shots
+    constants: dict[str, int | bool]
+    tile: int  # px
+    views: Tensor  # [V, numbers of `views.py`]
+    listed: Tensor  # [pairs, 9], the records in the order of the lists: a program reads them one after the other
+    depths: Tensor  # [V · N], infinite where a splat is not drawn
     bins: Bins
 
+    @property
+    def grid(self) -> tuple[int, int]:
+        """The most tiles of a view, and the number of views."""
+        return most_tiles(self.shots, self.tile), len(self.shots)
 
-def tile_grid(camera: Camera) -> tuple[int, int]:
-    """The number of tiles along x and y."""
-    return triton.cdiv(camera.width, TILE), triton.cdiv(camera.height, TILE)
+    @property
+    def most_pixels(self) -> int:
+        """Of a view."""
+        return max(camera.width * camera.height for camera, _ in self.shots)
 
-
-def warps_for(tiles: int) -> int:
-    """Warps per tile."""
-    return WARPS_OF_MANY if tiles >= MANY_TILES else WARPS_OF_FEW
-
-
-def draw(splats: KernelSplats, camera: Camera, effects: Effects) -> tuple[Tensor, Tensor, Drawing]:
-    """Image [H, W, 3] with its background, transmittance [H, W], and what `draw_back` needs."""
-    means, count = splats.means, len(splats.means)
-    tiles_x, tiles_y = tile_grid(camera)
-    view = view_parameters(camera, effects, means)
-    constants = {
-        "HAS_COVARIANCES": splats.covariances is not None,
-        "COMPENSATES": compensates(effects.screen_filter),
-        "DEGREE": min(effects.sh_degree, round(splats.sh.shape[1] ** 0.5) - 1),
-        "BANDS": splats.sh.shape[1],
-    }
-    records, depths = means.new_empty(count, RECORD), means.new_empty(count)
-    boxes = torch.empty(count, 4, dtype=torch.int32, device=means.device)
-    if count:
-        project_kernel[(triton.cdiv(count, SPLATS),)](
-            means, *splats.shapes, splats.opacities, splats.sh, view, records, depths, boxes, count, camera.width, camera.height, tiles_x, tiles_y,
-            **constants, TILE=TILE, BLOCK=SPLATS,
-        )  # fmt: skip
-    bins = bin_splats(records, depths, boxes, view, tiles_x, tiles_y)
-    image, transmittances = means.new_empty(*camera.size, 3), means.new_empty(*camera.size)
-    composite_kernel[(tiles_x * tiles_y,)](
-        records, bins.splat_ids, bins.tile_offsets, view, image, transmittances, tiles_x, camera.width, camera.height,
-        TILE=TILE, BATCH=FORWARD_BATCH, num_warps=warps_for(tiles_x * tiles_y),
-    )  # fmt: skip
-    return image, transmittances, Drawing(camera, constants, view, records, depths, bins)
+    @property
+    def lists(self) -> tuple[Tensor, Tensor]:
+        """The first arguments of what composites."""
+        return self.listed, self.bins.tile_offsets
 
 
-def draw_back(
-    drawing: Drawing, splats: KernelSplats, image: Tensor, transmittances: Tensor, d_image: Tensor, d_alpha: Tensor, *, deterministic: bool
-) -> tuple[Tensor | None, ...]:
-    """Gradients of means, quats, scales, opacities, sh and covariances from those of image and alpha. None for the shape that is not in use."""
-    d_records = _record_gradients(drawing, image, transmittances, d_image.contiguous(), d_alpha.contiguous(), deterministic)
-    covariances = splats.covariances
-    d_means, d_opacities, d_sh = (torch.empty_like(tensor) for tensor in (splats.means, splats.opacities, splats.sh))
-    d_quats, d_scales = (None, None) if covariances is not None else (torch.empty_like(splats.quats), torch.empty_like(splats.scales))
-    d_covariances = None if covariances is None else torch.empty_like(covariances)
-    if len(splats.means):
-        out = [d_means if gradient is None else gradient for gradient in (d_quats, d_scales, d_covariances)]
-        project_back_kernel[(triton.cdiv(len(splats.means), SPLATS),)](
-            splats.means, *splats.shapes, splats.opacities, splats.sh, drawing.view, drawing.depths, d_records,
-            d_means, *out, d_opacities, d_sh, len(splats.means), **drawing.constants, BLOCK=SPLATS,
-        )  # fmt: skip
-    return d_means, d_quats, d_scales, d_opacities, d_sh, d_covariances
+class Drawing(NamedTuple):
+    """Views that are drawn. A view's pixels lie row by row at the beginning of its row; the rest of the row is not set."""
+
+    projected: Projected
+    images: Tensor  # [V, pixels, 3]
+    transmittances: Tensor  # [V, pixels]
+
+    def views_of(self, array: Tensor) -> list[Tensor]:
+        """The part of each view [h, w, ...] of an array [V, pixels, ...]."""
+        cameras = [camera for camera, _ in self.projected.shots]
+        return [row[: camera.width * camera.height].unflatten(0, camera.size) for row, camera in zip(array, cameras, strict=True)]
+
+    def packed(self, views: Sequence[Tensor]) -> Tensor:
+        """The inverse of `views_of`, for contiguous rows; what lies after a view's pixels is not set."""
+        sizes = {view.shape for view in views}
+        if len(sizes) == 1:
+            return torch.stack([view.flatten(0, 1) for view in views]) if len(views) > 1 else views[0].contiguous().flatten(0, 1)[None]
+        array = views[0].new_empty(len(views), self.projected.most_pixels, *views[0].shape[2:])
+        for row, view in zip(array, views, strict=True):
+            row[: view.shape[0] * view.shape[1]] = view.flatten(0, 1)
+        return array
 
 
-def _record_gradients(drawing: Drawing, image: Tensor, transmittances: Tensor, d_image: Tensor, d_alpha: Tensor, deterministic: bool) -> Tensor:
-    """Gradients of the records, [N, 9]."""
-    camera, bins = drawing.camera, drawing.bins
-    tiles_x, tiles_y = tile_grid(camera)
-    d_records = torch.zeros_like(drawing.records)
+def most_tiles(shots: Shots, tile: int) -> int:
+    """The largest number of tiles of a view."""
+    return max(triton.cdiv(camera.width, tile) * triton.cdiv(camera.height, tile) for camera, _ in shots)
+
+
+def project(splats: KernelSplats, shots: Shots) -> Projected:
+    """Project splats to all views, whose effects have the same SH degree, and list those of each tile."""
+    means, rows = splats.means, len(shots) * len(splats.means)
+    tile = tile_for(sum(camera.width * camera.height for camera, _ in shots))
+    views, constants = view_parameters(shots, tile, means), splats.constants(shots[0][1])
+    records, depths = means.new_empty(rows, RECORD), means.new_empty(rows)
+    boxes = torch.empty(rows, 4, dtype=torch.int32, device=means.device)
+    if rows:
+        grid = triton.cdiv(len(means), SPLATS), len(shots)
+        project_kernel[grid](*splats.arrays, views, records, depths, boxes, len(means), TILE=tile, **constants)
+    bins = bin_splats(records, depths, boxes, views, most_tiles(shots, tile), tile)
+    return Projected(shots, constants, tile, views, records[bins.splat_ids], depths, bins)
+
+
+def draw(splats: KernelSplats, shots: Shots) -> Drawing:
+    """Draw all views, each over its background."""
+    projected = project(splats, shots)
+    pixels = projected.most_pixels
+    images, transmittances = splats.means.new_empty(len(shots), pixels, 3), splats.means.new_empty(len(shots), pixels)
+    composite_kernel[projected.grid](
+        *projected.lists, projected.views, images, transmittances, pixels, TILE=projected.tile, BATCH=BATCH, num_warps=WARPS[projected.tile]
+    )
+    return Drawing(projected, images, transmittances)
+
+
+def draw_back(drawing: Drawing, d_images: Tensor, d_alphas: Tensor, *, deterministic: bool) -> Tensor:
+    """Gradients of the records [V · N, 9] from those of the images [V, pixels, 3] and alphas [V, pixels]."""
+    projected, bins = drawing.projected, drawing.projected.bins
+    d_records = projected.listed.new_zeros(len(projected.depths), RECORD)
     target = d_records.new_zeros(len(bins.splat_ids), RECORD) if deterministic else d_records
-    composite_back_kernel[(tiles_x * tiles_y,)](
-        drawing.records, bins.splat_ids, bins.tile_offsets, bins.places, drawing.view, image, transmittances, d_image, d_alpha, target,
-        tiles_x, camera.width, camera.height, TILE=TILE, BATCH=BACKWARD_BATCH, DETERMINISTIC=deterministic, num_warps=warps_for(tiles_x * tiles_y),
+    composite_back_kernel[projected.grid](
+        *projected.lists, bins.splat_ids, bins.places, projected.views, drawing.images, drawing.transmittances, d_images, d_alphas, target,
+        projected.most_pixels,
+        TILE=projected.tile, BATCH=BACK_BATCH, DETERMINISTIC=deterministic, num_warps=BACK_WARPS,
     )  # fmt: skip
     if deterministic and len(d_records):
         gather_kernel[(len(d_records),)](target, bins.starts, bins.counts, d_records, ROWS=ROWS, num_warps=1)
     return d_records
+
+
+def project_back(splats: KernelSplats, projected: Projected, d_records: Tensor, grads: KernelSplats, *, further: bool = False) -> None:
+    """Write the gradients of the splats, summed over the views, or add them where `further`."""
+    count = len(splats.means)
+    if count:
+        unused = grads.means
+        d_quats, d_scales, d_covariances = (unused if array is None else array for array in (grads.quats, grads.scales, grads.covariances))
+        project_back_kernel[(triton.cdiv(count, SPLATS),)](
+            *splats.arrays, projected.views, projected.depths, d_records, grads.means, d_quats, d_scales, d_covariances, grads.opacities, grads.sh,
+            count, len(projected.shots), int(further), **projected.constants,
+        )  # fmt: skip
+
+
+def weigh(splats: KernelSplats, shots: Shots) -> Tensor:
+    """The sum of each splat's blend weights over the images, [V · N]."""
+    projected = project(splats, shots)
+    sums = torch.zeros_like(projected.depths)
+    weigh_kernel[projected.grid](
+        *projected.lists, projected.bins.splat_ids, projected.views, sums, projected.most_pixels,
+        TILE=projected.tile, BATCH=BATCH, num_warps=BACK_WARPS,
+    )  # fmt: skip
+    return sums

@@ -7,13 +7,15 @@ import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
 from mipmap_plugin.backends.triton_kernels.harmonics import color
-from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD, store_nine
+from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD, store_six
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes, from_covariance, load_quat
 from mipmap_plugin.backends.triton_kernels.vectors import finite, load3
 from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_camera
 
-NEAR, EPS2D, LEAST_COMPENSATION, MIN_ALPHA, LOG2_MIN_ALPHA = views.NEAR, views.EPS2D, views.LEAST_COMPENSATION, views.MIN_ALPHA, views.LOG2_MIN_ALPHA
+NEAR, EPS2D, MIN_ALPHA, LOG2_MIN_ALPHA = views.NEAR, views.EPS2D, views.MIN_ALPHA, views.LOG2_MIN_ALPHA
+COMPENSATES, LEAST_COMPENSATION = views.COMPENSATES, views.LEAST_COMPENSATION
 FX, FY, CX, CY = views.FX, views.FY, views.CX, views.CY
+WIDTH, HEIGHT, TILES_X, TILES_Y, NUMBERS = views.WIDTH, views.HEIGHT, views.TILES_X, views.TILES_Y, views.NUMBERS
 
 
 @triton.jit
@@ -25,7 +27,25 @@ def relative_position(view, means, at, mask):
 
 
 @triton.jit
-def image_covariance(view, eye, safe, quats, scales, covariances, at, mask, HAS_COVARIANCES: tl.constexpr):
+def load_scale(scales, at, mask, RAW: tl.constexpr):
+    """The standard deviations of the splats `at` [B]; raw ones are their logarithms."""
+    a, b, c = load3(scales + 3 * at, mask)
+    if RAW:
+        a, b, c = tl.exp(a), tl.exp(b), tl.exp(c)
+    return a, b, c
+
+
+@triton.jit
+def load_opacity(opacities, at, mask, RAW: tl.constexpr):
+    """Opacities; raw ones are their logits."""
+    opacity = tl.load(opacities + at, mask, 0.0)
+    if RAW:
+        opacity = 1 / (1 + tl.exp(-opacity))
+    return opacity
+
+
+@triton.jit
+def image_covariance(view, eye, safe, quats, scales, covariances, at, mask, HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr):
     """xx, xy, yy, det on the image, before any screen filter."""
     u, v = clamped_slopes(view, eye[0] / safe, eye[1] / safe)
     t = image_axis(view, u, tl.load(view + FX) / safe, 0)
@@ -33,7 +53,7 @@ def image_covariance(view, eye, safe, quats, scales, covariances, at, mask, HAS_
     if HAS_COVARIANCES:
         xx, xy, yy, det = from_covariance(covariances + 9 * at, mask, t, r)
     else:
-        xx, xy, yy, det = from_axes(load_quat(quats + 4 * at, mask), load3(scales + 3 * at, mask), t, r)
+        xx, xy, yy, det = from_axes(load_quat(quats + 4 * at, mask), load_scale(scales, at, mask, RAW), t, r)
     return xx, xy, yy, det
 
 
@@ -46,6 +66,13 @@ def direction(world):
 
 
 @triton.jit
+def by_channel(at, mask):
+    """For the splats `at` [B] their numbers, their channels and the mask in a lane per channel [B, 4], of which the fourth is none."""
+    channel = tl.arange(0, 4)[None, :]
+    return at[:, None] + 0 * channel, channel, mask[:, None] & (channel < 3)
+
+
+@triton.jit
 def bounds(center, extent, tiles, TILE: tl.constexpr):
     """The first tile that [center ± extent] px reaches, and their number; as clamped floats, because integers could overflow."""
     first = tl.minimum(tl.maximum(tl.floor((center - extent) / TILE), 0.0), tiles)
@@ -53,21 +80,23 @@ def bounds(center, extent, tiles, TILE: tl.constexpr):
     return first, tl.maximum(last - first, 0.0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def project_kernel(
-    means, quats, scales, covariances, opacities, sh, view, records, depths, boxes, count, width, height, tiles_x, tiles_y,
-    HAS_COVARIANCES: tl.constexpr, COMPENSATES: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, covariances, opacities, sh, shots, records, depths, boxes, count,
+    HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
+    """Project `count` splats to the view of the program's second number."""
+    view = shots + tl.program_id(1) * NUMBERS
     at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     inside = at < count
-    world, eye, safe = relative_position(view, means, at, inside)
+    row = tl.program_id(1).to(tl.int64) * count + at
+    _world, eye, safe = relative_position(view, means, at, inside)
     ahead = inside & (eye[2] > tl.load(view + NEAR))
-    xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, ahead, HAS_COVARIANCES)
+    xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, ahead, HAS_COVARIANCES, RAW)
     eps2d = tl.load(view + EPS2D)
     det_blur = det + eps2d * (xx + yy) + eps2d * eps2d
-    opacity = tl.load(opacities + at, ahead, 0.0)
-    if COMPENSATES:
-        opacity *= tl.sqrt(tl.maximum(det / det_blur, tl.load(view + LEAST_COMPENSATION)))
+    compensation = tl.sqrt(tl.maximum(det / det_blur, tl.load(view + LEAST_COMPENSATION)))
+    opacity = load_opacity(opacities, at, ahead, RAW) * tl.where(tl.load(view + COMPENSATES) > 0, compensation, 1.0)
     xx, yy = xx + eps2d, yy + eps2d
     x = eye[0] / safe * tl.load(view + FX) + tl.load(view + CX)
     y = eye[1] / safe * tl.load(view + FY) + tl.load(view + CY)
@@ -76,16 +105,17 @@ def project_kernel(
     drawn = ahead & all_finite & (opacity >= tl.load(view + MIN_ALPHA)) & (across > 0)
     reach = tl.sqrt(tl.maximum(log2_opacity - tl.load(view + LOG2_MIN_ALPHA), 0.0) * (2 * LN_2))
     reach_x, reach_y = reach * tl.sqrt(xx), reach * tl.sqrt(yy)
-    drawn &= (x + reach_x > 0) & (x - reach_x < width) & (y + reach_y > 0) & (y - reach_y < height)
-    dx, dy, dz, _ = direction(world)
-    red, green, blue = color(sh + at * (3 * BANDS), dx, dy, dz, drawn, DEGREE)
-    drawn &= finite(red) & finite(green) & finite(blue)
-    red, green, blue = tl.maximum(red + 0.5, 0.0), tl.maximum(green + 0.5, 0.0), tl.maximum(blue + 0.5, 0.0)
-    store_nine(records + at * RECORD, x, y, (-1 / yy) * HALF_LOG2_E, shear, (-1 / across) * HALF_LOG2_E, log2_opacity, red, green, blue, drawn)
-    tl.store(depths + at, tl.where(drawn, eye[2], float("inf")), inside)
-    first_x, wide_x = bounds(x, reach_x, tiles_x.to(tl.float32), TILE)
-    first_y, wide_y = bounds(y, reach_y, tiles_y.to(tl.float32), TILE)
-    box = boxes + 4 * at
+    drawn &= (x + reach_x > 0) & (x - reach_x < tl.load(view + WIDTH)) & (y + reach_y > 0) & (y - reach_y < tl.load(view + HEIGHT))
+    rows, channel, shown = by_channel(at, drawn)
+    dx, dy, dz, _ = direction(from_eye(view, *load3(means + 3 * rows, shown)))
+    value = color(sh + rows * (3 * BANDS) + channel, dx, dy, dz, shown, DEGREE)
+    drawn &= tl.min(finite(value).to(tl.int32), axis=1) > 0
+    tl.store(records + (tl.program_id(1).to(tl.int64) * count + rows) * RECORD + 6 + channel, tl.maximum(value + 0.5, 0.0), shown)
+    store_six(records + row * RECORD, x, y, (-1 / yy) * HALF_LOG2_E, shear, (-1 / across) * HALF_LOG2_E, log2_opacity, drawn)
+    tl.store(depths + row, tl.where(drawn, eye[2], float("inf")), inside)
+    first_x, wide_x = bounds(x, reach_x, tl.load(view + TILES_X), TILE)
+    first_y, wide_y = bounds(y, reach_y, tl.load(view + TILES_Y), TILE)
+    box = boxes + 4 * row
     tl.store(box, tl.where(drawn, first_x, 0.0).to(tl.int32), inside)
     tl.store(box + 1, tl.where(drawn, first_y, 0.0).to(tl.int32), inside)
     tl.store(box + 2, tl.where(drawn, wide_x, 0.0).to(tl.int32), inside)

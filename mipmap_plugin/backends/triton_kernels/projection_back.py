@@ -7,17 +7,18 @@ import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
 from mipmap_plugin.backends.triton_kernels.harmonics import color, color_back
-from mipmap_plugin.backends.triton_kernels.projection import direction, image_covariance, relative_position
+from mipmap_plugin.backends.triton_kernels.projection import by_channel, direction, image_covariance, load_opacity, load_scale, relative_position
 from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes_back, from_covariance_back, load_quat
-from mipmap_plugin.backends.triton_kernels.vectors import dot, load3, store3
-from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, image_axis, in_world, rotation_row
+from mipmap_plugin.backends.triton_kernels.vectors import add, add3, dot, load3
+from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_world, rotation_row
 
-EPS2D, LEAST_COMPENSATION, FX, FY = views.EPS2D, views.LEAST_COMPENSATION, views.FX, views.FY
+EPS2D, COMPENSATES, LEAST_COMPENSATION = views.EPS2D, views.COMPENSATES, views.LEAST_COMPENSATION
+FX, FY, NUMBERS = views.FX, views.FY, views.NUMBERS
 
 
 @triton.jit
-def filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity, COMPENSATES: tl.constexpr):
+def filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity):
     """Gradients of xx, xy, yy and det before the screen filter, and of the opacity, from those of a record."""
     eps2d = tl.load(view + EPS2D)
     yy_blur = yy + eps2d
@@ -26,13 +27,11 @@ def filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_lo
     d_width = d_across * HALF_LOG2_E / (across * across)
     d_yy = (d_along * HALF_LOG2_E / yy_blur - d_shear * xy / yy_blur - d_width * across) / yy_blur
     d_det_blur, d_xy = d_width / yy_blur, d_shear / yy_blur
-    d_opacity, d_det = d_log2_opacity / (opacity * LN_2), tl.zeros_like(det)
-    if COMPENSATES:
-        ratio = det / det_blur
-        compensation = tl.sqrt(tl.maximum(ratio, tl.load(view + LEAST_COMPENSATION)))
-        d_ratio = tl.where(ratio < tl.load(view + LEAST_COMPENSATION), 0.0, d_log2_opacity / (compensation * compensation * (2 * LN_2)))
-        d_det, d_det_blur = d_ratio / det_blur, d_det_blur - d_ratio * ratio / det_blur
-    return d_det_blur * eps2d, d_xy, d_yy + d_det_blur * eps2d, d_det + d_det_blur, d_opacity
+    ratio = det / det_blur
+    d_ratio = tl.where(ratio < tl.load(view + LEAST_COMPENSATION), 0.0, d_log2_opacity / (ratio * (2 * LN_2)))
+    d_ratio = tl.where(tl.load(view + COMPENSATES) > 0, d_ratio, 0.0)
+    d_det, d_det_blur = d_ratio / det_blur, d_det_blur - d_ratio * ratio / det_blur
+    return d_det_blur * eps2d, d_xy, d_yy + d_det_blur * eps2d, d_det + d_det_blur, d_log2_opacity / (opacity * LN_2)
 
 
 @triton.jit
@@ -50,44 +49,62 @@ def relative_position_back(view, eye, safe, u, v, dt, dr, d_x, d_y):
 
 
 @triton.jit
+def direction_gradient(view, means, sh, d_color, d_sh, rows, drawn, written, adds, DEGREE: tl.constexpr):
+    """Add the gradients of the coefficients, by channel; return those of the direction [B], summed over the channels."""
+    dx, dy, dz, _ = direction(from_eye(view, *load3(means + 3 * rows, drawn)))
+    d_color = tl.where(color(sh, dx, dy, dz, drawn, DEGREE) < -0.5, 0.0, tl.load(d_color, drawn, 0.0))
+    px, py, pz = color_back(sh, d_sh, dx, dy, dz, d_color, drawn, written, adds, DEGREE)
+    return tl.sum(px, axis=1), tl.sum(py, axis=1), tl.sum(pz, axis=1)
+
+
+@triton.jit(do_not_specialize=["count", "views", "further"])
 def project_back_kernel(
-    means, quats, scales, covariances, opacities, sh, view, depths, d_records, d_means, d_quats, d_scales, d_covariances, d_opacities, d_sh, count,
-    HAS_COVARIANCES: tl.constexpr, COMPENSATES: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, covariances, opacities, sh, shots, depths, d_records, d_means, d_quats, d_scales, d_covariances, d_opacities, d_sh,
+    count, views, further, HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
+    """Write the gradients of the splats, summed over the views, or add them to what is there if `further` is 1."""
     at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     inside = at < count
-    drawn = inside & (tl.load(depths + at, inside, float("inf")) < float("inf"))
-    d_record = d_records + at * RECORD
-    d_x, d_y, d_along = load3(d_record, drawn)
-    d_shear, d_across, d_log2_opacity = load3(d_record + 3, drawn)
-    d_red, d_green, d_blue = load3(d_record + 6, drawn)
-    world, eye, safe = relative_position(view, means, at, drawn)
-    safe = tl.where(drawn, safe, 1.0)  # with a near plane of 0, the depth of a splat that is not drawn may be 0
-    dx, dy, dz, per = direction(world)
-    coefficients = sh + at * (3 * BANDS)
-    red, green, blue = color(coefficients, dx, dy, dz, drawn, DEGREE)
-    d_red, d_green, d_blue = tl.where(red < -0.5, 0.0, d_red), tl.where(green < -0.5, 0.0, d_green), tl.where(blue < -0.5, 0.0, d_blue)
-    out = d_sh + at * (3 * BANDS)
-    px, py, pz = color_back(coefficients, out, dx, dy, dz, d_red, d_green, d_blue, drawn, inside, DEGREE)
+    rows, channel, written = by_channel(at, inside)
+    d_coefficients = d_sh + rows * (3 * BANDS) + channel
     for band in tl.static_range((DEGREE + 1) * (DEGREE + 1), BANDS):
-        store3(out + 3 * band, tl.zeros_like(px), tl.zeros_like(px), tl.zeros_like(px), inside)
-    along = px * dx + py * dy + pz * dz  # removed below: the color does not change along the ray
+        add(d_coefficients + 3 * band, tl.zeros([BLOCK, 4], tl.float32), written, further > 0)
+    number = tl.program_id(0) * 0
+    while number < views:
+        view, row, adds = shots + number * NUMBERS, number.to(tl.int64) * count + at, number + further > 0
+        drawn = inside & (tl.load(depths + row, inside, float("inf")) < float("inf"))
+        d_record = d_records + row * RECORD
+        d_x, d_y, d_along = load3(d_record, drawn)
+        d_shear, d_across, d_log2_opacity = load3(d_record + 3, drawn)
+        world, eye, safe = relative_position(view, means, at, drawn)
+        safe = tl.where(drawn, safe, 1.0)  # with a near plane of 0, the depth of a splat that is not drawn may be 0
+        dx, dy, dz, per = direction(world)
+        px, py, pz = direction_gradient(
+            view, means, sh + rows * (3 * BANDS) + channel, d_records + (number.to(tl.int64) * count + rows) * RECORD + 6 + channel,
+            d_coefficients, rows, drawn[:, None] & written, written, adds, DEGREE,
+        )  # fmt: skip
+        along = px * dx + py * dy + pz * dz  # removed below: the color does not change along the ray
 
-    xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, drawn, HAS_COVARIANCES)
-    opacity = tl.load(opacities + at, drawn, 1.0)
-    d_xx, d_xy, d_yy, d_det, d_opacity = filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity, COMPENSATES)
-    tl.store(d_opacities + at, tl.where(drawn, d_opacity, 0.0), inside)
-    # Splats that are not drawn were read as zeros, from which NaN may follow.
-    d_xx, d_xy = tl.where(drawn, d_xx, 0.0), tl.where(drawn, d_xy, 0.0)
-    d_yy, d_det = tl.where(drawn, d_yy, 0.0), tl.where(drawn, d_det, 0.0)
-    u, v = clamped_slopes(view, eye[0] / safe, eye[1] / safe)
-    t = image_axis(view, u, tl.load(view + FX) / safe, 0)
-    r = image_axis(view, v, tl.load(view + FY) / safe, 1)
-    if HAS_COVARIANCES:
-        dt, dr = from_covariance_back(covariances + 9 * at, drawn, t, r, d_xx, d_xy, d_yy, d_det, d_covariances + 9 * at, inside)
-    else:
-        quat, scale = load_quat(quats + 4 * at, drawn), load3(scales + 3 * at, drawn)
-        dt, dr = from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quats + 4 * at, d_scales + 3 * at, inside)
-    mx, my, mz = relative_position_back(view, eye, safe, u, v, dt, dr, d_x, d_y)
-    mx, my, mz = mx + per * (px - along * dx), my + per * (py - along * dy), mz + per * (pz - along * dz)
-    store3(d_means + 3 * at, tl.where(drawn, mx, 0.0), tl.where(drawn, my, 0.0), tl.where(drawn, mz, 0.0), inside)
+        xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, drawn, HAS_COVARIANCES, RAW)
+        opacity = tl.where(drawn, load_opacity(opacities, at, drawn, RAW), 1.0)
+        d_xx, d_xy, d_yy, d_det, d_opacity = filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity)
+        if RAW:
+            d_opacity *= opacity * (1 - opacity)
+        add(d_opacities + at, tl.where(drawn, d_opacity, 0.0), inside, adds)
+        # Splats that are not drawn were read as zeros, from which NaN may follow.
+        d_xx, d_xy = tl.where(drawn, d_xx, 0.0), tl.where(drawn, d_xy, 0.0)
+        d_yy, d_det = tl.where(drawn, d_yy, 0.0), tl.where(drawn, d_det, 0.0)
+        u, v = clamped_slopes(view, eye[0] / safe, eye[1] / safe)
+        t = image_axis(view, u, tl.load(view + FX) / safe, 0)
+        r = image_axis(view, v, tl.load(view + FY) / safe, 1)
+        if HAS_COVARIANCES:
+            rows, d_rows = covariances + 9 * at, d_covariances + 9 * at
+            dt, dr = from_covariance_back(rows, drawn, t, r, d_xx, d_xy, d_yy, d_det, d_rows, inside, adds)
+        else:
+            quat, scale = load_quat(quats + 4 * at, drawn), load_scale(scales, at, drawn, RAW)
+            d_quat, d_scale = d_quats + 4 * at, d_scales + 3 * at
+            dt, dr = from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quat, d_scale, inside, adds, RAW)
+        mx, my, mz = relative_position_back(view, eye, safe, u, v, dt, dr, d_x, d_y)
+        mx, my, mz = mx + per * (px - along * dx), my + per * (py - along * dy), mz + per * (pz - along * dz)
+        add3(d_means + 3 * at, tl.where(drawn, mx, 0.0), tl.where(drawn, my, 0.0), tl.where(drawn, mz, 0.0), inside, adds)
+        number += 1

@@ -31,14 +31,11 @@ def falloff(records, at, mask):
 
 
 @triton.jit
-def store_nine(rows, a, b, c, d, e, f, g, h, i, mask):
-    """Store nine numbers [B] side by side at the pointers `rows` [B]."""
+def store_six(rows, a, b, c, d, e, f, mask):
+    """Store six numbers [B] side by side at the pointers `rows` [B]."""
     tl.store(rows, a, mask)
     tl.store(rows + 1, b, mask)
     tl.store(rows + 2, c, mask)
     tl.store(rows + 3, d, mask)
     tl.store(rows + 4, e, mask)
     tl.store(rows + 5, f, mask)
-    tl.store(rows + 6, g, mask)
-    tl.store(rows + 7, h, mask)
-    tl.store(rows + 8, i, mask)

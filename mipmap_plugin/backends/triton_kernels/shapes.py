@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from mipmap_plugin.backends.triton_kernels.vectors import cross, dot, load3, rotation_columns, rotation_columns_back, store3, unit
+from mipmap_plugin.backends.triton_kernels.vectors import add, add3, cross, dot, load3, rotation_columns, rotation_columns_back, unit
 
 
 @triton.jit
@@ -43,8 +43,8 @@ def from_covariance(rows, mask, t, r):
 
 
 @triton.jit
-def from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quats, d_scales, inside):
-    """Write the gradients of quaternions and scales; return those of the image axes."""
+def from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quats, d_scales, inside, further, RAW: tl.constexpr):
+    """Add the gradients of quaternions and scales, or of the scales' logarithms; return those of the image axes."""
     w, x, y, z, inverse = unit(quat[0], quat[1], quat[2], quat[3])
     a, b, c = rotation_columns(w, x, y, z)
     ta, tb, tc = dot(*t, *a), dot(*t, *b), dot(*t, *c)
@@ -55,23 +55,26 @@ def from_axes_back(quat, scale, t, r, d_xx, d_xy, d_yy, d_det, d_quats, d_scales
     q0, q1, q2 = cross(n0, n1, n2, f0, f1, f2)
     df0, df1, df2 = 2 * (d_xx * f0 + d_det * p0) + d_xy * g0, 2 * (d_xx * f1 + d_det * p1) + d_xy * g1, 2 * (d_xx * f2 + d_det * p2) + d_xy * g2
     dg0, dg1, dg2 = 2 * (d_yy * g0 + d_det * q0) + d_xy * f0, 2 * (d_yy * g1 + d_det * q1) + d_xy * f1, 2 * (d_yy * g2 + d_det * q2) + d_xy * f2
-    store3(d_scales, df0 * ta + dg0 * ra, df1 * tb + dg1 * rb, df2 * tc + dg2 * rc, inside)
+    d0, d1, d2 = df0 * ta + dg0 * ra, df1 * tb + dg1 * rb, df2 * tc + dg2 * rc
+    if RAW:
+        d0, d1, d2 = d0 * scale[0], d1 * scale[1], d2 * scale[2]
+    add3(d_scales, d0, d1, d2, inside, further)
     df0, df1, df2, dg0, dg1, dg2 = scale[0] * df0, scale[1] * df1, scale[2] * df2, scale[0] * dg0, scale[1] * dg1, scale[2] * dg2
     da = df0 * t[0] + dg0 * r[0], df0 * t[1] + dg0 * r[1], df0 * t[2] + dg0 * r[2]
     db = df1 * t[0] + dg1 * r[0], df1 * t[1] + dg1 * r[1], df1 * t[2] + dg1 * r[2]
     dc = df2 * t[0] + dg2 * r[0], df2 * t[1] + dg2 * r[1], df2 * t[2] + dg2 * r[2]
     dw, dx, dy, dz = rotation_columns_back(w, x, y, z, da, db, dc)
     along = w * dw + x * dx + y * dy + z * dz  # removed below: the norm of a quaternion does not matter
-    tl.store(d_quats, inverse * (dw - w * along), inside)
-    store3(d_quats + 1, inverse * (dx - x * along), inverse * (dy - y * along), inverse * (dz - z * along), inside)
+    add(d_quats, inverse * (dw - w * along), inside, further)
+    add3(d_quats + 1, inverse * (dx - x * along), inverse * (dy - y * along), inverse * (dz - z * along), inside, further)
     dt = df0 * a[0] + df1 * b[0] + df2 * c[0], df0 * a[1] + df1 * b[1] + df2 * c[1], df0 * a[2] + df1 * b[2] + df2 * c[2]
     dr = dg0 * a[0] + dg1 * b[0] + dg2 * c[0], dg0 * a[1] + dg1 * b[1] + dg2 * c[1], dg0 * a[2] + dg1 * b[2] + dg2 * c[2]
     return dt, dr
 
 
 @triton.jit
-def from_covariance_back(rows, mask, t, r, d_xx, d_xy, d_yy, d_det, d_rows, inside):
-    """Write the gradient of the covariances; return those of the image axes."""
+def from_covariance_back(rows, mask, t, r, d_xx, d_xy, d_yy, d_det, d_rows, inside, further):
+    """Add the gradient of the covariances; return those of the image axes."""
     forth_t, back_t = times(rows, mask, t)
     forth_r, back_r = times(rows, mask, r)
     xx, xy, yy = dot(*t, *forth_t), dot(*t, *forth_r), dot(*r, *forth_r)
@@ -80,8 +83,8 @@ def from_covariance_back(rows, mask, t, r, d_xx, d_xy, d_yy, d_det, d_rows, insi
     for i in tl.static_range(3):
         left, right = d_xx * t[i], d_yy * r[i]
         across = d_xy * t[i]
-        store3(d_rows + 3 * i, left * t[0] + across * r[0] + right * r[0], left * t[1] + across * r[1] + right * r[1],
-               left * t[2] + across * r[2] + right * r[2], inside)  # fmt: skip
+        add3(d_rows + 3 * i, left * t[0] + across * r[0] + right * r[0], left * t[1] + across * r[1] + right * r[1],
+             left * t[2] + across * r[2] + right * r[2], inside, further)  # fmt: skip
     dt = (d_xx * (forth_t[0] + back_t[0]) + d_xy * forth_r[0], d_xx * (forth_t[1] + back_t[1]) + d_xy * forth_r[1],
           d_xx * (forth_t[2] + back_t[2]) + d_xy * forth_r[2])  # fmt: skip
     dr = (d_yy * (forth_r[0] + back_r[0]) + d_xy * back_t[0], d_yy * (forth_r[1] + back_r[1]) + d_xy * back_t[1],

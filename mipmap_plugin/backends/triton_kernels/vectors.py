@@ -29,6 +29,20 @@ def store3(rows, a, b, c, mask):
 
 
 @triton.jit
+def add(rows, a, mask, further):
+    """Store `a` at the pointers `rows`, or add it to what is there where `further`."""
+    tl.store(rows, tl.load(rows, mask & further, 0.0) + a, mask)
+
+
+@triton.jit
+def add3(rows, a, b, c, mask, further):
+    """As `add`, for three numbers side by side."""
+    add(rows, a, mask, further)
+    add(rows + 1, b, mask, further)
+    add(rows + 2, c, mask, further)
+
+
+@triton.jit
 def dot(ax, ay, az, bx, by, bz):
     return ax * bx + ay * by + az * bz
 

@@ -1,8 +1,10 @@
-"""The camera and the screen filter as an array on the device, and transformations between world, camera and image."""
+"""The cameras and screen filters as an array on the device, and transformations between world, camera and image."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 import triton
@@ -14,19 +16,27 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.render_settings import FRUSTUM_MARGIN
 from mipmap_plugin.splatting import filters
 
-# Indices into the array. It begins with the rotation, row by row, at 0.
+# Indices into a view's numbers. They begin with the rotation, row by row, at 0.
 EYE, FX, FY, CX, CY = tl.constexpr(9), tl.constexpr(12), tl.constexpr(13), tl.constexpr(14), tl.constexpr(15)
 LEFT, RIGHT, TOP, BOTTOM = tl.constexpr(16), tl.constexpr(17), tl.constexpr(18), tl.constexpr(19)  # bounds of the slopes in the Jacobian
 NEAR, EPS2D, MIN_ALPHA = tl.constexpr(20), tl.constexpr(21), tl.constexpr(23)
 LEAST_COMPENSATION = tl.constexpr(22)  # squared
 LOG2_MIN_ALPHA, MIN_TRANSMITTANCE = tl.constexpr(24), tl.constexpr(25)
 RED, GREEN, BLUE = tl.constexpr(26), tl.constexpr(27), tl.constexpr(28)  # of the background
+COMPENSATES = tl.constexpr(29)  # 1 or 0
+WIDTH, HEIGHT, TILES_X, TILES_Y = tl.constexpr(30), tl.constexpr(31), tl.constexpr(32), tl.constexpr(33)  # px, and tiles
+NUMBERS = tl.constexpr(34)  # of each view
 
 
-def view_parameters(camera: Camera, effects: Effects, like: Tensor) -> Tensor:
-    """The array [29], on the device of `like`. A copy of 116 bytes that does not synchronize."""
+def view_parameters(shots: Sequence[tuple[Camera, Effects]], tile: int, like: Tensor) -> Tensor:
+    """The array [V, NUMBERS], on the device of `like`. A copy of some hundred bytes that does not synchronize."""
+    return torch.tensor([_numbers(*shot, tile) for shot in shots], dtype=like.dtype).to(like.device, non_blocking=True)
+
+
+@lru_cache(maxsize=1024)
+def _numbers(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]:
     margin_x, margin_y = FRUSTUM_MARGIN * camera.width / camera.fx / 2, FRUSTUM_MARGIN * camera.height / camera.fy / 2
-    numbers = [
+    return (
         *camera.viewmat[:3, :3].flatten().tolist(),
         *camera.center.tolist(),
         *(camera.fx, camera.fy, camera.cx, camera.cy),
@@ -35,8 +45,9 @@ def view_parameters(camera: Camera, effects: Effects, like: Tensor) -> Tensor:
         *(effects.near_plane, effects.eps2d, filters.LEAST_COMPENSATION[effects.screen_filter] ** 2, effects.settings.min_alpha),
         *(math.log2(effects.settings.min_alpha), effects.settings.min_transmittance),
         *effects.background,
-    ]
-    return torch.tensor(numbers, dtype=like.dtype).to(like.device, non_blocking=True)
+        float(filters.compensates(effects.screen_filter)),
+        *(camera.width, camera.height, triton.cdiv(camera.width, tile), triton.cdiv(camera.height, tile)),
+    )
 
 
 @triton.jit

@@ -1,0 +1,66 @@
+"""Steps over the raw parameters of 3DGS (`backends.base.Stepper`): six launches for all views of a step, without autograd."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+import triton
+from torch import Tensor
+
+from mipmap_plugin.backends.base import AdamStep, Rendered
+from mipmap_plugin.backends.triton_kernels import NUMBERS_MOVED
+from mipmap_plugin.backends.triton_kernels.adam import adam_kernel
+from mipmap_plugin.backends.triton_kernels.drawing import Drawing, KernelSplats, Shots, draw, draw_back, project_back
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.effects import Effects
+
+PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
+RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")  # as `adam.py` reads them
+
+
+class TritonStepper:
+    """Draws splats from their raw parameters, and moves these."""
+
+    def __init__(self, raw: Mapping[str, Tensor]) -> None:
+        self._splats = KernelSplats(*(raw[name] for name in PARAMETERS), covariances=None, raw=True)
+        self._grads = self._splats.new_gradients()
+        self._drawn: dict[int, Drawing] = {}  # by the number of its first view
+        self._gradients: dict[int, Tensor] = {}  # of the records
+
+    def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
+        return self.render_all([(camera, effects)], number)[0]
+
+    def render_all(self, shots: Shots, number: int = 0) -> list[Rendered]:
+        with torch.cuda.device_of(self._splats.means):
+            drawn = self._drawn[number] = draw(self._splats, shots)
+        alphas = (1 - drawn.transmittances)
+        return [Rendered(image, alpha) for image, alpha in zip(drawn.views_of(drawn.images), drawn.views_of(alphas), strict=True)]
+
+    def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
+        self.differentiate_all([d_image], None if d_alpha is None else [d_alpha], number)
+
+    def differentiate_all(self, d_images: Sequence[Tensor], d_alphas: Sequence[Tensor] | None = None, number: int = 0) -> None:
+        drawn = self._drawn[number]
+        d_alpha = torch.zeros_like(drawn.transmittances) if d_alphas is None else drawn.packed(d_alphas)
+        with torch.cuda.device_of(d_alpha):
+            in_order = torch.are_deterministic_algorithms_enabled()
+            self._gradients[number] = draw_back(drawn, drawn.packed(d_images), d_alpha, deterministic=in_order)
+
+    def step(self, step: AdamStep) -> None:
+        if not self._gradients:
+            raise RuntimeError("a step needs the gradient of an image; call differentiate() first")
+        with torch.cuda.device_of(self._splats.means):
+            for nth, number in enumerate(sorted(self._gradients)):
+                project_back(self._splats, self._drawn[number].projected, self._gradients[number], self._grads, further=nth > 0)
+            self._move(step)
+        self._drawn.clear()
+        self._gradients.clear()
+
+    def _move(self, step: AdamStep) -> None:
+        (beta1, beta2), means = step.betas, self._splats.means
+        shared = 1 - beta1, 1 - beta2, (1 - beta1) * step.nesterov, step.correction, step.eps
+        numbers = torch.tensor([*(step.rates[name] for name in RATES), *shared], dtype=means.dtype).to(means.device, non_blocking=True)
+        arrays = [array for name in PARAMETERS for array in (step.raw[name], step.first[name], step.second[name], getattr(self._grads, name))]
+        grid = triton.cdiv(self._splats.sh.numel(), NUMBERS_MOVED), len(PARAMETERS)
+        adam_kernel[grid](*arrays, numbers, len(means), BANDS=self._splats.sh.shape[1], BLOCK=NUMBERS_MOVED)
