@@ -114,8 +114,13 @@ def test_wrong_cases_are_named():
 
 
 def test_hard_cases_are_shared_among_processes():
-    (checked,) = check_all(["reference"], "cpu", 2, ("one-splat", "sh-degree-0"))
-    assert checked == Checked("reference", 2, 0, {})
+    (checked,) = check_all(["reference"], "cpu", 2, ("one-splat", "sh-degree-0", "views"))
+    assert checked == Checked("reference", 3, 1, {})
+
+
+def test_views_and_steps_are_checked_where_there_are_any():
+    views, steps = gpu_conformance._outcomes("cpu", "cpu", ["views", "steps"])
+    assert views.passed and steps.passed and not (views.skipped or steps.skipped)
 
 
 def test_a_case_that_breaks_its_process_fails_alone(monkeypatch):
