@@ -93,7 +93,7 @@ def test_small_views_are_timed_alone_and_together():
     shots = Shots(raw_of(tiny.gaussians(), "cpu"), tiny.cameras(2))
     alone, both = measure("reference", shots, "cpu", 1), measure("cpu", shots, "cpu", 1)
     assert (alone.width, alone.views, alone.together_ms) == (32, 2, None) and alone.alone_ms > 0
-    assert both.together_ms > 0
+    assert both.together_ms > 0 and alone.step_ms > 0 and both.step_ms > 0
 
 
 def test_where_there_are_no_kernels_none_is_listed():
@@ -133,7 +133,7 @@ def test_a_case_that_breaks_its_process_fails_alone(monkeypatch):
 
 def test_the_report_and_its_files_are_named_after_the_device(tmp_path):
     results = Results(MACHINE, 4e12)
-    for record in (OURS, Failure("inria", "", "it is not there"), ADAPTED, Views("triton", 50, 4, 0.5, None), Checked("triton", 2, 1, {})):
+    for record in (OURS, Failure("inria", "", "it is not there"), ADAPTED, Views("triton", 50, 4, 0.5, None, 0.6), Checked("triton", 2, 1, {})):
         results.add(record)
     results.add(Profile("triton", 300, 64, 48, 200.0, [("kernel", 100.0, 2.0)]))
     results.save(tmp_path)
