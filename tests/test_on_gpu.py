@@ -129,10 +129,10 @@ def test_adapting_by_command_writes_the_same_file(backend, tmp_path):
     "words",
     [
         "render BASE --output OUT --scale 1/2 --depth --normals --supersampling 2",
-        "evaluate BASE --images SCENE --scale 1/2 --steps 4 --output OUT.json --no-report",
-        "tradeoff BASE --scale 1/2 --steps 4 --output OUT --no-picture --repeats 1",
-        "levels BASE --viewer classic --output OUT --coarsest 1/4 --steps 4",
-        "adapt BASE --scale 1/2 --scale 2 --steps 4 --viewer classic --viewer antialiased --output OUT",
+        "evaluate BASE --images SCENE --scale 1/2 --steps 4 --output OUT.json",
+        "tradeoff BASE --scale 1/2 --steps 4 --output OUT --no-picture --repeats 1 --report",
+        "levels BASE --viewer classic --output OUT --coarsest 1/4 --steps 4 --report",
+        "adapt BASE --scale 1/2 --scale 2 --steps 4 --viewer classic --viewer antialiased --output OUT --report",
     ],
     ids=["render", "evaluate", "tradeoff", "levels", "many"],
 )
