@@ -21,6 +21,16 @@ def test_gradients_are_those_of_the_definition(loss):
     torch.testing.assert_close(square_error, difference.detach().square().mean())
 
 
+@pytest.mark.parametrize("loss", DEFINITIONS)
+def test_those_of_several_images_are_those_of_each(loss):
+    differences = torch.randn(4, 5, 7, 3, generator=torch.Generator().manual_seed(0))
+    gradients, square_errors = gradient_of(differences, loss)
+    for number, difference in enumerate(differences):
+        gradient, square_error = gradient_of(difference, loss)
+        torch.testing.assert_close(gradients[number], gradient)
+        torch.testing.assert_close(square_errors[number], square_error)
+
+
 def test_an_image_that_is_right_has_no_gradient():
     gradient, square_error = gradient_of(torch.zeros(2, 2, 3), "psnr")
     assert not gradient.any() and square_error == 0

@@ -7,7 +7,7 @@ from PIL import Image
 
 from mipmap_plugin.adaptation.target import upsamplers
 from mipmap_plugin.adaptation.target.resampling import matrix_of
-from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.adaptation.target.resize import gradient_before, resize
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, register_upsampler
 from mipmap_plugin.errors import SettingsError
 
@@ -86,6 +86,16 @@ def test_a_constant_stays_and_the_same_size_is_the_same_image(image, method):
 def test_gradients_are_those_of_finite_differences(method, size):
     image = torch.rand(13, 15, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda image: resize(image, size, method), image, fast_mode=True)
+
+
+@pytest.mark.parametrize("size", [SMALLER, LARGER, (8, 45), (24, 30)])
+@pytest.mark.parametrize("method", ["area", "pil-bicubic"])
+def test_the_gradient_before_is_that_of_autograd(image, method, size):
+    image.requires_grad_()
+    small = resize(image, size, method)
+    gradient = torch.rand(small.shape, generator=torch.Generator().manual_seed(1))
+    small.backward(gradient)
+    torch.testing.assert_close(gradient_before(gradient, (24, 30), method), image.grad)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])

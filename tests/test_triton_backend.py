@@ -27,7 +27,7 @@ ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
 FLOAT, INT32, INT64 = "*fp32", "*i32", "*i64"
 TYPES = {"splat_ids": INT32, "owners": INT32, "boxes": INT32, "counts": INT32, "tiles": "*i16"}
 TYPES |= dict.fromkeys(("tile_offsets", "places", "starts"), INT64)
-TYPES |= dict.fromkeys(("count", "pairs", "views", "further", "most_tiles", "most_pixels", "no_tile"), "i32")
+TYPES |= dict.fromkeys(("count", "pairs", "views", "further", "most_tiles", "most_pixels", "no_tile", "least_key"), "i32")
 
 
 def compile_for(capability: int, kernel, warps: int = 4, **constants) -> str:
@@ -54,13 +54,13 @@ def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeyp
         compile_for(capability, projection.project_kernel, HAS_COVARIANCES=has_covariances, TILE=tile, **splat)
         compile_for(capability, projection_back.project_back_kernel, HAS_COVARIANCES=has_covariances, **splat)
     compile_for(capability, binning.emit_kernel, TILE=tile, BLOCK=sizes.PAIRS)
-    compile_for(capability, compositing.composite_kernel, sizes.WARPS[tile], TILE=tile, BATCH=sizes.BATCH)
+    compile_for(capability, compositing.composite_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH)
     for in_order in (False, True):
-        back = {"TILE": sizes.SMALL_TILE, "BATCH": sizes.BACK_BATCH, "DETERMINISTIC": in_order}
-        ptx = compile_for(capability, compositing_back.composite_back_kernel, sizes.BACK_WARPS, **back)
+        back = {"TILE": sizes.SMALL_TILE, "BATCH": sizes.BACK_BATCH[sizes.SMALL_TILE], "DETERMINISTIC": in_order}
+        ptx = compile_for(capability, compositing_back.composite_back_kernel, sizes.WARPS, **back)
         assert ("atom" in ptx or "red.global" in ptx) != in_order
     compile_for(capability, compositing_back.gather_kernel, 1, ROWS=32)
-    compile_for(capability, weighing.weigh_kernel, sizes.BACK_WARPS, TILE=tile, BATCH=sizes.BATCH)
+    compile_for(capability, weighing.weigh_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH)
     compile_for(capability, adam.adam_kernel, BANDS=4, BLOCK=sizes.NUMBERS_MOVED)
 
 

@@ -11,13 +11,16 @@ INVISIBLE_ERROR = (0.5 / 255) ** 2
 
 @torch.no_grad()
 def gradient_of(difference: Tensor, loss: str) -> tuple[Tensor, Tensor]:
-    """The gradient of a loss (`AdaptConfig.loss`) in the difference from the target, [h, w, 3], and the mean square error, [].
+    """The gradient of a loss (`AdaptConfig.loss`) in the difference from the target, [..., h, w, 3], and the mean square error, [...].
 
     `psnr` is the logarithm of the mean square error, so that a view that is far off does not outweigh the others.
     """
-    count = difference.numel()
-    square_error = difference.flatten().dot(difference.flatten()) / count
+    flat = difference.flatten(-3)
+    count = flat.shape[-1]
+    square_error: Tensor = torch.linalg.vecdot(flat, flat) / count
     if loss == "l1":
         return difference.sign() / count, square_error
-    weight = 1.0 / (square_error + INVISIBLE_ERROR) if loss == "psnr" else 1.0
-    return difference * (weight * (2 / count)), square_error
+    if loss == "l2":
+        return difference * (2 / count), square_error
+    weight = 2 / count / (square_error + INVISIBLE_ERROR)
+    return difference * weight[..., None, None, None], square_error

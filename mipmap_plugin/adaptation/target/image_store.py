@@ -43,7 +43,7 @@ class ImageStore:
         stored = self._images.get(key)
         if stored is None:
             stored = in_16_bits(make())
-            self._keep(key, stored)
+            self._keep([key], stored[None])
         return from_16_bits(stored.to(self._like.device, non_blocking=True), self._like.dtype)
 
     def of_one_size(self, keys: Sequence[Hashable], make: Callable[[list[int]], Tensor]) -> Tensor:
@@ -51,19 +51,20 @@ class ImageStore:
         stored = {number: self._images[key] for number, key in enumerate(keys) if key in self._images}
         if new := [number for number in range(len(keys)) if number not in stored]:
             made = in_16_bits(make(new))
+            self._keep([keys[number] for number in new], made)
             stored |= dict(zip(new, made.unbind(), strict=True))
-            for number in new:
-                self._keep(keys[number], stored[number])
         all_of_them = torch.stack([stored[number].to(self._like.device, non_blocking=True) for number in range(len(keys))])
         return from_16_bits(all_of_them, self._like.dtype)
 
     def __contains__(self, key: Hashable) -> bool:
         return key in self._images
 
-    def _keep(self, key: Hashable, image: Tensor) -> None:
-        if self._bytes + image.nbytes <= self._limit:
-            self._images[key] = moved_off_full_gpu(image)
-            self._bytes += image.nbytes
+    def _keep(self, keys: Sequence[Hashable], images: Tensor) -> None:
+        """Keep as many of the images [V, H, W, 3] as there is room for."""
+        if room := (self._limit - self._bytes) // images[0].nbytes:
+            kept = moved_off_full_gpu(images[:room])
+            self._images |= dict(zip(keys, kept.unbind(), strict=False))
+            self._bytes += kept.nbytes
 
     def keep_only(self, is_needed: Callable[[Any], bool]) -> None:
         """Make room by forgetting every image whose key is not needed."""

@@ -6,7 +6,7 @@ each block of outputs reads few inputs: a gather and a product of small matrices
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -51,14 +51,30 @@ class _Resample(torch.autograd.Function):
 
 def resample(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
     """Resample an image [H, W, C] to [size[0], size[1], C] by one of `TAPS`."""
-    # First the axis that shrinks more, so that less work is left for the other.
-    for axis in sorted((0, 1), key=lambda axis: size[axis] / image.shape[axis]):
-        if image.shape[axis] != size[axis]:
-            first = image.movedim(axis, 0)
-            matrices = matrix_of(first.shape[0], size[axis], method, image.device, image.dtype)
-            resampled = _Resample.apply(first.flatten(1), *matrices)  # type: ignore[no-untyped-call]  # torch's
-            image = resampled.unflatten(1, first.shape[1:]).movedim(0, axis)
+    for axis in _order(image.shape, size):
+        matrix, transposed = matrix_of(image.shape[axis], size[axis], method, image.device, image.dtype)
+        image = _along(axis, image, matrix, transposed)
     return image
+
+
+def resample_back(gradient: Tensor, size: tuple[int, int], method: str) -> Tensor:
+    """The gradient in an image [size[0], size[1], C] from that in the image [h, w, C] which it was resampled to."""
+    for axis in reversed(_order(size, gradient.shape)):
+        matrix, transposed = matrix_of(size[axis], gradient.shape[axis], method, gradient.device, gradient.dtype)
+        gradient = _along(axis, gradient, transposed, matrix)
+    return gradient
+
+
+def _order(old: Sequence[int], new: Sequence[int]) -> list[int]:
+    """The axes that change; first the one that shrinks more, so that less work is left for the other."""
+    return [axis for axis in sorted((0, 1), key=lambda axis: new[axis] / old[axis]) if new[axis] != old[axis]]
+
+
+def _along(axis: int, image: Tensor, matrix: Blocks, transposed: Blocks) -> Tensor:
+    """The product with each of the lines [pixels, C] of an image [H, W, C] along an axis."""
+    first = image.movedim(axis, 0)
+    resampled: Tensor = _Resample.apply(first.flatten(1), matrix, transposed)  # type: ignore[no-untyped-call]  # torch's
+    return resampled.unflatten(1, first.shape[1:]).movedim(0, axis)
 
 
 @lru_cache(maxsize=CACHED_SIZES)

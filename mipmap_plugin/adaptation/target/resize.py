@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from mipmap_plugin.adaptation.target.resampling import resample
+from mipmap_plugin.adaptation.target.resampling import resample, resample_back
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
@@ -23,6 +23,11 @@ def resize(image: Tensor, size: tuple[int, int], method: str) -> Tensor:
     if method == "box":
         _check_box(image, size)
     return resample(image, size, method)
+
+
+def gradient_before(gradient: Tensor, size: tuple[int, int], method: str) -> Tensor:
+    """The gradient in an image [size[0], size[1], 3] from that in what it was resized to, [h, w, 3]: without the time that autograd takes."""
+    return gradient if tuple(gradient.shape[:2]) == tuple(size) else resample_back(gradient, size, method)
 
 
 def resize_all(images: Tensor, size: tuple[int, int], method: str) -> Tensor:

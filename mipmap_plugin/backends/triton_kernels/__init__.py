@@ -24,21 +24,19 @@ Compute capability 7.5 suffices: plain loads, stores and float32 atomics. The co
 changes an image.
 """
 
-# px. A program renders one tile. Large tiles share what each pair costs; small ones waste fewer pixels, and give a small image enough
-# programs to fill a GPU: below this number of pixels, in all views that are drawn at once, tiles are small.
-SMALL_TILE, LARGE_TILE = 8, 16
-PIXELS_OF_LARGE = 1 << 19
+# px. A program renders one tile. Large tiles share what each pair costs; small ones waste fewer pixels, and give small images, which show
+# thousands of splats in a tile, more and shorter lists: up to this number of pixels, in all views that are drawn at once, tiles are small.
+SMALL_TILE, LARGE_TILE = 4, 8
+PIXELS_OF_SMALL = 1 << 18
 
-# Splats between two checks whether a pixel of the tile is still open. Their loads overlap; larger batches need more registers.
+# Splats of a tile whose loads and sums overlap: more hide more latency, but need registers, which are few where tiles are many. One warp per
+# tile, so that sums over it need no barrier.
 BATCH = 4
-BACK_BATCH = 2
-
-# Warps per tile. In the backward pass one: sums over the tile then need no barrier.
-WARPS = {SMALL_TILE: 1, LARGE_TILE: 2}
-BACK_WARPS = 1
+BACK_BATCH = {SMALL_TILE: 4, LARGE_TILE: 2}
+WARPS = 1
 
 # Splats per program in kernels with a lane per splat: small blocks, for a thread holds over a hundred numbers at once.
-SPLATS = 128
+SPLATS = 32
 
 # (splat, tile) pairs per program in kernels with a lane per pair, and numbers that a program of Adam moves.
 PAIRS = 512
@@ -50,4 +48,4 @@ RECORD = 9
 
 def tile_for(pixels: int) -> int:
     """The size of a tile, px, for so many pixels in all views."""
-    return LARGE_TILE if pixels >= PIXELS_OF_LARGE else SMALL_TILE
+    return SMALL_TILE if pixels <= PIXELS_OF_SMALL else LARGE_TILE

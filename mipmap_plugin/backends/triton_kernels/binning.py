@@ -32,8 +32,8 @@ class Bins:
     counts: Tensor  # [V · N] int32, number of its pairs
 
 
-@triton.jit(do_not_specialize=["pairs", "count", "most_tiles", "no_tile"])
-def emit_kernel(records, boxes, starts, owners, tiles, shots, pairs, count, most_tiles, no_tile, TILE: tl.constexpr, BLOCK: tl.constexpr):
+@triton.jit(do_not_specialize=["pairs", "count", "most_tiles", "no_tile", "least_key"])
+def emit_kernel(records, boxes, starts, owners, tiles, shots, pairs, count, most_tiles, no_tile, least_key, TILE: tl.constexpr, BLOCK: tl.constexpr):
     """Write the tile of each pair, or `no_tile` where the splat's ellipse does not reach that tile of its box."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = at < pairs
@@ -56,7 +56,7 @@ def emit_kernel(records, boxes, starts, owners, tiles, shots, pairs, count, most
     left = shear * at_left - tl.sqrt(tl.maximum(level + along * at_left * at_left, 0.0) / -across)
     outside = (top > bottom) | (x + right < tile_x * TILE + EDGE) | (x + left > tile_x * TILE + TILE - EDGE)
     tile = number * most_tiles + tile_y * tl.load(view + TILES_X).to(tl.int32) + tile_x
-    tl.store(tiles + at, tl.where(outside, no_tile, tile), inside)
+    tl.store(tiles + at, tl.where(outside, no_tile, tile) - least_key, inside)
 
 
 def bin_splats(records: Tensor, depths: Tensor, boxes: Tensor, shots: Tensor, most_tiles: int, tile: int) -> Bins:
@@ -72,11 +72,13 @@ def bin_splats(records: Tensor, depths: Tensor, boxes: Tensor, shots: Tensor, mo
     pairs = int(ends[-1]) if len(ends) else 0
     owners = order.int().repeat_interleave(in_order, output_size=pairs)
     no_tile = len(shots) * most_tiles
-    # A radix sort takes one pass per byte of the key.
-    tiles = torch.empty(pairs, dtype=torch.int16 if no_tile < 1 << 15 else torch.int32, device=depths.device)
+    # A radix sort takes one pass per byte of the key. Torch has no sort for unsigned ones.
+    key, least_key = (torch.int16, 1 << 15) if no_tile < 1 << 16 else (torch.int32, 0)
+    tiles = torch.empty(pairs, dtype=key, device=depths.device)
     if pairs:
         grid, count = (triton.cdiv(pairs, PAIRS),), len(records) // len(shots)
-        emit_kernel[grid](records, boxes, starts, owners, tiles, shots, pairs, count, most_tiles, no_tile, TILE=tile, BLOCK=PAIRS)
+        emit_kernel[grid](records, boxes, starts, owners, tiles, shots, pairs, count, most_tiles, no_tile, least_key, TILE=tile, BLOCK=PAIRS)
     by_tile, places = tiles.sort(stable=True)
-    tile_offsets = torch.searchsorted(by_tile, torch.arange(no_tile + 1, dtype=tiles.dtype, device=tiles.device))
+    keys = torch.arange(-least_key, no_tile + 1 - least_key, dtype=key, device=tiles.device)
+    tile_offsets = torch.searchsorted(by_tile, keys)
     return Bins(owners[places], tile_offsets, places, starts, counts)

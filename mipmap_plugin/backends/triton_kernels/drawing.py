@@ -10,7 +10,7 @@ import torch
 import triton
 from torch import Tensor
 
-from mipmap_plugin.backends.triton_kernels import BACK_BATCH, BACK_WARPS, BATCH, RECORD, SPLATS, WARPS, tile_for
+from mipmap_plugin.backends.triton_kernels import BACK_BATCH, BATCH, RECORD, SPLATS, WARPS, tile_for
 from mipmap_plugin.backends.triton_kernels.binning import Bins, bin_splats
 from mipmap_plugin.backends.triton_kernels.compositing import composite_kernel
 from mipmap_plugin.backends.triton_kernels.compositing_back import composite_back_kernel, gather_kernel
@@ -69,20 +69,12 @@ class Projected:
     shots: Shots
     constants: dict[str, int | bool]
     tile: int  # px
+    grid: tuple[int, int]  # the most tiles of a view, and the number of views
+    most_pixels: int  # of a view
     views: Tensor  # [V, numbers of `views.py`]
     listed: Tensor  # [pairs, 9], the records in the order of the lists: a program reads them one after the other
     depths: Tensor  # [V · N], infinite where a splat is not drawn
     bins: Bins
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """The most tiles of a view, and the number of views."""
-        return most_tiles(self.shots, self.tile), len(self.shots)
-
-    @property
-    def most_pixels(self) -> int:
-        """Of a view."""
-        return max(camera.width * camera.height for camera, _ in self.shots)
 
     @property
     def lists(self) -> tuple[Tensor, Tensor]:
@@ -113,23 +105,21 @@ class Drawing(NamedTuple):
         return array
 
 
-def most_tiles(shots: Shots, tile: int) -> int:
-    """The largest number of tiles of a view."""
-    return max(triton.cdiv(camera.width, tile) * triton.cdiv(camera.height, tile) for camera, _ in shots)
-
-
 def project(splats: KernelSplats, shots: Shots) -> Projected:
     """Project splats to all views, whose effects have the same SH degree, and list those of each tile."""
     means, rows = splats.means, len(shots) * len(splats.means)
-    tile = tile_for(sum(camera.width * camera.height for camera, _ in shots))
+    sizes = [camera.size for camera, _ in shots]
+    pixels = [height * width for height, width in sizes]
+    tile = tile_for(sum(pixels))
+    most_tiles = max(triton.cdiv(height, tile) * triton.cdiv(width, tile) for height, width in sizes)
     views, constants = view_parameters(shots, tile, means), splats.constants(shots[0][1])
     records, depths = means.new_empty(rows, RECORD), means.new_empty(rows)
     boxes = torch.empty(rows, 4, dtype=torch.int32, device=means.device)
     if rows:
         grid = triton.cdiv(len(means), SPLATS), len(shots)
         project_kernel[grid](*splats.arrays, views, records, depths, boxes, len(means), TILE=tile, **constants)
-    bins = bin_splats(records, depths, boxes, views, most_tiles(shots, tile), tile)
-    return Projected(shots, constants, tile, views, records[bins.splat_ids], depths, bins)
+    bins = bin_splats(records, depths, boxes, views, most_tiles, tile)
+    return Projected(shots, constants, tile, (most_tiles, len(shots)), max(pixels), views, records[bins.splat_ids], depths, bins)
 
 
 def draw(splats: KernelSplats, shots: Shots) -> Drawing:
@@ -138,7 +128,7 @@ def draw(splats: KernelSplats, shots: Shots) -> Drawing:
     pixels = projected.most_pixels
     images, transmittances = splats.means.new_empty(len(shots), pixels, 3), splats.means.new_empty(len(shots), pixels)
     composite_kernel[projected.grid](
-        *projected.lists, projected.views, images, transmittances, pixels, TILE=projected.tile, BATCH=BATCH, num_warps=WARPS[projected.tile]
+        *projected.lists, projected.views, images, transmittances, pixels, TILE=projected.tile, BATCH=BATCH, num_warps=WARPS
     )
     return Drawing(projected, images, transmittances)
 
@@ -151,7 +141,7 @@ def draw_back(drawing: Drawing, d_images: Tensor, d_alphas: Tensor, *, determini
     composite_back_kernel[projected.grid](
         *projected.lists, bins.splat_ids, bins.places, projected.views, drawing.images, drawing.transmittances, d_images, d_alphas, target,
         projected.most_pixels,
-        TILE=projected.tile, BATCH=BACK_BATCH, DETERMINISTIC=deterministic, num_warps=BACK_WARPS,
+        TILE=projected.tile, BATCH=BACK_BATCH[projected.tile], DETERMINISTIC=deterministic, num_warps=WARPS,
     )  # fmt: skip
     if deterministic and len(d_records):
         gather_kernel[(len(d_records),)](target, bins.starts, bins.counts, d_records, ROWS=ROWS, num_warps=1)
@@ -176,6 +166,6 @@ def weigh(splats: KernelSplats, shots: Shots) -> Tensor:
     sums = torch.zeros_like(projected.depths)
     weigh_kernel[projected.grid](
         *projected.lists, projected.bins.splat_ids, projected.views, sums, projected.most_pixels,
-        TILE=projected.tile, BATCH=BATCH, num_warps=BACK_WARPS,
+        TILE=projected.tile, BATCH=BATCH, num_warps=WARPS,
     )  # fmt: skip
     return sums

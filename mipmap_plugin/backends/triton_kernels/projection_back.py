@@ -98,8 +98,8 @@ def project_back_kernel(
         t = image_axis(view, u, tl.load(view + FX) / safe, 0)
         r = image_axis(view, v, tl.load(view + FY) / safe, 1)
         if HAS_COVARIANCES:
-            rows, d_rows = covariances + 9 * at, d_covariances + 9 * at
-            dt, dr = from_covariance_back(rows, drawn, t, r, d_xx, d_xy, d_yy, d_det, d_rows, inside, adds)
+            covariance, d_covariance = covariances + 9 * at, d_covariances + 9 * at
+            dt, dr = from_covariance_back(covariance, drawn, t, r, d_xx, d_xy, d_yy, d_det, d_covariance, inside, adds)
         else:
             quat, scale = load_quat(quats + 4 * at, drawn), load_scale(scales, at, drawn, RAW)
             d_quat, d_scale = d_quats + 4 * at, d_scales + 3 * at
