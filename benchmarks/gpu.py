@@ -131,7 +131,11 @@ def adaptations(request: Request, data: Path, bases: Sequence[Base] = BASES, **s
             yield Failure(backend, base.title, "no time was left")
             continue
         try:
-            yield from of_base(base, data, backend, request.device, **settings)
+            for row in of_base(base, data, backend, request.device, **settings):
+                yield row
+                if time.monotonic() > request.ends and row.scale != base.scales[-1]:
+                    yield Failure(backend, f"{base.title} after x{row.scale:g}", "no time was left")
+                    break
         except Exception as error:  # as in `gpu_speed.py`
             yield Failure.of(backend, base.title, error)
 

@@ -11,9 +11,15 @@ import torch
 
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.conformance import CASES, Outcome, check_backend
+from mipmap_plugin.backends.conformance.checks import check_steps, check_views
 
 SHARE = 6  # cases at a time
 ROUNDS = 4  # at most so many sets of processes, if kernels break them
+
+# What only some backends have: its name in them, and what checks it, with the case of this name.
+OPTIONAL = {"views": ("render_views", check_views), "steps": ("stepper", check_steps)}
+USUAL = "sh-degree-3"
+ALL = (*CASES, *OPTIONAL)
 
 # After an error of CUDA's a process can launch nothing more.
 BROKEN = ("CUDA error", "CUDA driver error")
@@ -34,7 +40,7 @@ class Checked:
         return cls(backend, len(outcomes), sum(outcome.skipped for outcome in outcomes), failed)
 
 
-def check_all(backends: Sequence[str], device: str, processes: int, cases: Sequence[str] = tuple(CASES)) -> Iterator[Checked]:
+def check_all(backends: Sequence[str], device: str, processes: int, cases: Sequence[str] = ALL) -> Iterator[Checked]:
     """Every backend on every case, all backends at once, each in processes of its own. A case that breaks its process fails alone."""
     each = max(1, processes // len(backends))
     rounds = {name: Round(name, device, each, cases) for name in backends}
@@ -64,7 +70,7 @@ class Round:
 
 def _kind(case: str) -> tuple[int, str, bool]:
     """Cases of one kind need the same kernels: where they lie side by side, each process compiles others. Those that take longest come first."""
-    built = CASES[case]()
+    built = CASES[USUAL if case in OPTIONAL else case]()
     return -built.effects.sh_degree, built.effects.screen_filter, built.gaussians.covariances is not None
 
 
@@ -78,6 +84,19 @@ def _outcomes(name: str, device: str, cases: Sequence[str]) -> list[Outcome]:
     for case in cases:
         if _broken:
             break
-        found += check_backend(get_backend(name), {case: CASES[case]}, device=device)
+        found.append(_outcome(name, device, case))
         _broken = any(sign in found[-1].message for sign in BROKEN)
     return found
+
+
+def _outcome(name: str, device: str, case: str) -> Outcome:
+    backend = get_backend(name)
+    if case not in OPTIONAL:
+        return check_backend(backend, {case: CASES[case]}, device=device)[0]
+    part, check = OPTIONAL[case]
+    if not hasattr(backend, part):
+        return Outcome(case, float("nan"), True, True, f"it has no {part}", skipped=True)
+    try:
+        return check(backend, CASES[USUAL], device=device)
+    except Exception as error:  # as `check_backend`
+        return Outcome(case, float("nan"), False, False, f"{type(error).__name__}: {error}")

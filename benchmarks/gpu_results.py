@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,8 @@ class Results:
             known = json.loads(file.read_text())
             results.bandwidth = known["bandwidth"]
             for key, kind in KINDS.items():
-                setattr(results, key, [] if key == "failures" else [kind(**row) for row in known[key]])
+                with suppress(TypeError):  # those of an earlier version may have other figures, and are measured again
+                    setattr(results, key, [] if key == "failures" else [kind(**row) for row in known[key]])
         return results
 
     def add(self, record: Any) -> None:

@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from typing import Literal
 
 import torch
+from gpu_gsplat import find, with_itself
 from gpu_tables import Failure, Speed
 from gpu_timing import Clock
 from scenes import Scene as Generated
@@ -18,7 +19,6 @@ from torch import Tensor
 from workloads import activated, effects_of
 
 from mipmap_plugin.adaptation.renderers import unrounded
-from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -105,14 +105,14 @@ def measure_all(
     backends: Sequence[str], cases: Sequence[Case], device: str, runs: int, modes: Sequence[Mode] = ("classic",)
 ) -> Iterator[Speed | Failure]:
     """Every backend on every case in every mode. A failure of one, such as too little memory, does not end the others."""
-    lacks = {(name, mode): get_backend(name).lacking(needs_of(mode, device)) for name in backends for mode in modes}
+    lacks = {(name, mode): find(name).lacking(needs_of(mode, device)) for name in with_itself(backends) for mode in modes}
     yield from (Failure(name, f"as {mode}", "; ".join(reasons)) for (name, mode), reasons in lacks.items() if reasons)
     made = generated(cases)
     for case in cases:
         scene = Scene.of(*case, device, made[spec_of(*case)])
         for name, mode in (key for key, reasons in lacks.items() if not reasons):
             try:
-                yield measure(get_backend(name), scene, device, runs, mode)
+                yield measure(find(name), scene, device, runs, mode)
             except Exception as error:  # a kernel that does not compile, or memory that does not suffice, is a finding
                 yield Failure.of(name, "{:,} splats at {} x {} px as {}".format(*case, mode), error)
             gc.collect()

@@ -5,31 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from gpu_gsplat import ITSELF, find, rasterized, with_itself
 from gpu_tables import Failure
 from gpu_timing import Clock
 from torch import Tensor
 from workloads import activated, effects_of
 
 from mipmap_plugin import Camera, Gaussians, load_model
-from mipmap_plugin.backends import get_backend
+from mipmap_plugin.backends.base import AdamStep
 from mipmap_plugin.wrap import own_cameras
 
 BASE = "lego_200"
 WIDTHS = (50, 100, 200, 400)  # px
 COUNTS = (1, 4, 8)  # views
 
+# The raw parameters' names in an `AdamStep`, and here.
+NAMES = {"means": "means", "quats": "quats", "scales": "log_scales", "opacities": "logits", "sh": "sh"}
+
 
 @dataclass(frozen=True)
 class Views:
-    """Milliseconds per view, forward and backward."""
+    """Milliseconds per view: forward and backward, and of a whole step."""
 
     backend: str
     width: int  # px
     views: int
     alone_ms: float  # one after the other
     together_ms: float | None  # in one call; None: the backend has none
+    step_ms: float  # in the quickest way that the backend has, and Adam's step
 
 
 @dataclass(frozen=True)
@@ -47,7 +53,7 @@ def measure_views(data: Path, backends: Sequence[str], device: str, runs: int) -
     raw = raw_of(model.gaussians(cameras[0]).detach(), device)
     for width in WIDTHS:
         sized = [camera.resized(width, round(width * camera.height / camera.width)) for camera in cameras]
-        for name in backends:
+        for name in with_itself(backends):
             try:
                 for count in COUNTS:
                     yield measure(name, Shots(raw, sized[:count]), device, runs)
@@ -66,8 +72,9 @@ def raw_of(gaussians: Gaussians, device: str) -> dict[str, Tensor]:
 
 def measure(name: str, shots: Shots, device: str, runs: int) -> Views:
     clock, count, width = Clock(device), len(shots.cameras), shots.cameras[0].width
-    alone, together = (clock.milliseconds(call, runs) / count if call else None for call in (_alone(name, shots), _together(name, shots)))
-    return Views(name, width, count, round(alone or 0.0, 4), together and round(together, 4))
+    kinds = (_alone(name, shots), _together(name, shots), _step(name, shots))
+    alone, together, step = (round(clock.milliseconds(call, runs) / count, 4) if call else None for call in kinds)
+    return Views(name, width, count, alone or 0.0, together, step or 0.0)
 
 
 def _differentiated(shots: Shots, images: Callable[[Gaussians], list[Tensor]]) -> None:
@@ -77,7 +84,7 @@ def _differentiated(shots: Shots, images: Callable[[Gaussians], list[Tensor]]) -
 
 
 def _alone(name: str, shots: Shots) -> Callable[[], None]:
-    backend = get_backend(name)
+    backend = find(name)
 
     def images(gaussians: Gaussians) -> list[Tensor]:
         return [backend.render(gaussians, camera, effects_of(gaussians)).image for camera in shots.cameras]
@@ -86,10 +93,10 @@ def _alone(name: str, shots: Shots) -> Callable[[], None]:
 
 
 def _together(name: str, shots: Shots) -> Callable[[], None] | None:
-    """gsplat, which draws several cameras at once, is called as its users do."""
-    backend = get_backend(name)
-    if name == "gsplat":
-        return lambda: _differentiated(shots, lambda gaussians: list(_of_gsplat(gaussians, shots.cameras)))
+    """gsplat itself draws several cameras at once."""
+    backend = find(name)
+    if name == ITSELF:
+        return lambda: _differentiated(shots, lambda gaussians: list(rasterized(gaussians, shots.cameras, effects_of(gaussians))[0]))
     if not hasattr(backend, "render_views"):
         return None
 
@@ -100,12 +107,34 @@ def _together(name: str, shots: Shots) -> Callable[[], None] | None:
     return lambda: _differentiated(shots, images)
 
 
-def _of_gsplat(gaussians: Gaussians, cameras: Sequence[Camera]) -> Tensor:
-    from gsplat import rasterization
+def _step(name: str, shots: Shots) -> Callable[[], None]:
+    backend = find(name)
+    if hasattr(backend, "stepper"):
+        return _of_stepper(backend, shots)
+    draw, optimizer = _together(name, shots) or _alone(name, shots), torch.optim.Adam(shots.raw.values(), lr=1e-9, fused=True)
 
-    means, first = gaussians.means, cameras[0]
-    intrinsics = torch.tensor([[[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras])
-    viewmats = torch.stack([camera.viewmat for camera in cameras])
-    splats = (means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    lens = (viewmats.to(means), intrinsics.to(means), first.width, first.height)
-    return rasterization(*splats, *lens, sh_degree=gaussians.sh_degree, packed=False)[0]
+    def step() -> None:
+        draw()
+        optimizer.step()
+
+    return step
+
+
+def _of_stepper(backend: Any, shots: Shots) -> Callable[[], None]:
+    """A step by what draws, differentiates and moves splats itself."""
+    raw = {own: shots.raw[name].detach().clone() for own, name in NAMES.items()}
+    first, second = ({own: torch.zeros_like(tensor) for own, tensor in raw.items()} for _ in range(2))
+    rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-9)
+    adam = AdamStep(raw, first, second, rates, betas=(0.9, 0.95), correction=1.0, eps=1e-15)
+    stepper, effects = backend.stepper(raw), effects_of(activated(shots.raw))
+
+    def step() -> None:
+        views = [(camera, effects) for camera in shots.cameras]
+        if hasattr(stepper, "render_all"):
+            stepper.differentiate_all([2 * drawn.image for drawn in stepper.render_all(views)])
+        else:
+            for number, view in enumerate(views):
+                stepper.differentiate(number, 2 * stepper.render(number, *view).image)
+        stepper.step(adam)
+
+    return step

@@ -9,6 +9,7 @@ import threading
 from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.report import PeakMemory
+from mipmap_plugin.adaptation.session import Session
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import remarks
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -547,6 +549,16 @@ def test_the_loss_is_what_was_asked_for_and_the_curve_is_in_decibel_all_the_same
     squares, absolutes = (wrapped().adapt(1 / 4, **{**BRIEF, "loss": loss, "steps": 2, "returns": "last"}) for loss in ("l2", "l1"))
     assert not torch.equal(shown(squares), shown(absolutes))
     assert absolutes.report.curve[0].psnr_db == pytest.approx(squares.report.curve[0].psnr_db, abs=3)
+
+
+def test_a_phase_on_a_gpu_ends_when_the_gpu_is_done(monkeypatch):
+    """What it is still at would count as the next one's."""
+    waited = []
+    monkeypatch.setattr(torch.cuda, "synchronize", waited.append)
+    session = SimpleNamespace(scale=0.5, device=torch.device("cuda"), seconds={"merging": 1.0})
+    with Session.phase(session, "merging"):
+        pass
+    assert session.seconds["merging"] > 1 and waited == [session.device] * 2
 
 
 def test_memory_is_counted_on_a_gpu_and_from_its_beginning(monkeypatch):

@@ -12,6 +12,7 @@ import pretended
 import pytest
 import tiny
 import torch
+from gsplat_stand_in import StandIn
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names, as scripts do
@@ -21,6 +22,7 @@ import gpu_adaptation  # noqa: E402
 import gpu_conformance  # noqa: E402
 from gpu_adaptation import Adaptation, Base  # noqa: E402
 from gpu_conformance import Checked, check_all  # noqa: E402
+from gpu_gsplat import Itself  # noqa: E402
 from gpu_profile import Profile, kernels  # noqa: E402
 from gpu_results import Results  # noqa: E402
 from gpu_speed import Scene, denser, measure_all  # noqa: E402
@@ -30,9 +32,11 @@ from gpu_views import Shots, Views, measure, raw_of  # noqa: E402
 
 from mipmap_plugin import load_model  # noqa: E402
 from mipmap_plugin.backends.conformance import Outcome  # noqa: E402
+from mipmap_plugin.backends.reference import ReferenceBackend  # noqa: E402
+from mipmap_plugin.effects import Effects  # noqa: E402
 
 OURS = Speed("triton", "classic", 1_000_000, 1920, 1080, 1.0, 4.0, 100.0, 10**9, 2 * 10**9)
-THEIRS = Speed("gsplat", "classic", 1_000_000, 1920, 1080, 2.0, 5.0, 200.0, 10**9, 2 * 10**9)
+THEIRS = Speed("gsplat itself", "classic", 1_000_000, 1920, 1080, 2.0, 5.0, 200.0, 10**9, 2 * 10**9)
 ADAPTED = Adaptation("lego_200", 0.25, "triton", 2.94, 2.5, 3.0, 400, "400 steps", 612.0, 33.87, 33.9, {"total": 2.94, "optimization": 2.5})
 MACHINE = {"device": "NVIDIA H200 (SXM)", "memory_gib": 139}
 
@@ -54,7 +58,9 @@ def test_every_backend_is_measured_on_every_scene():
     ]
     assert all(row.forward_ms > 0 and row.both_ms > 0 for row in rows)
     failures = [record for record in records if isinstance(record, Failure)]
-    assert [(failure.backend, failure.what) for failure in failures] == [("gsplat", "as classic"), ("gsplat", "as playcanvas")]
+    assert [(failure.backend, failure.what) for failure in failures] == [
+        (name, f"as {mode}") for name in ("gsplat", "gsplat itself") for mode in ("classic", "playcanvas")
+    ]
     assert "it runs on cuda, not on cpu" in failures[0].reason and "splats that fade to 0" in failures[1].reason
 
 
@@ -87,7 +93,7 @@ def test_small_views_are_timed_alone_and_together():
     shots = Shots(raw_of(tiny.gaussians(), "cpu"), tiny.cameras(2))
     alone, both = measure("reference", shots, "cpu", 1), measure("cpu", shots, "cpu", 1)
     assert (alone.width, alone.views, alone.together_ms) == (32, 2, None) and alone.alone_ms > 0
-    assert both.together_ms > 0
+    assert both.together_ms > 0 and alone.step_ms > 0 and both.step_ms > 0
 
 
 def test_where_there_are_no_kernels_none_is_listed():
@@ -108,8 +114,13 @@ def test_wrong_cases_are_named():
 
 
 def test_hard_cases_are_shared_among_processes():
-    (checked,) = check_all(["reference"], "cpu", 2, ("one-splat", "sh-degree-0"))
-    assert checked == Checked("reference", 2, 0, {})
+    (checked,) = check_all(["reference"], "cpu", 2, ("one-splat", "sh-degree-0", "views"))
+    assert checked == Checked("reference", 3, 1, {})
+
+
+def test_views_and_steps_are_checked_where_there_are_any():
+    views, steps = gpu_conformance._outcomes("cpu", "cpu", ["views", "steps"])
+    assert views.passed and steps.passed and not (views.skipped or steps.skipped)
 
 
 def test_a_case_that_breaks_its_process_fails_alone(monkeypatch):
@@ -122,7 +133,7 @@ def test_a_case_that_breaks_its_process_fails_alone(monkeypatch):
 
 def test_the_report_and_its_files_are_named_after_the_device(tmp_path):
     results = Results(MACHINE, 4e12)
-    for record in (OURS, Failure("inria", "", "it is not there"), ADAPTED, Views("triton", 50, 4, 0.5, None), Checked("triton", 2, 1, {})):
+    for record in (OURS, Failure("inria", "", "it is not there"), ADAPTED, Views("triton", 50, 4, 0.5, None, 0.6), Checked("triton", 2, 1, {})):
         results.add(record)
     results.add(Profile("triton", 300, 64, 48, 200.0, [("kernel", 100.0, 2.0)]))
     results.save(tmp_path)
@@ -186,3 +197,14 @@ def test_a_stand_in_for_a_larger_capture_is_made_on_the_device(tmp_path):
     with pretended.pretending():
         larger = gpu_adaptation.denser(model.to(pretended.DEVICE), 150)
         assert len(larger) == 150 and larger.parameters()["means"].device.type == pretended.DEVICE
+
+
+def test_gsplat_itself_draws_what_our_backend_asks_it_for(monkeypatch):
+    gsplat = pytest.importorskip("gsplat", reason="gsplat is in the test extra")
+    twin = StandIn()
+    monkeypatch.setattr(gsplat, "rasterization", lambda *args, **named: twin(*args, **named, backgrounds=torch.zeros(1, 3)))
+    splats, view = tiny.gaussians(20), tiny.cameras()[0]
+    for effects in (Effects(1), Effects(1, "antialiased")):
+        drawn, right = (backend.render(splats, view, effects) for backend in (Itself(), ReferenceBackend()))
+        torch.testing.assert_close(drawn.image, right.image, atol=2e-3, rtol=0)
+        torch.testing.assert_close(drawn.alpha, right.alpha, atol=2e-3, rtol=0)

@@ -30,6 +30,8 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.recipes import RECIPES
+from mipmap_plugin.viewing.sources import File, Supersampled
+from mipmap_plugin.viewing.stage import Look, Stage
 from mipmap_plugin.wrap import Wrapped
 
 TRIED = os.environ.get("TRY_WITHOUT_GPU") == "1"
@@ -127,10 +129,10 @@ def test_adapting_by_command_writes_the_same_file(backend, tmp_path):
     "words",
     [
         "render BASE --output OUT --scale 1/2 --depth --normals --supersampling 2",
-        "evaluate BASE --images SCENE --scale 1/2 --steps 4 --output OUT.json --no-report",
-        "tradeoff BASE --scale 1/2 --steps 4 --output OUT --no-picture --repeats 1",
-        "levels BASE --viewer classic --output OUT --coarsest 1/4 --steps 4",
-        "adapt BASE --scale 1/2 --scale 2 --steps 4 --viewer classic --viewer antialiased --output OUT",
+        "evaluate BASE --images SCENE --scale 1/2 --steps 4 --output OUT.json",
+        "tradeoff BASE --scale 1/2 --steps 4 --output OUT --no-picture --repeats 1 --report",
+        "levels BASE --viewer classic --output OUT --coarsest 1/4 --steps 4 --report",
+        "adapt BASE --scale 1/2 --scale 2 --steps 4 --viewer classic --viewer antialiased --output OUT --report",
     ],
     ids=["render", "evaluate", "tradeoff", "levels", "many"],
 )
@@ -151,6 +153,18 @@ def test_tiles_which_need_the_processor_are_refused(backend, tmp_path, capsys):
 def test_the_demo_runs_there(tmp_path, capsys):
     assert main(["demo", "--scale", "1/4", "--output", str(tmp_path / "demo"), "--no-report"]) == 0
     assert "dB" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_the_live_view_draws_there(backend):
+    pictures, screen = [], tiny.cameras()[0].resized(40, 30)
+    for device, name in (("cpu", "reference"), (DEVICE, backend)):
+        base = wrap_model(tiny.model().to(device), cameras=tiny.cameras(), backend=name)
+        stage = Stage(base, [File("base", base)], Supersampled("supersampled", base))
+        pictures.append(stage.draw(Look("base", against="supersampled"), screen))
+    here, there = pictures
+    assert there.psnr_db == pytest.approx(here.psnr_db, abs=SAME_DB) and there.seconds > 0
+    assert psnr(here.image, there.image.cpu()) > 30
 
 
 @pytest.mark.parametrize("viewer", ["playcanvas", "spark"])

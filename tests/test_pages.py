@@ -13,6 +13,8 @@ import torch
 from PIL import Image
 
 from mipmap_plugin import wrap_model
+from mipmap_plugin.backends import register_backend
+from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists
 from mipmap_plugin.evaluation.evaluate import Row
@@ -48,6 +50,21 @@ def pixels(uri: str) -> Image.Image:
 @pytest.fixture
 def model_folder(tmp_path):
     return tiny.folder(tmp_path / "base", tiny.cameras(3) + tiny.cameras(1, seed=9, split="test"))
+
+
+class OfFewSettings(ReferenceBackend):
+    """As those of a GPU: it has no viewer's cut-offs."""
+
+    name = "few"
+    capabilities = replace(ReferenceBackend.capabilities, settings=frozenset())
+
+
+def test_viewers_that_the_backend_lacks_are_left_out_with_its_reason(model_folder, tmp_path):
+    register_backend("few", OfFewSettings)
+    words = ["adapt", str(model_folder), "--scale", "1/2", "--report", "--output", str(tmp_path / "a.ply"), *BRIEF]
+    assert main(["few" if word == "reference" else word for word in words]) == 0
+    zoom = record_of(tmp_path / "a.ply.report.html")["zooms"][0]
+    assert zoom["viewers"] == [] and zoom["no_viewers"].startswith("Not drawn: backend 'few' cannot do this: it does not support another least alpha")
 
 
 def test_a_page_asks_the_network_for_nothing(tmp_path):

@@ -139,6 +139,15 @@ def test_pixels_are_enlarged_whole(stage, base, screen):
     assert picture.zoom == pytest.approx(stage.draw(Look("base"), odd).zoom / 4, rel=0.05)
 
 
+def test_a_picture_is_timed_until_the_device_has_drawn_it(stage, screen, monkeypatch):
+    """On a GPU the host is done long before."""
+    waited = []
+    monkeypatch.setattr(stage, "_device", torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "synchronize", waited.append)
+    stage.draw(Look("base"), screen)
+    assert waited == [torch.device("cuda")] * 2
+
+
 def test_a_difference_is_amplified_and_measured(stage, screen):
     same = stage.draw(Look("base", against="base"), screen)
     assert same.image.abs().max() == 0 and same.psnr_db > 100

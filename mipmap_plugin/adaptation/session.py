@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.curve import CurvePoint, is_true
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, is_true
 from mipmap_plugin.adaptation.following import Following, release
 from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_trained, psnr_per_viewer
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
@@ -86,7 +86,8 @@ class Session:
         self.asked_steps, config = config.steps, affordable_for_model(asked, self.base, cameras, near)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs, self.budget_share = request.finer, dict(request.inputs), request.budget_share
-        self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.base.parameters()["means"].device)
+        self.device = self.base.parameters()["means"].device
+        self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
         self._closest_of = cameras if scale > 1 and cameras else self.base_views  # a zoom-in is as fine as what the base was seen from
@@ -222,11 +223,11 @@ class Session:
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Count the seconds spent inside under a phase of that name."""
-        began = time.perf_counter()
-        with announced(f"{name} x{self.scale:g}"):
+        """Count the seconds spent inside under a phase of that name, those of a GPU too."""
+        watch = Stopwatch(self.device, self.seconds.get(name, 0.0))
+        with announced(f"{name} x{self.scale:g}"), watch:
             yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+        self.seconds[name] = watch.seconds
 
     def quality(self, model: SplatModel) -> Quality:
         """That of a model on the views that steer the run."""

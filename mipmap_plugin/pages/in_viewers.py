@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.errors import BackendUnavailable
 from mipmap_plugin.evaluation.metrics import psnr, ssim
 from mipmap_plugin.evaluation.viewer_differences import VIEWERS
 from mipmap_plugin.models.base import why_no_viewer
@@ -26,9 +27,11 @@ def why_not(base: Wrapped) -> str:
         return f"No viewer: {reason}."
     if base.model.traits.placed:
         return "No viewer: its own project alone opens such a file."
-    if base.backend(viewer=VIEWERS[0])[0].name == "reference":
-        return "Not drawn: only the reference backend could, which takes too long here."
-    return ""
+    try:
+        backend, _ = base.backend(viewer=VIEWERS[0])
+    except BackendUnavailable as error:
+        return f"Not drawn: {error}."
+    return "Not drawn: only the reference backend could, which takes too long here." if backend.name == "reference" else ""
 
 
 @torch.no_grad()

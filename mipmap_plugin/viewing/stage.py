@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.curve import decibel
+from mipmap_plugin.adaptation.curve import Stopwatch, decibel
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.viewing.screen import Sampling
 from mipmap_plugin.viewing.sources import Request, Source, Supersampled
@@ -49,7 +48,8 @@ class Stage:
     def __init__(self, base: Wrapped, others: Iterable[Source], reference: Supersampled) -> None:
         """`others`: the base itself among them; `reference`: what adapting aims at."""
         self.base, self.reference = base, reference
-        self.sampling = Sampling(base.model.parameters()["means"], base.views())
+        means = base.model.parameters()["means"]
+        self.sampling, self._device = Sampling(means, base.views()), means.device
         self.sources: dict[str, Source] = {}
         for source in (*others, reference):
             self.add(source)
@@ -65,19 +65,18 @@ class Stage:
     @torch.no_grad()
     def draw(self, look: Look, screen: Camera, coarse: float = 1.0) -> Picture:
         """Draw what a screen shows; `coarse`: the fraction of its width and height that is drawn. Raises SettingsError, BackendUnavailable."""
-        began = time.perf_counter()
         camera = smaller(replace(screen, time=look.time), 1 / look.pixel)
         zoom = self.sampling.of(camera).zoom
         drawn = smaller(camera, coarse)
         request = Request(drawn, zoom, look.viewer, drawn.height / camera.height if coarse < 1 else 1.0)
         source = self.sources[look.source]
-        image, psnr_db = source.render(request).clamp(0, 1), None
-        if look.against is not None:
-            difference = image - self.sources[look.against].render(request).clamp(0, 1)
-            image, psnr_db = (AMPLIFIED * difference.abs()).clamp(0, 1), decibel(float(difference.square().mean()))
-        seconds = time.perf_counter() - began
+        with Stopwatch(self._device) as watch:
+            image, psnr_db = source.render(request).clamp(0, 1), None
+            if look.against is not None:
+                difference = image - self.sources[look.against].render(request).clamp(0, 1)
+                image, psnr_db = (AMPLIFIED * difference.abs()).clamp(0, 1), decibel(float(difference.square().mean()))
         enlarged = whole_pixels(image, look.pixel, screen) if coarse == 1 else image
-        return Picture(enlarged, drawn, zoom, source.shown(zoom), seconds, source.splats(request), psnr_db)
+        return Picture(enlarged, drawn, zoom, source.shown(zoom), watch.seconds, source.splats(request), psnr_db)
 
 
 def smaller(camera: Camera, factor: float) -> Camera:
