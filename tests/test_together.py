@@ -1,5 +1,6 @@
 """Several views at once: where a GPU waits for each operation, weights, truths and checks are found for all of them in one call."""
 
+import pretended
 import pytest
 import tiny
 import torch
@@ -7,6 +8,7 @@ import torch
 from mipmap_plugin.adaptation.optimization import validation
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.parallel import ROWS_OF_VIEWS, together
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.start import blend_weights as weights
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -91,3 +93,14 @@ def test_a_check_draws_all_views_in_one_call_if_these_fit(fits, monkeypatch):
         drawn.append(check.steer(tiny.model()))
     assert drawn[0] == drawn[1]
     assert not fits or backend.calls == [4]
+
+
+def test_as_many_views_are_drawn_together_as_there_is_memory_for():
+    """Splats and pixels alike bound them; on a processor there is no need to."""
+    views = [tiny.cameras(1)[0].resized(512, 512)]
+    assert together(torch.zeros(10, 3), views) == 1
+    with pretended.pretending():
+        few, many = (torch.zeros(count, 3).to(pretended.DEVICE) for count in (10, ROWS_OF_VIEWS // 2))
+        assert together(few, views) == ROWS_OF_VIEWS // 512**2
+        assert together(many, views) == 2
+        assert together(torch.cat([many] * 3), views) == 1
