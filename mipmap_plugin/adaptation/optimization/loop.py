@@ -20,7 +20,7 @@ from mipmap_plugin.adaptation.optimization.losses import gradient_of
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, views_at_once
-from mipmap_plugin.adaptation.target.resize import difference_from
+from mipmap_plugin.adaptation.target.resize import difference_from, gradient_before
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -162,12 +162,13 @@ def _compare_all(
 def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The gradient of the loss of an image, [h, w, 3], and its mean square error, []."""
     image = image.detach()
-    if task.detail is None and image.shape == target.shape:
-        return gradient_of(image - target, config.loss)
+    if task.detail is None:
+        gradient, square_error = gradient_of(difference_from(target, image, config.resize), config.loss)
+        return gradient_before(gradient, (image.shape[0], image.shape[1]), config.resize), square_error
     difference = difference_from(target, image.requires_grad_(), config.resize)
     gradient, square_error = gradient_of(difference.detach(), config.loss)
-    further = () if task.detail is None else (task.detail(view, image),)
-    [whole] = torch.autograd.grad((difference, *further), image, (gradient, *map(torch.ones_like, further)))
+    further = task.detail(view, image)
+    [whole] = torch.autograd.grad((difference, further), image, (gradient, torch.ones_like(further)))
     return whole, square_error
 
 
