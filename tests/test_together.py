@@ -5,6 +5,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization import validation
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.validation import Validation
@@ -14,6 +15,7 @@ from mipmap_plugin.adaptation.start import blend_weights as weights
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.backends import register_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
@@ -72,6 +74,24 @@ def test_the_time_of_truths_that_are_prepared_is_that_of_each():
     costs, views = Costs(), tiny.cameras(3)
     costs.prepare(views, lambda some: some)
     assert list(costs.truths) == views and len(set(costs.truths.values())) == 1
+
+
+def test_truths_that_are_used_next_are_drawn_in_one_call():
+    drawn = []
+
+    class Noting(ReferenceBackend):
+        name, speed = "noting", -1
+
+        def render_views(self, gaussians, shots):
+            drawn.append((shots[0][0].zoom, len(shots)))
+            return [self.render(gaussians, *shot) for shot in shots]
+
+    register_backend("noting", Noting, replace=True)
+    settings = dict(steps=6, views_per_step=1, extra_views=0, merge_to=1.0, validation_views=2)
+    with pretended.pretending():
+        wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(6, width=16, height=12), backend="noting")
+        wrapped.adapt(1 / 4, **settings)
+    assert [count for zoom, count in drawn if zoom == 1] == [6]
 
 
 def test_weights_of_several_views_are_the_same(monkeypatch):

@@ -19,8 +19,8 @@ from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.losses import gradient_of
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, views_at_once
-from mipmap_plugin.adaptation.target.resize import difference_from
+from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, together, views_at_once
+from mipmap_plugin.adaptation.target.resize import difference_from, gradient_before
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -162,27 +162,32 @@ def _compare_all(
 def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The gradient of the loss of an image, [h, w, 3], and its mean square error, []."""
     image = image.detach()
-    if task.detail is None and image.shape == target.shape:
-        return gradient_of(image - target, config.loss)
+    if task.detail is None:
+        gradient, square_error = gradient_of(difference_from(target, image, config.resize), config.loss)
+        return gradient_before(gradient, (image.shape[0], image.shape[1]), config.resize), square_error
     difference = difference_from(target, image.requires_grad_(), config.resize)
     gradient, square_error = gradient_of(difference.detach(), config.loss)
-    further = () if task.detail is None else (task.detail(view, image),)
-    [whole] = torch.autograd.grad((difference, *further), image, (gradient, *map(torch.ones_like, further)))
+    further = task.detail(view, image)
+    [whole] = torch.autograd.grad((difference, further), image, (gradient, torch.ones_like(further)))
     return whole, square_error
 
 
 def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule, views: Sequence[Camera]) -> None:
-    """Make the truths of the views of a step that none used yet, and of some that are next to be used, so that every thread makes some."""
+    """Make the truths of the views of a step that none used yet, and of some that are used next: in one call, or some in every thread."""
     known, new = run.costs.truths, [view for view in views if view not in run.costs.truths]
     if not new:
         return
-    at_once = max_threads(run.student.parameters()["means"], new[0].zoomed(task.scale))
-    wanted = TRUTHS_AT_ONCE * at_once if at_once > 1 else 1
+    means, prepare = run.student.parameters()["means"], getattr(task.truth, "prepare", None)
+    at_once, in_a_call = max_threads(means, new[0].zoomed(task.scale)), 1 if prepare is None else together(means, task.views)
+    wanted = max(in_a_call, TRUTHS_AT_ONCE * at_once if at_once > 1 else 1)
     for step in range(run.step + 1, min(run.step + 1 + STEPS_AHEAD * wanted, config.steps)):
         if len(new) >= wanted:
             break
         new += [view for view in order(step, run.progress(config)) if view not in known and view not in new]
-    list(side_by_side(lambda view: run.costs.truth(view, task.truth), new, at_once))
+    if prepare is not None and in_a_call > 1:
+        run.costs.prepare(new, prepare)
+    else:
+        list(side_by_side(lambda view: run.costs.truth(view, task.truth), new, at_once))
 
 
 def _check(run: Run, task: Task, config: AdaptConfig) -> None:
