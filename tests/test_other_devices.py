@@ -28,6 +28,7 @@ from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.cli import main
+from mipmap_plugin.demo.run import beside_each_other
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.formats.images import write_image
@@ -139,6 +140,13 @@ def test_photographs_and_evaluation_there(tmp_path):
         wrapped.adapt(2, steps=2, images=scene, **FEW)
         rows = evaluate(wrapped, scene, (1 / 2,), ("default",), "P3", steps=2, **FEW)
     assert all(row.psnr_db > 10 for row in rows)
+
+
+def test_pictures_of_two_devices_are_put_beside_each_other():
+    pictures = [torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(seed)) for seed in range(2)]
+    with pretended.pretending():
+        joined = beside_each_other([pictures[0].to(pretended.DEVICE), pictures[1]])
+    assert torch.equal(joined, beside_each_other(pictures))
 
 
 @pytest.mark.parametrize("with_covariances", [False, True])
