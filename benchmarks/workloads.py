@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -34,7 +34,7 @@ class Workload:
     pairs: int  # (splat, pixel) pairs whose alpha is at least 1/255
 
     def save(self, path: Path) -> None:
-        torch.save(vars(self) | {"camera": vars(self.camera)}, path)
+        torch.save(vars(self) | {"camera": {each.name: getattr(self.camera, each.name) for each in fields(Camera)}}, path)
 
     @classmethod
     def load(cls, path: Path) -> Workload:

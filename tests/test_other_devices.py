@@ -83,6 +83,13 @@ def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
         assert all(torch.equal(tensor, parameters[name]) for name, tensor in here.model.parameters().items())
 
 
+def test_pictures_from_there_stand_beside_those_of_the_processor():
+    pictures = [torch.rand(4, 6, 3) for _ in range(2)]
+    here = beside_each_other(pictures)
+    with pretended.pretending():
+        assert torch.equal(beside_each_other([pictures[0].to(pretended.DEVICE), pictures[1]]), here)
+
+
 def test_anchors_are_left_out_there(monkeypatch, tmp_path):
     monkeypatch.setattr("mipmap_plugin.adaptation.start.thinning.PER_PIXEL", 0.0)
     model = load_model(FAMILIES["scaffold"](tmp_path / "base"))

@@ -96,7 +96,7 @@ def test_a_wrong_alpha_of_a_backend_is_told_by_its_name(alpha):
 @pytest.mark.parametrize(
     ("part", "method", "said"),
     [
-        ("render_views", lambda self, gaussians, shots: [], "render_views has to return a list of 4 Rendered, one for each view; it returned 0"),
+        ("render_views", lambda self, gaussians, shots: [], "render_views has to return a list of 1 Rendered, one for each view; it returned 0"),
         ("blend_weights", lambda self, *_: torch.zeros(3), "blend_weights has to return 60 finite numbers"),
         ("stepper", lambda self, raw: 1 / 0, "failed: ZeroDivisionError"),
     ],

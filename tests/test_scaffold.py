@@ -1,6 +1,7 @@
 """Scaffold-GS: decoded as in its own project, adapted, and saved so that its own reader takes it."""
 
 import json
+from dataclasses import replace
 
 import anchor_checkpoints as checkpoints
 import anchor_oracle as oracle
@@ -14,7 +15,6 @@ from anchor_checkpoints import Layout
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.resize import resize
-from mipmap_plugin.camera import Camera
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError, ShapeError
 from mipmap_plugin.evaluation.metrics import psnr
@@ -79,11 +79,11 @@ def test_decoding_agrees_with_the_formulas_in_float64(tmp_path, name, zoom):
 def test_a_training_view_sees_its_own_appearance(tmp_path):
     layout = LAYOUTS["distance of colors, appearance"]
     states = checkpoints.weights(layout)
-    view = Camera(**{**vars(VIEWS[0]), "index": 3})
+    view = replace(VIEWS[0], index=3)
     model = load(tmp_path, layout)
     agrees(model.gaussians(view), oracle.decode(checkpoints.columns(layout), states, layout, view, states["appearance"]["embedding.weight"][3]))
     with pytest.raises(SettingsError, match="index 5, but the model has the appearance of 5"):
-        model.gaussians(Camera(**{**vars(view), "index": 5}))
+        model.gaussians(replace(view, index=5))
 
 
 @pytest.mark.parametrize("size", [(48, 36), (5, 3), (17, 16)])
@@ -261,7 +261,7 @@ def test_inspecting_examines_what_a_view_shows(folder, capsys):
 
 
 def test_training_views_beside_the_model_are_numbered(folder):
-    write_cameras(folder / "cameras.json", [Camera(**{**vars(view), "split": "test" if i < 2 else "train"}) for i, view in enumerate(VIEWS)])
+    write_cameras(folder / "cameras.json", [replace(view, split="test" if i < 2 else "train") for i, view in enumerate(VIEWS)])
     (folder / "cfg_args").write_text(checkpoints.cfg_args(Layout()).replace("eval=False", "eval=True"))
     assert [camera.index for camera in wrap_model(folder).cameras] == [None, 0, 1, 2, 3, 4]
 

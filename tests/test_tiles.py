@@ -400,7 +400,7 @@ def test_a_step_whose_views_show_nothing_moves_nothing(halved):
     stepper = around[0].to_step.stepper(raw)
     seen = []
     shot = nothing(view), around[0]._effects
-    around[0].to_step.differentiate_one(stepper, 0, shot, lambda number, image: (seen.append(image) or image, image.square().mean()))
+    around[0].to_step.differentiate_one(stepper, 0, shot, lambda _, images: [(seen.extend(images) or images[0], images[0].square().mean())])
     zeros = {name: torch.zeros_like(tensor) for name, tensor in raw.items()}
     rates = dict.fromkeys(["means", "quats", "scales", "opacities", "sh0", "shN"], 0.1)
     stepper.step(AdamStep(raw, zeros, {name: zero.clone() for name, zero in zeros.items()}, rates, (0.9, 0.99), 1.0, 1e-8))

@@ -1,17 +1,21 @@
 """Several views at once: where a GPU waits for each operation, weights, truths and checks are found for all of them in one call."""
 
+import pretended
 import pytest
 import tiny
 import torch
 
+from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation.optimization import validation
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.validation import Validation
+from mipmap_plugin.adaptation.parallel import ROWS_OF_VIEWS, together
 from mipmap_plugin.adaptation.renderers import Renderer
 from mipmap_plugin.adaptation.start import blend_weights as weights
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
+from mipmap_plugin.backends import register_backend
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
@@ -72,6 +76,24 @@ def test_the_time_of_truths_that_are_prepared_is_that_of_each():
     assert list(costs.truths) == views and len(set(costs.truths.values())) == 1
 
 
+def test_truths_that_are_used_next_are_drawn_in_one_call():
+    drawn = []
+
+    class Noting(ReferenceBackend):
+        name, speed = "noting", -1
+
+        def render_views(self, gaussians, shots):
+            drawn.append((shots[0][0].zoom, len(shots)))
+            return [self.render(gaussians, *shot) for shot in shots]
+
+    register_backend("noting", Noting, replace=True)
+    settings = dict(steps=6, views_per_step=1, extra_views=0, merge_to=1.0, validation_views=2)
+    with pretended.pretending():
+        wrapped = wrap_model(tiny.model().to(pretended.DEVICE), cameras=tiny.cameras(6, width=16, height=12), backend="noting")
+        wrapped.adapt(1 / 4, **settings)
+    assert [count for zoom, count in drawn if zoom == 1] == [6]
+
+
 def test_weights_of_several_views_are_the_same(monkeypatch):
     monkeypatch.setattr(weights, "together", lambda *_: 2)
     splats, views, backend = tiny.gaussians(40), tiny.cameras(5), Together()
@@ -91,3 +113,14 @@ def test_a_check_draws_all_views_in_one_call_if_these_fit(fits, monkeypatch):
         drawn.append(check.steer(tiny.model()))
     assert drawn[0] == drawn[1]
     assert not fits or backend.calls == [4]
+
+
+def test_as_many_views_are_drawn_together_as_there_is_memory_for():
+    """Splats and pixels alike bound them; on a processor there is no need to."""
+    views = [tiny.cameras(1)[0].resized(512, 512)]
+    assert together(torch.zeros(10, 3), views) == 1
+    with pretended.pretending():
+        few, many = (torch.zeros(count, 3).to(pretended.DEVICE) for count in (10, ROWS_OF_VIEWS // 2))
+        assert together(few, views) == ROWS_OF_VIEWS // 512**2
+        assert together(many, views) == 2
+        assert together(torch.cat([many] * 3), views) == 1

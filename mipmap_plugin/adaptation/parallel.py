@@ -17,8 +17,8 @@ Result = TypeVar("Result")
 # Rows that a processor computes together, in bounded memory.
 CHUNK = 1 << 14
 
-# Rows times views that are computed together elsewhere, and pixels of views that are drawn together: each takes some hundred bytes.
-ROWS_OF_VIEWS = 1 << 22
+# Rows times views that are computed together elsewhere, and pixels of views that are drawn together: each takes up to half a kilobyte.
+ROWS_OF_VIEWS = 1 << 21
 
 # Splats plus pixels of a view. Larger views are rendered one after the other: the kernels' own threads are as fast there, and only one view
 # needs memory at a time.

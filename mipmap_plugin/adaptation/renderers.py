@@ -23,8 +23,8 @@ from mipmap_plugin.threads import side_by_side
 # For a rounding that does not depend on it.
 NO_CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
-# The number of a view in a step and its image [h, w, 3] -> the gradient of its loss, [h, w, 3], and its mean square error, [].
-Comparison = Callable[[int, Tensor], tuple[Tensor, Tensor]]
+# The numbers of views in a step and their images [h, w, 3] -> the gradient of each one's loss, [h, w, 3], and its mean square error, [].
+Comparison = Callable[[Sequence[int], Sequence[Tensor]], list[tuple[Tensor, Tensor]]]
 
 # Splats, cameras of the new scale and the number of the first of these draws -> [h, w, 3] each.
 ViewsRenderer = Callable[[Gaussians, Sequence[Camera], int], list[Tensor]]
@@ -88,7 +88,7 @@ class SteppingRenderer:
         """Draw the views of a step, whose first is the `draw`-th since the beginning, and compare their images; return the mean square errors."""
         shots = _shots(cameras, self.targets, draw)
         if self.together and hasattr(stepper, "render_all"):
-            compared = [compare(number, drawn.image) for number, drawn in enumerate(stepper.render_all(shots))]
+            compared = compare(range(len(shots)), [drawn.image for drawn in stepper.render_all(shots)])
             stepper.differentiate_all([gradient for gradient, _ in compared])
             return [square_error for _, square_error in compared]
         at_once = math.gcd(len(shots), threads.for_views())
@@ -96,7 +96,7 @@ class SteppingRenderer:
 
     def differentiate_one(self, stepper: Stepper, number: int, shot: tuple[Camera, Effects], compare: Comparison) -> Tensor:
         """The same for the view of that number in the step."""
-        gradient, square_error = compare(number, stepper.render(number, *shot).image)
+        [(gradient, square_error)] = compare([number], [stepper.render(number, *shot).image])
         stepper.differentiate(number, gradient)
         return square_error
 

@@ -211,15 +211,16 @@ class Backend(Protocol):
 
     name: str
     api_version: int
-    # Rank for `auto`, which takes the highest of the backends that can serve a request. On a GPU: 40 gsplat, whose speed others have
-    # measured; 30 triton; 20 inria, whose footprint and gradients differ most from the reference's; 0 reference.
+    # Rank for `auto`, which takes the highest of the backends that can serve a request. On a GPU: 50 triton, the fastest and closest to the
+    # reference (`benchmarks/results/gpu`); 40 gsplat; 20 inria, whose footprint and gradients differ most; 0 reference.
     speed: int
     # Optional: `note: str`, shown wherever the backend is listed or chosen. `own_threads: bool`: its kernels have threads of their own
     # (`threads.for_kernels`), return the same bytes on any number, and may run in several threads at once; then torch has one while adapting.
     # `blend_weights(gaussians, camera, effects) -> Tensor | None`: the sum of each splat's blend weights over the image, [N], or None where it has
-    # to be found from gradients. `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call, each shot a
-    # (camera, effects); adaptation steps are drawn so. `stepper(raw) -> Stepper`: for splats of 3DGS, with `raw` as `AdamStep.raw`; it
-    # keeps gradients from autograd and hands them to Adam itself, row by row, which takes less time, and far less memory.
+    # to be found from gradients; `weigh_views(gaussians, shots) -> Tensor`: those of several views, [V, N], each shot a (camera, effects).
+    # `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call; adaptation steps are drawn so.
+    # `stepper(raw) -> Stepper`: for splats of 3DGS, with `raw` as `AdamStep.raw`; it keeps gradients from autograd and hands them to Adam
+    # itself, row by row, which takes less time, and far less memory.
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""

@@ -12,7 +12,6 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.rotations import unit
 
 NO_CUDA = "it needs a CUDA GPU, and torch sees none here"
-UNTESTED = "not tested on a GPU by this package's author"
 
 
 class CachedCheck:

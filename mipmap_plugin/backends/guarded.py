@@ -18,7 +18,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.plugin_errors import naming, unchanged
 
 # What a backend may have beside `lacking` and `render`.
-OPTIONAL = ("render_views", "blend_weights", "stepper")
+OPTIONAL = ("render_views", "blend_weights", "weigh_views", "stepper")
 
 
 class Guarded:
@@ -80,6 +80,14 @@ class Guarded:
             weights: Tensor | None = theirs(gaussians, camera, effects)
         if weights is not None and (not isinstance(weights, Tensor) or tuple(weights.shape) != (len(gaussians),) or not weights.isfinite().all()):
             raise PluginError(f"{self._title}: blend_weights has to return {len(gaussians)} finite numbers, one for each splat, or None")
+        return weights
+
+    def _weigh_views(self, theirs: Any, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> Tensor:
+        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
+            weights: Tensor = theirs(gaussians, shots)
+        wanted = len(shots), len(gaussians)
+        if not isinstance(weights, Tensor) or tuple(weights.shape) != wanted or not weights.isfinite().all():
+            raise PluginError(f"{self._title}: weigh_views has to return finite numbers {list(wanted)}, one for each view and splat")
         return weights
 
     def _stepper(self, theirs: Any, raw: Mapping[str, Tensor]) -> Stepper:

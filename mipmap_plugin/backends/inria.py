@@ -1,7 +1,7 @@
 """INRIA's `diff_gaussian_rasterization` as a backend, in both generations, if the user has built it. No code of it is included.
 
-Not tested on a GPU by this package's author: the arguments were verified with a stand-in that renders what they say
-(`tests/test_inria_backend.py`). The rasterizer's conventions are fixed; requests are adapted to them:
+The arguments were verified with a stand-in that renders what they say (`tests/test_inria_backend.py`). On a GPU only alpha was: the build that was
+tried there lacks the instructions that store colors. The rasterizer's conventions are fixed; requests are adapted to them:
 
 - its near plane is 0.2: the scene is scaled so that the requested near plane lies there. The eye becomes the origin, so no digits are lost;
 - its dilation is 0.3 px²: the difference is added to each splat as variance along the camera's x and y, which projects to just that;
@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered
-from mipmap_plugin.backends.external import NO_CUDA, UNTESTED, CachedCheck, finite_splats, normalized
+from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, Effects
@@ -55,7 +55,7 @@ class InriaBackend:
     name = "inria"
     api_version = API_VERSION
     speed = 20
-    note = UNTESTED
+    note = "its colors were not tested on a GPU by this package's author"
     capabilities = Capabilities(
         devices=frozenset({"cuda"}),
         dtypes=frozenset({torch.float32}),

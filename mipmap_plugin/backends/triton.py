@@ -1,7 +1,7 @@
 """The Triton backend: a CUDA rasterizer without a build step, for Triton comes with torch's CUDA wheels. Same image as the reference.
 
-Not tested on a GPU by its author: the kernels were compiled for compute capability 8.0, 9.0 and 7.5, and run on tiny images in
-Triton's interpreter on a CPU (`tests/test_triton_backend.py`, `tests/test_triton_interpreted.py`).
+The kernels are also compiled for compute capability 7.5, 8.0 and 9.0, and run on tiny images in Triton's interpreter on a CPU, in
+`tests/test_triton_backend.py` and `tests/test_triton_interpreted.py`. The first run on a machine compiles them, for half a minute.
 
 The gradients of a splat are summed by atomic additions, in the order in which tiles finish. With
 `torch.use_deterministic_algorithms(True)` they are summed in a fixed order, for 36 bytes of memory per (splat, tile) pair.
@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered, Stepper
-from mipmap_plugin.backends.external import NO_CUDA, UNTESTED, CachedCheck
+from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -37,11 +37,10 @@ class TritonBackend:
 
     name = "triton"
     api_version = API_VERSION
-    note = UNTESTED
 
     def __init__(self) -> None:
         self._check = CachedCheck(self)
-        self.speed = -1 if interpreted() else 30
+        self.speed = -1 if interpreted() else 50
         self.capabilities = Capabilities(
             devices=frozenset({"cpu" if interpreted() else "cuda"}),
             dtypes=frozenset({torch.float32}),
@@ -72,12 +71,18 @@ class TritonBackend:
     @torch.no_grad()
     def blend_weights(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Tensor:
         """The sum of each splat's blend weights over the image, [N]. Raises as `render`."""
-        self._check.require(Needs.of(gaussians, effects, gradients=True))
+        return self.weigh_views(gaussians, [(camera, effects)])[0]
+
+    @torch.no_grad()
+    def weigh_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> Tensor:
+        """The same for several views, whose effects have one SH degree, [V, N]."""
+        for _, effects in shots:
+            self._check.require(Needs.of(gaussians, effects, gradients=True))
         from mipmap_plugin.backends.triton_kernels import drawing
 
         g = gaussians
         with torch.cuda.device_of(g.means):
-            return drawing.weigh(drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), [(camera, effects)])
+            return drawing.weigh(drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), shots)
 
     def stepper(self, raw: Mapping[str, Tensor]) -> Stepper:
         """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`."""

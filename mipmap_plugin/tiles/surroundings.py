@@ -143,7 +143,7 @@ class _InHalo(SteppingRenderer):
         core = stepper.render(number, *shot)
         image, alpha = core.image.requires_grad_(), core.alpha.requires_grad_()
         whole = self.around.whole(camera, core)
-        gradient, square_error = compare(number, whole.detach())
+        [(gradient, square_error)] = compare([number], [whole.detach()])
         whole.backward(gradient)
         assert image.grad is not None  # since the whole contains it
         stepper.differentiate(number, image.grad, alpha.grad)

@@ -69,12 +69,14 @@ class _Moments:
     states: Mapping[Tensor, dict[str, Any]]  # of the optimizer, which makes new ones when it starts anew
     first: Mapping[str, Tensor]
     second: Mapping[str, Tensor]
+    steps: int  # as counted in the states, which to read means to wait for a GPU
 
     @classmethod
     def of(cls, optimizer: Adam, parameters: Mapping[str, Tensor]) -> _Moments:
         states = {name: optimizer.state_of(tensor) for name, tensor in parameters.items()}
         first, second = (_joined_moments(states, name) for name in ("exp_avg", "exp_avg_sq"))
-        return cls({parameters[name]: state for name, state in states.items()}, first, second)
+        steps = int(next(iter(states.values()))["step"])
+        return cls({parameters[name]: state for name, state in states.items()}, first, second, steps)
 
     def are_of(self, optimizer: Adam) -> bool:
         """Whether the optimizer still has them."""
@@ -83,11 +85,11 @@ class _Moments:
     @torch.no_grad()
     def next_step(self, optimizer: Adam, raw: Mapping[str, Tensor]) -> AdamStep:
         """The optimizer's next step over the raw parameters of 3DGS."""
-        counts = [state["step"] for state in self.states.values()]
-        torch._foreach_add_(counts, 1)
-        count, (beta1, beta2) = int(counts[0]), optimizer.betas
-        rates = {group["name"]: group["lr"] / (1 - beta1**count) for group in optimizer.param_groups}
-        correction = (1 - beta2**count) ** -0.5
+        torch._foreach_add_([state["step"] for state in self.states.values()], 1)
+        self.steps += 1
+        beta1, beta2 = optimizer.betas
+        rates = {group["name"]: group["lr"] / (1 - beta1**self.steps) for group in optimizer.param_groups}
+        correction = (1 - beta2**self.steps) ** -0.5
         return AdamStep(raw, self.first, self.second, rates, optimizer.betas, correction, optimizer.eps, optimizer.nesterov)
 
 

@@ -19,8 +19,8 @@ from mipmap_plugin.adaptation.optimization.interrupt import interruptible
 from mipmap_plugin.adaptation.optimization.losses import gradient_of
 from mipmap_plugin.adaptation.optimization.optimizer import restore_snapshot, set_rates
 from mipmap_plugin.adaptation.optimization.run import Run, Task
-from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, views_at_once
-from mipmap_plugin.adaptation.target.resize import difference_from
+from mipmap_plugin.adaptation.parallel import large_for_torch, max_threads, together, views_at_once
+from mipmap_plugin.adaptation.target.resize import difference_from, gradient_before
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
@@ -112,9 +112,10 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
 def _step_by_rows(run: Run, rows: ByRows, task: Task, config: AdaptConfig, views: Sequence[Camera], cameras: Mapping[Camera, Camera]) -> None:
     """A step by the backend, which sums the gradients of the views that are drawn and compared side by side."""
 
-    def compare(number: int, x: Tensor) -> tuple[Tensor, Tensor]:  # x: the student
-        target = run.costs.truth(views[number], task.truth)  # r(x̂): the frozen base, resized
-        return _compare(task, config, views[number], x, target)
+    def compare(numbers: Sequence[int], xs: Sequence[Tensor]) -> list[tuple[Tensor, Tensor]]:  # x: the student
+        some = [views[number] for number in numbers]
+        targets = [run.costs.truth(view, task.truth) for view in some]  # r(x̂): the frozen base, resized
+        return _compare_all(task, config, some, xs, targets)
 
     square_errors = rows.differentiate([cameras[view] for view in views], run.step * config.views_per_step, compare)
     run.square_error = run.square_error + torch.stack(square_errors).mean()
@@ -135,7 +136,7 @@ def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence
         targets = [run.costs.truth(view, task.truth) for view in some]
         gaussians = splats(cameras[some[0]])
         images = task.images(gaussians, [cameras[view] for view in some], run.step * config.views_per_step + number)
-        compared = [_compare(task, config, *each) for each in zip(some, images, targets, strict=True)]
+        compared = _compare_all(task, config, some, images, targets)
         torch.autograd.backward(images, [gradient for gradient, _ in compared])
         run.square_error = run.square_error + sum(square_error for _, square_error in compared) / len(views)
         if run.gradients is not None:
@@ -148,30 +149,45 @@ def _step_by_autograd(run: Run, task: Task, config: AdaptConfig, views: Sequence
     run.optimizer.zero_grad()
 
 
+def _compare_all(
+    task: Task, config: AdaptConfig, views: Sequence[Camera], images: Sequence[Tensor], targets: Sequence[Tensor]
+) -> list[tuple[Tensor, Tensor]]:
+    """`_compare` of several views: in one operation where their images are of one size, since a GPU waits for each."""
+    if len(images) == 1 or task.detail is not None or len({image.shape for image in (*images, *targets)}) > 1:
+        return [_compare(task, config, *each) for each in zip(views, images, targets, strict=True)]
+    differences = torch.stack([image.detach() for image in images]) - torch.stack(list(targets))
+    return list(zip(*gradient_of(differences, config.loss), strict=True))
+
+
 def _compare(task: Task, config: AdaptConfig, view: Camera, image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The gradient of the loss of an image, [h, w, 3], and its mean square error, []."""
     image = image.detach()
-    if task.detail is None and image.shape == target.shape:
-        return gradient_of(image - target, config.loss)
+    if task.detail is None:
+        gradient, square_error = gradient_of(difference_from(target, image, config.resize), config.loss)
+        return gradient_before(gradient, (image.shape[0], image.shape[1]), config.resize), square_error
     difference = difference_from(target, image.requires_grad_(), config.resize)
     gradient, square_error = gradient_of(difference.detach(), config.loss)
-    further = () if task.detail is None else (task.detail(view, image),)
-    [whole] = torch.autograd.grad((difference, *further), image, (gradient, *map(torch.ones_like, further)))
+    further = task.detail(view, image)
+    [whole] = torch.autograd.grad((difference, further), image, (gradient, torch.ones_like(further)))
     return whole, square_error
 
 
 def _make_truths(run: Run, task: Task, config: AdaptConfig, order: ViewSchedule, views: Sequence[Camera]) -> None:
-    """Make the truths of the views of a step that none used yet, and of some that are next to be used, so that every thread makes some."""
+    """Make the truths of the views of a step that none used yet, and of some that are used next: in one call, or some in every thread."""
     known, new = run.costs.truths, [view for view in views if view not in run.costs.truths]
     if not new:
         return
-    at_once = max_threads(run.student.parameters()["means"], new[0].zoomed(task.scale))
-    wanted = TRUTHS_AT_ONCE * at_once if at_once > 1 else 1
+    means, prepare = run.student.parameters()["means"], getattr(task.truth, "prepare", None)
+    at_once, in_a_call = max_threads(means, new[0].zoomed(task.scale)), 1 if prepare is None else together(means, task.views)
+    wanted = max(in_a_call, TRUTHS_AT_ONCE * at_once if at_once > 1 else 1)
     for step in range(run.step + 1, min(run.step + 1 + STEPS_AHEAD * wanted, config.steps)):
         if len(new) >= wanted:
             break
         new += [view for view in order(step, run.progress(config)) if view not in known and view not in new]
-    list(side_by_side(lambda view: run.costs.truth(view, task.truth), new, at_once))
+    if prepare is not None and in_a_call > 1:
+        run.costs.prepare(new, prepare)
+    else:
+        list(side_by_side(lambda view: run.costs.truth(view, task.truth), new, at_once))
 
 
 def _check(run: Run, task: Task, config: AdaptConfig) -> None:

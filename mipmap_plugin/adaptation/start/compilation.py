@@ -26,7 +26,7 @@ def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], 
         if merging and number == 0:  # here, because another process may be compiling the backward pass by now
             weights = blend_weights(few, [CAMERA], backend, setting)
             merge(few, torch.ones_like(weights), weights, fraction=0.5)
-        if gradients and image.requires_grad:
+        if gradients and image.requires_grad and not (by_rows and hasattr(backend, "stepper")):
             image.sum().backward()
     if by_rows and gradients and hasattr(backend, "stepper"):
         _step(backend, few, effects[0])

@@ -74,7 +74,8 @@ def _along(axis: int, image: Tensor, matrix: Blocks, transposed: Blocks) -> Tens
     """The product with each of the lines [pixels, C] of an image [H, W, C] along an axis."""
     first = image.movedim(axis, 0)
     resampled: Tensor = _Resample.apply(first.flatten(1), matrix, transposed)  # type: ignore[no-untyped-call]  # torch's
-    return resampled.unflatten(1, first.shape[1:]).movedim(0, axis)
+    image = resampled.unflatten(1, first.shape[1:])
+    return image.movedim(0, axis)
 
 
 @lru_cache(maxsize=CACHED_SIZES)

@@ -161,11 +161,11 @@ def project_back(splats: KernelSplats, projected: Projected, d_records: Tensor, 
 
 
 def weigh(splats: KernelSplats, shots: Shots) -> Tensor:
-    """The sum of each splat's blend weights over the images, [V · N]."""
+    """The sum of each splat's blend weights over each image, [V, N]."""
     projected = project(splats, shots)
     sums = torch.zeros_like(projected.depths)
     weigh_kernel[projected.grid](
         *projected.lists, projected.bins.splat_ids, projected.views, sums, projected.most_pixels,
         TILE=projected.tile, BATCH=BATCH, num_warps=WARPS,
     )  # fmt: skip
-    return sums
+    return sums.view(len(shots), -1)
