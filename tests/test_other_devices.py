@@ -142,13 +142,6 @@ def test_photographs_and_evaluation_there(tmp_path):
     assert all(row.psnr_db > 10 for row in rows)
 
 
-def test_pictures_of_two_devices_are_put_beside_each_other():
-    pictures = [torch.rand(6, 8, 3, generator=torch.Generator().manual_seed(seed)) for seed in range(2)]
-    with pretended.pretending():
-        joined = beside_each_other([pictures[0].to(pretended.DEVICE), pictures[1]])
-    assert torch.equal(joined, beside_each_other(pictures))
-
-
 @pytest.mark.parametrize("with_covariances", [False, True])
 def test_arguments_of_other_rasterizers_are_on_the_device(with_covariances):
     splats, view, effects = tiny.gaussians(20), tiny.cameras()[0], Effects(1, "mip", 0.1)
