@@ -28,7 +28,6 @@ from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.cli import main
-from mipmap_plugin.demo.run import beside_each_other
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.formats.images import write_image

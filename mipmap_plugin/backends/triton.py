@@ -12,6 +12,8 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import torch
@@ -24,6 +26,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 
+OLDEST = (3, 3)  # versions before it compile no tuples
 NO_TRITON = "it needs triton, which comes with torch's CUDA wheels: pip install triton"
 
 
@@ -95,6 +98,10 @@ def missing() -> list[str]:
     """What this machine lacks to run the backend; empty if nothing."""
     if importlib.util.find_spec("triton") is None:
         return [NO_TRITON]
+    with suppress(PackageNotFoundError):  # other builds of triton have names of their own
+        installed = version("triton")
+        if tuple(int(part) for part in installed.split(".")[:2]) < OLDEST:
+            return [f"it needs triton {'.'.join(map(str, OLDEST))} or newer, which comes with torch 2.7; {installed} is installed"]
     return [] if interpreted() or torch.cuda.is_available() else [NO_CUDA]
 
 
