@@ -28,6 +28,7 @@ DIGITS = 16
 # slips (one axis flipped, one stretched, intrinsics multiplied in) are off by far more.
 POSE_TOLERANCE = 3e-2
 
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """One view of a pinhole camera, with the axes of OpenCV: x right, y down, z forward. The centers of pixels lie at +0.5.

@@ -57,6 +57,15 @@ def test_an_image_beyond_the_limit_is_made_again_and_looks_the_same():
     assert torch.equal(first, store(0, noise)) and torch.equal(second, ImageStore(1 << 20, LIKE)(1, lambda: noise(1)))
 
 
+def test_images_that_were_made_together_are_forgotten_one_by_one():
+    store = ImageStore(1 << 20, LIKE)
+    store.of_one_size([0, 1, 2], lambda numbers: torch.stack([noise(number) for number in numbers]))
+    store.keep_only(lambda key: key == 1)
+    [kept] = store._images.values()
+    assert kept.untyped_storage().nbytes() == kept.nbytes == store._bytes
+    assert torch.equal(store(1, lambda: 1 / 0), ImageStore(1 << 20, LIKE)(1, lambda: noise(1)))
+
+
 def test_the_dtype_is_the_models():
     model = tiny.model()
     model.replace_parameters({name: tensor.double() for name, tensor in model.parameters().items()})

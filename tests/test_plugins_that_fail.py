@@ -98,6 +98,7 @@ def test_a_wrong_alpha_of_a_backend_is_told_by_its_name(alpha):
     [
         ("render_views", lambda self, gaussians, shots: [], "render_views has to return a list of 1 Rendered, one for each view; it returned 0"),
         ("blend_weights", lambda self, *_: torch.zeros(3), "blend_weights has to return 60 finite numbers"),
+        ("weigh_views", lambda self, *_: torch.zeros(3), r"weigh_views has to return finite numbers \[\d+, 60\]"),
         ("stepper", lambda self, raw: 1 / 0, "failed: ZeroDivisionError"),
     ],
 )
@@ -105,6 +106,19 @@ def test_what_a_backend_may_have_is_looked_at_too(part, method, said):
     base = backend(lambda rendered, _: rendered, **{part: method})
     with pytest.raises(PluginError, match=f"backend 'odd'.*{said}"):
         base.adapt(0.5, **BRIEF, views_per_step=4, warm_up=0)
+
+
+def test_a_stepper_that_draws_all_views_in_one_call_still_does_and_fails_by_its_backends_name():
+    class Failing:
+        def render_all(self, shots):
+            return 1 / 0
+
+        def differentiate_all(self, gradients):
+            pass
+
+    base = backend(lambda rendered, _: rendered, stepper=lambda self, raw: Failing())
+    with pytest.raises(PluginError, match="backend 'odd' failed: ZeroDivisionError"):
+        base.backend()[0].stepper({}).render_all([])
 
 
 def test_a_backend_that_fails_ends_a_command_in_a_sentence(tmp_path, capsys):

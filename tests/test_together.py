@@ -10,7 +10,7 @@ from mipmap_plugin.adaptation.optimization import validation
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.parallel import ROWS_OF_VIEWS, together
-from mipmap_plugin.adaptation.renderers import Renderer
+from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer
 from mipmap_plugin.adaptation.start import blend_weights as weights
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.pseudo_truth import PseudoTruth
@@ -101,6 +101,29 @@ def test_weights_of_several_views_are_the_same(monkeypatch):
     expected, expected_shown = weights.weighed(splats, views, ReferenceBackend(), EFFECTS)
     torch.testing.assert_close(found, expected)
     assert shown == expected_shown and backend.calls == [2, 2, 1]
+
+
+@pytest.mark.parametrize(("degrees", "calls"), [((1, 1), [2]), ((1, 0), [1, 1])])
+def test_views_of_a_step_are_drawn_in_one_call_where_their_colors_have_one_degree(degrees, calls):
+    drawn = []
+
+    class Stepper:
+        def render_all(self, shots):
+            drawn.append(len(shots))
+            return [ReferenceBackend().render(tiny.gaussians(8), *shot) for shot in shots]
+
+        def render(self, number, *shot):
+            return self.render_all([shot])[0]
+
+        def differentiate(self, number, gradient):
+            pass
+
+        def differentiate_all(self, gradients):
+            pass
+
+    renderer = SteppingRenderer(lambda raw: Stepper(), [Effects(degree) for degree in degrees])
+    errors = renderer.differentiate(Stepper(), tiny.cameras(2), 0, lambda numbers, images: [(image, image.mean()) for image in images])
+    assert drawn == calls and len(errors) == 2
 
 
 @pytest.mark.parametrize("fits", [True, False])

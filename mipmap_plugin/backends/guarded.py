@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -100,6 +100,16 @@ class _GuardedStepper:
 
     def __init__(self, title: str, theirs: Stepper) -> None:
         self._title, self._theirs = title, theirs
+
+    def __getattr__(self, name: str) -> Any:
+        """What it may have beside: `render_all` and `differentiate_all`."""
+        if name not in ("render_all", "differentiate_all"):
+            raise AttributeError(name)
+        return partial(self._named, getattr(self._theirs, name))
+
+    def _named(self, theirs: Callable[..., Any], *args: Any) -> Any:
+        with naming(self._title):
+            return theirs(*args)
 
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
         with naming(self._title):

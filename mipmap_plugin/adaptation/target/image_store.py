@@ -68,7 +68,9 @@ class ImageStore:
 
     def keep_only(self, is_needed: Callable[[Any], bool]) -> None:
         """Make room by forgetting every image whose key is not needed."""
-        self._images = {key: image for key, image in self._images.items() if is_needed(key)}
+        kept = {key: image for key, image in self._images.items() if is_needed(key)}
+        # Of images that were made together, one alone would keep the memory of all.
+        self._images = {key: image.clone() if image.untyped_storage().nbytes() > image.nbytes else image for key, image in kept.items()}
         self._bytes = sum(image.nbytes for image in self._images.values())
 
 
