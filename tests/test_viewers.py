@@ -583,12 +583,18 @@ def test_a_viewer_draws_no_more_bands_than_it_has():
     assert find_viewer("spark").effects(Effects(2)).sh_degree == 2
 
 
-@pytest.mark.parametrize("backend", [GsplatBackend(), InriaBackend(), TritonBackend()], ids=lambda backend: backend.name)
+@pytest.mark.parametrize("backend", [GsplatBackend(), InriaBackend()], ids=lambda backend: backend.name)
 def test_backends_on_a_gpu_report_what_they_do_not_support(backend):
     needs = Needs.of(splat(1.0, 1.0), find_viewer("gaussian-splats-3d").effects(Effects(0)), gradients=True)
     [reason] = [reason for reason in backend.lacking(needs) if "reference backend does" in reason]
     assert "stretching of round splats" in reason and "packing" in reason and "splats that end at a radius" in reason
     assert not [reason for reason in backend.lacking(replace(needs, settings=USUAL)) if "reference backend does" in reason]
+
+
+def test_triton_draws_every_viewer():
+    needs = [Needs.of(splat(1.0, 1.0), viewer.effects(Effects(0)), gradients=True) for viewer in BUILT_IN]
+    capabilities = TritonBackend().capabilities
+    assert not [reason for need in needs for reason in capabilities.lacking(replace(need, device=next(iter(capabilities.devices))))]
 
 
 def test_filters_that_integrate_are_no_viewers():
