@@ -55,7 +55,7 @@ def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeyp
         compile_for(capability, projection.project_kernel, TILE=tile, **shape, **splat)
         compile_for(capability, projection_back.project_back_kernel, **shape, **splat)
     compile_for(capability, binning.emit_kernel, TILE=tile, BLOCK=sizes.PAIRS)
-    compile_for(capability, rounding.round_kernel, sizes.WARPS, TILE=tile)
+    compile_for(capability, rounding.round_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH)
     for viewer in (False, True):
         compile_for(capability, compositing.composite_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH, VIEWER=viewer)
         compile_for(capability, weighing.weigh_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH, VIEWER=viewer)

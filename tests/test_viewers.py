@@ -20,7 +20,7 @@ from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, EvenBuckets, RenderSettings
-from mipmap_plugin.splatting.buckets import even_ranks, ranks
+from mipmap_plugin.splatting.buckets import even_ranks, ranks, ranks_of_views
 from mipmap_plugin.splatting.packing import packed
 from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer
 from mipmap_plugin.wrap import Wrapped
@@ -396,6 +396,17 @@ def test_buckets_of_three_js_divide_a_sphere_around_all_splats():
     splats = Gaussians(means, torch.ones(5, 4), torch.full((5, 3), 5.0), torch.ones(5), torch.zeros(5, 1, 3))
     places = even_ranks(splats, camera(), EvenBuckets(10, sphere_from=10.0, later_in_front=True))  # buckets of 10 units
     assert places.tolist() == [1, 4, 3, 2, 0]
+
+
+def test_the_order_of_several_views_is_that_of_each():
+    means = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, DEPTH])
+    splats = Gaussians(means, torch.ones(50, 4), torch.ones(50, 3), torch.ones(50), torch.zeros(50, 1, 3))
+    aside = camera().looking_from(torch.tensor([[0.6, 0.0, -0.8, 6.0], [0.0, 1.0, 0.0, 0.0], [0.8, 0.0, 0.6, 4.0], [0.0, 0.0, 0.0, 1.0]]), "")
+    bucketed, even = RenderSettings(bucketed=True), EvenBuckets(10)
+    found = ranks_of_views(splats, [(aside, bucketed), (aside, RenderSettings(even_buckets=even)), (camera(), USUAL), (camera(), bucketed)])
+    expected = [ranks(splats, aside), even_ranks(splats, aside, even), None, ranks(splats, camera())]
+    assert [None if own is None else own.tolist() for own in found] == [None if own is None else own.tolist() for own in expected]
+    assert not torch.equal(expected[0], expected[3])
 
 
 @BOTH

@@ -1,7 +1,8 @@
 """The Triton backend: a CUDA rasterizer without a build step, for Triton comes with torch's CUDA wheels. Same image as the reference.
 
 The kernels are also compiled for compute capability 7.5, 8.0 and 9.0, and run on tiny images in Triton's interpreter on a CPU, in
-`tests/test_triton_backend.py` and `tests/test_triton_interpreted.py`. The first run on a machine compiles them, for half a minute.
+`tests/test_triton_backend.py` and `tests/test_triton_interpreted.py`. The first run on a machine compiles them, for half a minute, and so does the
+first for a viewer, whose settings are not the usual ones.
 
 The gradients of a splat are summed by atomic additions, in the order in which tiles finish. With
 `torch.use_deterministic_algorithms(True)` they are summed in a fixed order, for 36 bytes of memory per (splat, tile) pair.
@@ -23,7 +24,7 @@ from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.buckets import ranks_for
+from mipmap_plugin.splatting.buckets import ranks_of_views
 from mipmap_plugin.splatting.packing import packed
 
 if TYPE_CHECKING:
@@ -92,7 +93,8 @@ class TritonBackend:
             self._check.require(Needs.of(gaussians, effects, gradients=True))
         from mipmap_plugin.backends.triton_kernels.views import Shot
 
-        ranked = [Shot(camera, effects, ranks_for(effects.settings, gaussians, camera)) for camera, effects in shots]
+        ranks = ranks_of_views(gaussians, [(camera, effects.settings) for camera, effects in shots])
+        ranked = [Shot(*shot, own) for shot, own in zip(shots, ranks, strict=True)]
         if all(effects.settings.packing is None for _, effects in shots):
             return [(_tensors(gaussians), ranked)]
         packings = [effects.settings.packing for _, effects in shots]

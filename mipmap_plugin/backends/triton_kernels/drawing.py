@@ -152,7 +152,8 @@ def rounded(drawing: Drawing) -> Tensor:
     if all(shot.effects.settings.picture_step is None for shot in projected.shots):
         return drawing.images
     images = drawing.images.clone()
-    round_kernel[projected.grid](*projected.lists, projected.views, images, projected.most_pixels, TILE=projected.tile, num_warps=WARPS)
+    arrays = *projected.lists, projected.views, images
+    round_kernel[projected.grid](*arrays, projected.most_pixels, TILE=projected.tile, BATCH=BATCH, num_warps=WARPS)
     return images
 
 

@@ -29,7 +29,7 @@ def blended(alpha, color, behind, step):
 
 
 @triton.jit(do_not_specialize=["most_pixels"])
-def round_kernel(records, tile_offsets, shots, images, most_pixels, TILE: tl.constexpr):
+def round_kernel(records, tile_offsets, shots, images, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr):
     """Draw one tile of `images` again, where its view rounds pictures."""
     view = shots + tl.program_id(1) * NUMBERS
     step, limits = tl.load(view + PICTURE_STEP), cut_offs(view)
@@ -38,13 +38,15 @@ def round_kernel(records, tile_offsets, shots, images, most_pixels, TILE: tl.con
         begin, end = slots(tile_offsets)
         nothing = tl.zeros_like(px)
         red, green, blue = nothing + tl.load(view + RED), nothing + tl.load(view + GREEN), nothing + tl.load(view + BLUE)
-        slot = end
-        while slot > begin:
-            slot -= 1
-            record = record_at(records, slot, end)
-            _dy, _u, _raw, alpha = alpha_at(record, px, py, limits, VIEWER=True)
-            alpha = drawn(record, alpha, VIEWER=True)
-            red, green, blue = blended(alpha, record[6], red, step), blended(alpha, record[7], green, step), blended(alpha, record[8], blue, step)
+        slot = end - 1
+        while slot >= begin:
+            for _ in tl.static_range(BATCH):
+                record = record_at(records, tl.where(slot >= begin, slot, end), end)
+                _dy, _u, _raw, alpha = alpha_at(record, px, py, limits, VIEWER=True)
+                alpha = drawn(record, alpha, VIEWER=True)
+                red, green = blended(alpha, record[6], red, step), blended(alpha, record[7], green, step)
+                blue = blended(alpha, record[8], blue, step)
+                slot -= 1
         tl.store(images + 3 * at, red, inside)
         tl.store(images + 3 * at + 1, green, inside)
         tl.store(images + 3 * at + 2, blue, inside)

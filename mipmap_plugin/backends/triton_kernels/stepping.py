@@ -16,7 +16,7 @@ from mipmap_plugin.backends.triton_kernels.views import Shot
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.splatting.buckets import ranks_for
+from mipmap_plugin.splatting.buckets import ranks_of_views
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")  # as `adam.py` reads them
@@ -47,7 +47,8 @@ class TritonStepper:
             return [Shot(*shot) for shot in shots]
         splats = self._splats
         activated = Gaussians(splats.means, splats.quats, splats.scales.exp(), splats.opacities.sigmoid(), splats.sh)
-        return [Shot(camera, effects, ranks_for(effects.settings, activated, camera)) for camera, effects in shots]
+        ranks = ranks_of_views(activated, [(camera, effects.settings) for camera, effects in shots])
+        return [Shot(*shot, own) for shot, own in zip(shots, ranks, strict=True)]
 
     def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
         self.differentiate_all([d_image], None if d_alpha is None else [d_alpha], number)
