@@ -28,7 +28,6 @@ from mipmap_plugin.backends import gsplat, inria
 from mipmap_plugin.backends.conformance.cases import covariances
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.cli import main
-from mipmap_plugin.demo.run import beside_each_other
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.formats.images import write_image
@@ -81,13 +80,6 @@ def test_each_family_adapts_and_is_saved_there(family, scale, tmp_path):
     assert [point.psnr_db for point in there.report.curve] == pytest.approx([point.psnr_db for point in here.report.curve], abs=1e-3)
     if family == "3dgs" and EXACT:  # networks' products of matrices are taken apart in another way there
         assert all(torch.equal(tensor, parameters[name]) for name, tensor in here.model.parameters().items())
-
-
-def test_pictures_from_there_stand_beside_those_of_the_processor():
-    pictures = [torch.rand(4, 6, 3) for _ in range(2)]
-    here = beside_each_other(pictures)
-    with pretended.pretending():
-        assert torch.equal(beside_each_other([pictures[0].to(pretended.DEVICE), pictures[1]]), here)
 
 
 def test_anchors_are_left_out_there(monkeypatch, tmp_path):

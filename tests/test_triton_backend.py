@@ -74,6 +74,8 @@ def test_what_is_missing_is_reported(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert TritonBackend().lacking(USUAL) == []
     assert TritonBackend().lacking(replace(USUAL, screen_filter="window")) == ["it has the screen filters antialiased, classic, mip, not window"]
+    monkeypatch.setattr("mipmap_plugin.backends.triton.version", lambda name: "3.2.0")
+    assert TritonBackend().lacking(USUAL) == ["it needs triton 3.3 or newer, which comes with torch 2.7; 3.2.0 is installed"]
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert TritonBackend().lacking(USUAL) == [NO_TRITON]
 

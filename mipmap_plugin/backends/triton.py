@@ -13,6 +13,8 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -30,6 +32,7 @@ from mipmap_plugin.splatting.packing import packed
 if TYPE_CHECKING:
     from mipmap_plugin.backends.triton_kernels.views import Shot
 
+OLDEST = (3, 3)  # versions before it compile no tuples
 NO_TRITON = "it needs triton, which comes with torch's CUDA wheels: pip install triton"
 
 
@@ -116,6 +119,10 @@ def missing() -> list[str]:
     """What this machine lacks to run the backend; empty if nothing."""
     if importlib.util.find_spec("triton") is None:
         return [NO_TRITON]
+    with suppress(PackageNotFoundError):  # other builds of triton have names of their own
+        installed = version("triton")
+        if tuple(int(part) for part in installed.split(".")[:2]) < OLDEST:
+            return [f"it needs triton {'.'.join(map(str, OLDEST))} or newer, which comes with torch 2.7; {installed} is installed"]
     return [] if interpreted() or torch.cuda.is_available() else [NO_CUDA]
 
 

@@ -135,7 +135,7 @@ def settings_for(base: Wrapped) -> dict[str, Any]:
 
 def beside_each_other(pictures: Sequence[Tensor]) -> Tensor:
     """Pictures [h, w, 3] of one size beside each other, each about SHOWN px high: small ones enlarged by whole pixels."""
-    pictures = [picture.cpu() for picture in pictures]  # a truth is made on the processor
+    pictures = [picture.cpu() for picture in pictures]  # a truth is ray-traced there
     height, width = pictures[0].shape[:2]
     times = max(1, SHOWN // height)
     shown = [picture.repeat_interleave(times, 0).repeat_interleave(times, 1) for picture in pictures]
