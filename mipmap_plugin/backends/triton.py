@@ -73,7 +73,7 @@ class TritonBackend:
         camera, one by one. Raises as `render`."""
         outputs: list[Tensor] = []
         for tensors, together in self._prepared(gaussians, shots):
-            outputs += _Draw.apply(together, *tensors)  # type: ignore[no-untyped-call]  # torch's
+            outputs += _Draw.apply(together, torch.is_grad_enabled(), *tensors)  # type: ignore[no-untyped-call]  # torch's
         return [Rendered(image, alpha) for image, alpha in zip(outputs[::2], outputs[1::2], strict=True)]
 
     @torch.no_grad()
@@ -130,11 +130,11 @@ class _Draw(torch.autograd.Function):
     """The image and the alpha of each shot, one after the other."""
 
     @staticmethod
-    def forward(ctx: Any, shots: Sequence[Shot], *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, shots: Sequence[Shot], in_graph: bool, *tensors: Tensor) -> tuple[Tensor, ...]:
         from mipmap_plugin.backends.triton_kernels import drawing
 
         with torch.cuda.device_of(tensors[0]):  # kernels are launched on the current GPU, which may be another
-            drawn = drawing.draw(drawing.KernelSplats.of(*tensors), shots, gradients=any(ctx.needs_input_grad))
+            drawn = drawing.draw(drawing.KernelSplats.of(*tensors), shots, gradients=in_graph and any(ctx.needs_input_grad))
             rounded = drawing.rounded(drawn)
         ctx.projected = drawn.projected
         ctx.save_for_backward(*tensors, drawn.images, drawn.transmittances)
@@ -152,4 +152,4 @@ class _Draw(torch.autograd.Function):
         with torch.cuda.device_of(images):
             d_records = drawing.draw_back(drawn, drawn.packed(d_outputs[::2]), drawn.packed(d_outputs[1::2]), deterministic=in_order)
             drawing.project_back(splats, drawn.projected, d_records, grads)
-        return None, *grads[:-1]
+        return None, None, *grads[:-1]
