@@ -53,11 +53,12 @@ class KernelSplats(NamedTuple):
         return self.means, self.quats, self.scales, covariances, self.opacities, self.sh
 
     def constants(self, shots: Shots) -> dict[str, int | bool]:
-        """What the projection kernels are compiled for."""
-        bands = self.sh.shape[1]
-        degree = min(max(shot.effects.sh_degree for shot in shots), round(bands**0.5) - 1)
+        """What the projection kernels are compiled for. Where there are viewers, whose degrees of SH differ, kernels have all bands."""
+        bands, viewer = self.sh.shape[1], any(shot.effects.settings != USUAL for shot in shots)
+        most = round(bands**0.5) - 1
+        degree = most if viewer else min(max(shot.effects.sh_degree for shot in shots), most)
         shape = {"HAS_COVARIANCES": self.covariances is not None, "RAW": self.raw, "DEGREE": degree, "BANDS": bands}
-        return {**shape, "VIEWER": any(shot.effects.settings != USUAL for shot in shots), "BLOCK": SPLATS}
+        return {**shape, "VIEWER": viewer, "BLOCK": SPLATS}
 
     def new_gradients(self) -> KernelSplats:
         """Arrays for the gradients; None for the shape that is not in use."""

@@ -10,7 +10,7 @@ from mipmap_plugin.backends.triton_kernels.harmonics import color
 from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD, end_of, store_six
 from mipmap_plugin.backends.triton_kernels.rounding import round_to
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes, from_covariance, load_quat
-from mipmap_plugin.backends.triton_kernels.vectors import finite, load3
+from mipmap_plugin.backends.triton_kernels.vectors import LARGEST, finite, load3
 from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_camera
 
 NEAR, EPS2D, MIN_ALPHA, W_END, SH_DEGREE = views.NEAR, views.EPS2D, views.MIN_ALPHA, views.W_END, views.SH_DEGREE
@@ -150,7 +150,8 @@ def project_kernel(
     store_six(records + row * RECORD, x, y, along, shear, (-1 / across) * HALF_LOG2_E, log2_opacity, drawn)
     depth = eye[2]
     if VIEWER:
-        depth = tl.where(tl.load(view + RADIAL) > 0, tl.sqrt(eye[0] * eye[0] + eye[1] * eye[1] + eye[2] * eye[2]), depth)
+        distance = tl.minimum(tl.sqrt(eye[0] * eye[0] + eye[1] * eye[1] + eye[2] * eye[2]), LARGEST)  # infinity is for what is not drawn
+        depth = tl.where(tl.load(view + RADIAL) > 0, distance, depth)
     tl.store(depths + row, tl.where(drawn, depth, float("inf")), inside)
     first_x, wide_x = bounds(x, reach_x, tl.load(view + TILES_X), TILE)
     first_y, wide_y = bounds(y, reach_y, tl.load(view + TILES_Y), TILE)
