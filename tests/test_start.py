@@ -8,11 +8,15 @@ import torch
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.start import candidates as start
+from mipmap_plugin.adaptation.start import compilation
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.start.pixel_size import mean_pixel_size, pixel_size
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.splatting.viewers import find_viewer
 from mipmap_plugin.wrap import wrap_model
 
 SCALE, COUNT = 1 / 4, 80
@@ -184,6 +188,16 @@ def test_phases_are_named():
     assert seconds["total"] == pytest.approx(sum(seconds[phase] for phase in phases), rel=0.2)
     assert "merging" not in adapted().report.seconds
     assert "closed form" not in adapted(closed_form=False).report.seconds
+
+
+def test_steps_with_the_usual_settings_and_with_others_are_compiled_first(monkeypatch):
+    """A backend may have kernels of their own for viewers."""
+    stepped, backend = [], ReferenceBackend()
+    backend.stepper = None
+    monkeypatch.setattr(compilation, "_step", lambda _backend, _splats, effects: stepped.append(effects))
+    effects = [Effects(1), Effects(1, "mip"), find_viewer("unity").effects(Effects(1)), find_viewer("spark").effects(Effects(1))]
+    compilation.warm_up(backend, tiny.gaussians(3), effects, gradients=True, merging=False, by_rows=True)
+    assert len(stepped) == 2 and effects[0] in stepped and effects[2] in stepped
 
 
 def test_a_start_is_computed_from_as_many_views_as_show_enough(monkeypatch):

@@ -47,20 +47,23 @@ def compile_for(capability: int, kernel, warps: int = 4, **constants) -> str:
 def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeypatch):
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     from mipmap_plugin.backends import triton_kernels as sizes
-    from mipmap_plugin.backends.triton_kernels import adam, binning, compositing, compositing_back, projection, projection_back, weighing
+    from mipmap_plugin.backends.triton_kernels import adam, binning, compositing, compositing_back, projection, projection_back, rounding, weighing
 
     splat, tile = {"RAW": True, "DEGREE": 1, "BANDS": 4, "BLOCK": sizes.SPLATS}, sizes.LARGE_TILE
-    for has_covariances in (False, True):
-        compile_for(capability, projection.project_kernel, HAS_COVARIANCES=has_covariances, TILE=tile, **splat)
-        compile_for(capability, projection_back.project_back_kernel, HAS_COVARIANCES=has_covariances, **splat)
+    for has_covariances in (False, True):  # and with other settings than the usual ones
+        shape = {"HAS_COVARIANCES": has_covariances, "VIEWER": has_covariances}
+        compile_for(capability, projection.project_kernel, TILE=tile, **shape, **splat)
+        compile_for(capability, projection_back.project_back_kernel, **shape, **splat)
     compile_for(capability, binning.emit_kernel, TILE=tile, BLOCK=sizes.PAIRS)
-    compile_for(capability, compositing.composite_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH)
-    for in_order in (False, True):
-        back = {"TILE": sizes.SMALL_TILE, "BATCH": sizes.BACK_BATCH[sizes.SMALL_TILE], "DETERMINISTIC": in_order}
+    compile_for(capability, rounding.round_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH)
+    for viewer in (False, True):
+        compile_for(capability, compositing.composite_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH, VIEWER=viewer)
+        compile_for(capability, weighing.weigh_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH, VIEWER=viewer)
+    for in_order, viewer in ((False, False), (True, True), (False, True)):
+        back = {"TILE": sizes.SMALL_TILE, "BATCH": sizes.BACK_BATCH[sizes.SMALL_TILE], "DETERMINISTIC": in_order, "VIEWER": viewer}
         ptx = compile_for(capability, compositing_back.composite_back_kernel, sizes.WARPS, **back)
         assert ("atom" in ptx or "red.global" in ptx) != in_order
     compile_for(capability, compositing_back.gather_kernel, 1, ROWS=32)
-    compile_for(capability, weighing.weigh_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH)
     compile_for(capability, adam.adam_kernel, BANDS=4, BLOCK=sizes.NUMBERS_MOVED)
 
 

@@ -11,15 +11,18 @@ import torch
 from oracle import brute_force
 from samples import camera, gaussians
 
+from mipmap_plugin.adaptation.renderers import unrounded
 from mipmap_plugin.backends.base import AdamStep, Needs
 from mipmap_plugin.backends.conformance import CASES, check_case
-from mipmap_plugin.backends.conformance.cases import covariances
+from mipmap_plugin.backends.conformance.cases import HardCase, covariances
 from mipmap_plugin.backends.conformance.checks import check_steps, check_views
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.backends.triton import TritonBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import USUAL, RenderSettings
 from mipmap_plugin.splatting.harmonics import C0
+from mipmap_plugin.splatting.viewers import find_viewer
 
 MISSING = importlib.util.find_spec("triton") is None
 pytestmark = [
@@ -37,7 +40,15 @@ HARD = [
     "on-the-near-plane-classic", "center-beyond-the-frustum-body-on-antialiased", "needle-1e12-classic", "scale-0-on-three-axes-mip",
     "quaternion-0-classic", "opacity-1-classic", "nan-in-scales-classic", "inf-in-sh-antialiased", "nan-in-covariances",
     "image-1x1-classic", "principal-point-outside-classic", "sh-bands-left-out",
+    "spark-1", "playcanvas-1", "gaussian-splats-3d-1", "viser-1", "scale-1e4-playcanvas", "needle-1e12-spark",
+    "rule-half-axis-of-the-whole", "rule-faint-and-transparent", "rule-rounded-picture",
 ]  # fmt: skip
+
+# Of two sizes and two degrees of SH, in two orders of buckets, and with most of the rules of viewers.
+OF_VIEWERS = [
+    (view, unrounded(find_viewer(name).effects(Effects(1))))
+    for view, name in ((WIDE, "playcanvas"), (camera(16, 24), "gaussian-splats-3d"))
+]
 
 
 def draw(backend, g: Gaussians, view, effects: Effects):
@@ -136,7 +147,7 @@ def test_a_tile_lists_its_visible_splats_front_to_back_and_few_others():
 
     g, view = gaussians(150, dtype=torch.float32), camera(64, 48)
     splats = drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None)
-    drawn = drawing.project(splats, [(view, Effects(1))])
+    drawn = drawing.project(splats, [drawing.Shot(view, Effects(1))])
     assert drawn.listed.shape[1] == WIDTH
     records = torch.zeros(150, WIDTH).index_copy(0, drawn.bins.splat_ids.long(), drawn.listed)
     x, y, along, shear, across, log2_opacity = records[:, :6].T[:, :, None, None]
@@ -175,10 +186,10 @@ def test_views_in_one_call_and_steps_are_right(check, case):
     assert outcome.passed, outcome.message
 
 
-def test_views_of_a_step_are_summed_in_any_grouping():
+@pytest.mark.parametrize("shots", [[(WIDE, Effects(1)), (camera(16, 24), Effects(1, "antialiased"))], OF_VIEWERS], ids=["usual", "viewers"])
+def test_views_of_a_step_are_summed_in_any_grouping(shots):
     """Views of two sizes, drawn in one call and one by one."""
     g = gaussians(20, dtype=torch.float32)
-    shots = [(WIDE, Effects(1)), (camera(16, 24), Effects(1, "antialiased"))]
     moments = []
     for groups in ([shots], [shots[:1], shots[1:]]):
         raw = {"means": g.means.clone(), "quats": 2 * g.quats, "scales": g.scales.log(), "opacities": g.opacities.logit(), "sh": g.sh.clone()}
@@ -194,11 +205,48 @@ def test_views_of_a_step_are_summed_in_any_grouping():
             torch.testing.assert_close(tensor, alone[name], atol=1e-6, rtol=1e-4)
 
 
-def test_blend_weights_are_the_gradient_of_a_white_color():
+def test_views_of_several_viewers_in_one_call_equal_the_reference():
+    """Settings, and degrees of SH, are those of each view; one is rounded, the other not."""
     g = gaussians(20, dtype=torch.float32)
+    shots = [OF_VIEWERS[0], (OF_VIEWERS[1][0], replace(OF_VIEWERS[1][1], settings=replace(OF_VIEWERS[1][1].settings, picture_step=1 / 255)))]
+
+    def both(render):
+        def images(splats, _view, _effects):
+            drawn = render(splats)
+            return torch.cat([each.image.flatten(0, 1) for each in drawn])[None], torch.cat([each.alpha.flatten() for each in drawn])[None]
+
+        return images
+
+    right = draw(both(lambda splats: [ReferenceBackend().render(splats, *shot) for shot in shots]), g.to(dtype=torch.float64), None, None)
+    assert_equal(draw(both(lambda splats: TritonBackend().render_views(splats, shots)), g, None, None), right, 1e-4)
+
+
+def test_steps_follow_the_gradients_in_a_viewer():
+    def case():
+        view, effects = OF_VIEWERS[0]
+        return HardCase(gaussians(20), view, effects)
+
+    outcome = check_steps(TritonBackend(), case)
+    assert outcome.passed, outcome.message
+
+
+def test_culled_splats_are_listed_for_their_gradient_only():
+    from mipmap_plugin.backends.triton_kernels import drawing
+
+    g = gaussians(40, dtype=torch.float32)
+    splats = drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None)
+    shots = [drawing.Shot(WIDE, Effects(1, settings=RenderSettings(min_variance=6.0)))]
+    seen, listed = (drawing.draw(splats, shots, gradients=gradients) for gradients in (False, True))
+    assert torch.equal(seen.images, listed.images)
+    assert 0 < seen.projected.depths.isfinite().sum() < listed.projected.depths.isfinite().sum()
+
+
+@pytest.mark.parametrize("settings", [USUAL, RenderSettings(radius=8**0.5, fades=True, min_variance=4.0, bucketed=True, max_alpha=0.8)])
+def test_blend_weights_are_the_gradient_of_a_white_color(settings):
+    g, effects = gaussians(20, dtype=torch.float32), Effects(0, settings=settings)
     colors = g.sh.detach().clone().requires_grad_()
     white = replace(g, sh=colors)
-    image = ReferenceBackend().render(white, WIDE, Effects(0)).image
+    image = ReferenceBackend().render(white, WIDE, effects).image
     [gradient] = torch.autograd.grad(image[..., 0].sum(), colors)
-    weights = TritonBackend().blend_weights(g, WIDE, Effects(0))
+    weights = TritonBackend().blend_weights(g, WIDE, effects)
     torch.testing.assert_close(weights, gradient[:, 0, 0] / C0, atol=1e-5, rtol=1e-4)

@@ -20,7 +20,7 @@ from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, EvenBuckets, RenderSettings
-from mipmap_plugin.splatting.buckets import even_ranks, ranks
+from mipmap_plugin.splatting.buckets import even_ranks, ranks, ranks_of_views
 from mipmap_plugin.splatting.packing import packed
 from mipmap_plugin.splatting.viewers import BUILT_IN, EDGE, Viewer, find_viewer
 from mipmap_plugin.wrap import Wrapped
@@ -398,6 +398,17 @@ def test_buckets_of_three_js_divide_a_sphere_around_all_splats():
     assert places.tolist() == [1, 4, 3, 2, 0]
 
 
+def test_the_order_of_several_views_is_that_of_each():
+    means = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, DEPTH])
+    splats = Gaussians(means, torch.ones(50, 4), torch.ones(50, 3), torch.ones(50), torch.zeros(50, 1, 3))
+    aside = camera().looking_from(torch.tensor([[0.6, 0.0, -0.8, 6.0], [0.0, 1.0, 0.0, 0.0], [0.8, 0.0, 0.6, 4.0], [0.0, 0.0, 0.0, 1.0]]), "")
+    bucketed, even = RenderSettings(bucketed=True), EvenBuckets(10)
+    found = ranks_of_views(splats, [(aside, bucketed), (aside, RenderSettings(even_buckets=even)), (camera(), USUAL), (camera(), bucketed)])
+    expected = [ranks(splats, aside), even_ranks(splats, aside, even), None, ranks(splats, camera())]
+    assert [None if own is None else own.tolist() for own in found] == [None if own is None else own.tolist() for own in expected]
+    assert not torch.equal(expected[0], expected[3])
+
+
 @BOTH
 @pytest.mark.parametrize(
     ("viewer", "front"), [("three", 1.0), ("gaussian-splats-3d", 1.0), ("viser", 1.0), ("gsplat-js", 0.0), ("antimatter15", 0.0)]
@@ -583,12 +594,18 @@ def test_a_viewer_draws_no_more_bands_than_it_has():
     assert find_viewer("spark").effects(Effects(2)).sh_degree == 2
 
 
-@pytest.mark.parametrize("backend", [GsplatBackend(), InriaBackend(), TritonBackend()], ids=lambda backend: backend.name)
+@pytest.mark.parametrize("backend", [GsplatBackend(), InriaBackend()], ids=lambda backend: backend.name)
 def test_backends_on_a_gpu_report_what_they_do_not_support(backend):
     needs = Needs.of(splat(1.0, 1.0), find_viewer("gaussian-splats-3d").effects(Effects(0)), gradients=True)
     [reason] = [reason for reason in backend.lacking(needs) if "reference backend does" in reason]
     assert "stretching of round splats" in reason and "packing" in reason and "splats that end at a radius" in reason
     assert not [reason for reason in backend.lacking(replace(needs, settings=USUAL)) if "reference backend does" in reason]
+
+
+def test_triton_draws_every_viewer():
+    needs = [Needs.of(splat(1.0, 1.0), viewer.effects(Effects(0)), gradients=True) for viewer in BUILT_IN]
+    capabilities = TritonBackend().capabilities
+    assert not [reason for need in needs for reason in capabilities.lacking(replace(need, device=next(iter(capabilities.devices))))]
 
 
 def test_filters_that_integrate_are_no_viewers():

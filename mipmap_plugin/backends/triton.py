@@ -1,7 +1,8 @@
 """The Triton backend: a CUDA rasterizer without a build step, for Triton comes with torch's CUDA wheels. Same image as the reference.
 
 The kernels are also compiled for compute capability 7.5, 8.0 and 9.0, and run on tiny images in Triton's interpreter on a CPU, in
-`tests/test_triton_backend.py` and `tests/test_triton_interpreted.py`. The first run on a machine compiles them, for half a minute.
+`tests/test_triton_backend.py` and `tests/test_triton_interpreted.py`. The first run on a machine compiles them, for half a minute, and so does the
+first for a viewer, whose settings are not the usual ones.
 
 The gradients of a splat are summed by atomic additions, in the order in which tiles finish. With
 `torch.use_deterministic_algorithms(True)` they are summed in a fixed order, for 36 bytes of memory per (splat, tile) pair.
@@ -14,17 +15,22 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Rendered, Stepper
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.buckets import ranks_of_views
+from mipmap_plugin.splatting.packing import packed
+
+if TYPE_CHECKING:
+    from mipmap_plugin.backends.triton_kernels.views import Shot
 
 OLDEST = (3, 3)  # versions before it compile no tuples
 NO_TRITON = "it needs triton, which comes with torch's CUDA wheels: pip install triton"
@@ -48,6 +54,7 @@ class TritonBackend:
             devices=frozenset({"cpu" if interpreted() else "cuda"}),
             dtypes=frozenset({torch.float32}),
             screen_filters=frozenset({"classic", "antialiased", "mip"}),
+            settings=frozenset(SETTINGS) - {"tile"},
         )
 
     def lacking(self, needs: Needs) -> list[str]:
@@ -62,13 +69,11 @@ class TritonBackend:
         return self.render_views(gaussians, [(camera, effects)])[0]
 
     def render_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
-        """Several views of the same splats, each with effects of its own, by one launch of each kernel. Raises as `render`."""
-        if len({effects.sh_degree for _, effects in shots}) > 1:  # which kernels are compiled for
-            return [self.render(gaussians, *shot) for shot in shots]
-        for _, effects in shots:
-            self._check.require(Needs.of(gaussians, effects, gradients=True))
-        g = gaussians
-        outputs = _Draw.apply(shots, g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances)  # type: ignore[no-untyped-call]  # torch's
+        """Several views of the same splats, each with effects of its own, by one launch of each kernel; of packed splats, which depend on the
+        camera, one by one. Raises as `render`."""
+        outputs: list[Tensor] = []
+        for tensors, together in self._prepared(gaussians, shots):
+            outputs += _Draw.apply(together, torch.is_grad_enabled(), *tensors)  # type: ignore[no-untyped-call]  # torch's
         return [Rendered(image, alpha) for image, alpha in zip(outputs[::2], outputs[1::2], strict=True)]
 
     @torch.no_grad()
@@ -78,20 +83,36 @@ class TritonBackend:
 
     @torch.no_grad()
     def weigh_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> Tensor:
-        """The same for several views, whose effects have one SH degree, [V, N]."""
-        for _, effects in shots:
-            self._check.require(Needs.of(gaussians, effects, gradients=True))
+        """The same for several views, [V, N]."""
+        prepared = self._prepared(gaussians, shots)
         from mipmap_plugin.backends.triton_kernels import drawing
 
-        g = gaussians
-        with torch.cuda.device_of(g.means):
-            return drawing.weigh(drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), shots)
+        with torch.cuda.device_of(gaussians.means):
+            return torch.cat([drawing.weigh(drawing.KernelSplats.of(*tensors), together) for tensors, together in prepared])
+
+    def _prepared(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[tuple[tuple[Tensor | None, ...], list[Shot]]]:
+        """The tensors of the splats, packed as a viewer's file does, and the views that are drawn of them at once. Raises BackendUnavailable."""
+        for _, effects in shots:
+            self._check.require(Needs.of(gaussians, effects, gradients=True))
+        from mipmap_plugin.backends.triton_kernels.views import Shot
+
+        ranks = ranks_of_views(gaussians, [(camera, effects.settings) for camera, effects in shots])
+        ranked = [Shot(*shot, own) for shot, own in zip(shots, ranks, strict=True)]
+        if all(effects.settings.packing is None for _, effects in shots):
+            return [(_tensors(gaussians), ranked)]
+        packings = [effects.settings.packing for _, effects in shots]
+        splats = [gaussians if packing is None else packed(gaussians, shot.camera, packing) for shot, packing in zip(ranked, packings, strict=True)]
+        return [(_tensors(own), [shot]) for own, shot in zip(splats, ranked, strict=True)]
 
     def stepper(self, raw: Mapping[str, Tensor]) -> Stepper:
         """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`."""
         from mipmap_plugin.backends.triton_kernels.stepping import TritonStepper
 
         return TritonStepper(raw)
+
+
+def _tensors(g: Gaussians) -> tuple[Tensor | None, ...]:
+    return g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances
 
 
 def missing() -> list[str]:
@@ -109,14 +130,15 @@ class _Draw(torch.autograd.Function):
     """The image and the alpha of each shot, one after the other."""
 
     @staticmethod
-    def forward(ctx: Any, shots: Sequence[tuple[Camera, Effects]], *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, shots: Sequence[Shot], in_graph: bool, *tensors: Tensor) -> tuple[Tensor, ...]:
         from mipmap_plugin.backends.triton_kernels import drawing
 
         with torch.cuda.device_of(tensors[0]):  # kernels are launched on the current GPU, which may be another
-            drawn = drawing.draw(drawing.KernelSplats.of(*tensors), shots)
+            drawn = drawing.draw(drawing.KernelSplats.of(*tensors), shots, gradients=in_graph and any(ctx.needs_input_grad))
+            rounded = drawing.rounded(drawn)
         ctx.projected = drawn.projected
         ctx.save_for_backward(*tensors, drawn.images, drawn.transmittances)
-        images, alphas = drawn.views_of(drawn.images), drawn.views_of(1 - drawn.transmittances)
+        images, alphas = drawn.views_of(rounded), drawn.views_of(1 - drawn.transmittances)
         return tuple(output for pair in zip(images, alphas, strict=True) for output in pair)
 
     @staticmethod
@@ -130,4 +152,4 @@ class _Draw(torch.autograd.Function):
         with torch.cuda.device_of(images):
             d_records = drawing.draw_back(drawn, drawn.packed(d_outputs[::2]), drawn.packed(d_outputs[1::2]), deterministic=in_order)
             drawing.project_back(splats, drawn.projected, d_records, grads)
-        return None, *grads[:-1]
+        return None, None, *grads[:-1]

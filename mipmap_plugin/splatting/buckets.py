@@ -8,6 +8,7 @@ aframe-gaussian-splatting are versions. Splats of one bucket keep the order of t
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -36,24 +37,35 @@ MORTON_BITS = 10
 SPREADING = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))
 
 
-@torch.no_grad()
 def ranks(gaussians: Gaussians, camera: Camera) -> Tensor:
     """Rank of each splat front to back, [N] int32. Within a bucket splats are in Morton order, whatever their depth.
 
     Computed in float64, so that every backend gets the same order. The rank of a splat that is not finite is arbitrary.
     """
+    return view_ranks(gaussians, [camera])[0]
+
+
+@torch.no_grad()
+def view_ranks(gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Tensor]:
+    """As `ranks`, for several cameras: what does not depend on them is found once, and a GPU is waited for once."""
     means = gaussians.means.double().nan_to_num(0.0, 0.0, 0.0)
     sizes = gaussians.scales.double().nan_to_num(0.0, 0.0, 0.0).abs().amax(1, keepdim=True)
     if not len(means):
-        return torch.zeros(0, dtype=torch.int32, device=means.device)
+        return [torch.zeros(0, dtype=torch.int32, device=means.device) for _ in cameras]
+    box = torch.stack([(means - BOX * sizes).amin(0), (means + BOX * sizes).amax(0)]).cpu()
+    buckets = [_buckets(means, depth_scale(box, len(means), camera), camera) for camera in cameras]
+    codes = _morton(means)
+    return [_places(((own.max() - own) << 3 * MORTON_BITS | codes).argsort(stable=True)) for own in buckets]
+
+
+def _buckets(means: Tensor, scale: DepthScale, camera: Camera) -> Tensor:
+    """The bucket of each center, [N] int64; higher is nearer."""
     depths = ((means - camera.center.to(means)) * camera.viewmat[2, :3].to(means)).sum(1)
-    scale = depth_scale(torch.stack([(means - BOX * sizes).amin(0), (means + BOX * sizes).amax(0)]), len(means), camera)
     bins = (scale.farthest - depths) * BINS / scale.range
     # A splat at the very end of the last bin has a bucket of its own.
     first, count_of = means.new_tensor(scale.firsts), means.new_tensor([*scale.counts, 0])
     whole = bins.long().clamp(0, BINS)
-    buckets = (first[whole] + count_of[whole] * (bins - whole)).long()
-    return _places(((buckets.max() - buckets) << 3 * MORTON_BITS | _morton(means)).argsort(stable=True))
+    return (first[whole] + count_of[whole] * (bins - whole)).long()
 
 
 @torch.no_grad()
@@ -95,6 +107,13 @@ def ranks_for(settings: RenderSettings, gaussians: Gaussians, camera: Camera) ->
     if settings.bucketed:
         return ranks(gaussians, camera)
     return even_ranks(gaussians, camera, settings.even_buckets) if settings.even_buckets else None
+
+
+def ranks_of_views(gaussians: Gaussians, views: Sequence[tuple[Camera, RenderSettings]]) -> list[Tensor | None]:
+    """The same for several views."""
+    bucketed = [camera for camera, settings in views if settings.bucketed]
+    found = iter(view_ranks(gaussians, bucketed) if bucketed else [])
+    return [next(found) if settings.bucketed else ranks_for(settings, gaussians, camera) for camera, settings in views]
 
 
 def bucket_bits(count: int) -> int:

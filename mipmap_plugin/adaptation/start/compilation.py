@@ -14,6 +14,7 @@ from mipmap_plugin.backends.base import AdamStep, Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import USUAL
 
 CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
@@ -21,15 +22,18 @@ CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], *, gradients: bool, merging: bool, by_rows: bool = False) -> None:
     """Let the backend compile what draws splats like these with all `effects`, and what their `gradients`, `merging` and steps `by_rows` need."""
     few = gaussians[torch.arange(min(2, len(gaussians)))].detach()
-    for number, setting in enumerate(effects):
+    # The first with the usual settings, and the first with others, for which a backend may have kernels of their own.
+    kinds = list({setting.settings == USUAL: setting for setting in reversed(effects)}.values())
+    for setting in effects:
         image = backend.render(replace(few, means=few.means.clone().requires_grad_(gradients)), CAMERA, setting).image
-        if merging and number == 0:  # here, because another process may be compiling the backward pass by now
+        if merging and setting in kinds:  # here, because another process may be compiling the backward pass by now
             weights = blend_weights(few, [CAMERA], backend, setting)
             merge(few, torch.ones_like(weights), weights, fraction=0.5)
         if gradients and image.requires_grad and not (by_rows and hasattr(backend, "stepper")):
             image.sum().backward()
     if by_rows and gradients and hasattr(backend, "stepper"):
-        _step(backend, few, effects[0])
+        for kind in kinds:
+            _step(backend, few, kind)
 
 
 def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:

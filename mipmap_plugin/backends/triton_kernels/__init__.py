@@ -13,7 +13,7 @@ Memory layout. V views of N splats are drawn at once; all arrays are contiguous,
                                          ^                       ^                             ^
                          tile_offsets:   0                       1                             V · tiles      [V · tiles + 1]
                               |
-                              v  composite_kernel, a program per tile and view
+                              v  composite_kernel, a program per tile and view; round_kernel, where a viewer rounds pictures
     pixel (v, y, x):     images [V, pixels, 3]  transmittances [V, pixels]; `tiles` and `pixels` are those of the largest view
 
 composite_back_kernel adds the gradients of a tile's pixels to d_records [V · N, 9]. With deterministic sums it writes one row per pair

@@ -13,9 +13,9 @@ import triton.language as tl
 from torch import Tensor
 
 from mipmap_plugin.backends.triton_kernels import PAIRS, views
-from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, falloff
+from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, end_of, falloff
 
-LOG2_MIN_ALPHA, TILES_X, NUMBERS = views.LOG2_MIN_ALPHA, views.TILES_X, views.NUMBERS
+TILES_X, NUMBERS = views.TILES_X, views.NUMBERS
 
 # px from a tile's edge to the outermost pixel centers, less a margin for rounding.
 EDGE = tl.constexpr(0.49)
@@ -44,7 +44,7 @@ def emit_kernel(records, boxes, starts, owners, tiles, shots, pairs, count, most
     wide = tl.load(box + 2, inside, 1)
     tile_x, tile_y = tl.load(box, inside, 0) + nth % wide, tl.load(box + 1, inside, 0) + nth // wide
     x, y, along, shear, across, log2_opacity = falloff(records, owner, inside)
-    level = tl.maximum(log2_opacity - tl.load(view + LOG2_MIN_ALPHA), 0.0)  # inside the ellipse, along dy² + across u² >= -level
+    level = end_of(view, log2_opacity)  # inside the ellipse, along dy² + across u² >= -level
     across, along = tl.minimum(across, -1e-37), tl.minimum(along, -1e-37)
     # The dy, within the tile, at which the ellipse reaches furthest right and left: `high` and -`high`, or the tile's top or bottom.
     across_2, along_2 = (-1 / across) * HALF_LOG2_E, (-1 / along) * HALF_LOG2_E  # variances, px²

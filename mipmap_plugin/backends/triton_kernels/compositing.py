@@ -13,8 +13,9 @@ from mipmap_plugin import render_settings
 from mipmap_plugin.backends.triton_kernels import views
 from mipmap_plugin.backends.triton_kernels.records import RECORD
 
-MAX_ALPHA = tl.constexpr(render_settings.MAX_ALPHA)
-MIN_ALPHA, MIN_TRANSMITTANCE = views.MIN_ALPHA, views.MIN_TRANSMITTANCE
+USUAL_MAX_ALPHA = tl.constexpr(render_settings.MAX_ALPHA)
+MIN_ALPHA, MIN_TRANSMITTANCE, MAX_ALPHA = views.MIN_ALPHA, views.MIN_TRANSMITTANCE, views.MAX_ALPHA
+W_END, LOG2_W_CUT = views.W_END, views.LOG2_W_CUT
 RED, GREEN, BLUE = views.RED, views.GREEN, views.BLUE
 WIDTH, HEIGHT, TILES_X, NUMBERS = views.WIDTH, views.HEIGHT, views.TILES_X, views.NUMBERS
 
@@ -53,29 +54,63 @@ def record_at(records, slot, end):
 
 
 @triton.jit
-def alpha_at(record, px, py, least):
-    """For the pixels [P]: dy, u = dx - shear · dy, and alpha before and after its cut-offs."""
+def cut_offs(view):
+    """The least alpha and, for other settings than the usual ones, the largest, and the weights where splats are cut off and where they end."""
+    return tl.load(view + MIN_ALPHA), tl.load(view + MAX_ALPHA), tl.load(view + LOG2_W_CUT), tl.load(view + W_END)
+
+
+@triton.jit
+def is_culled(record):
+    """Whether a splat is listed for its gradient only."""
+    return record[2] > 0
+
+
+@triton.jit
+def alpha_at(record, px, py, limits, VIEWER: tl.constexpr):
+    """For the pixels [P]: dy, u = dx - shear · dy, and alpha before and after its cut-offs.
+
+    VIEWER: whether the settings are not the usual ones. Alpha of a culled splat is what it would be without culling and without a largest one.
+    """
     x, y, along, shear, across, log2_opacity, _red, _green, _blue = record
+    least, most, cut, end = limits
     dy = py - y
     u = px - x - shear * dy
-    raw = tl.exp2(along * dy * dy + across * u * u + log2_opacity)
-    return dy, u, raw, tl.where(raw >= least, tl.minimum(raw, MAX_ALPHA), 0.0)
+    if VIEWER:
+        power = -tl.abs(along) * dy * dy + across * u * u
+        raw = tl.exp2(power + log2_opacity) - end * tl.exp2(log2_opacity)
+        alpha = tl.minimum(raw, tl.where(is_culled(record), float("inf"), most))
+        alpha = tl.where((raw >= least) & (power >= cut), alpha, 0.0)
+    else:
+        raw = tl.exp2(along * dy * dy + across * u * u + log2_opacity)
+        alpha = tl.where(raw >= least, tl.minimum(raw, USUAL_MAX_ALPHA), 0.0)
+    return dy, u, raw, alpha
+
+
+@triton.jit
+def drawn(record, alpha, VIEWER: tl.constexpr):
+    """Alpha of a splat, or 0 if it is culled."""
+    if VIEWER:
+        alpha = tl.where(is_culled(record), 0.0, alpha)
+    return alpha
 
 
 @triton.jit(do_not_specialize=["most_pixels"])
-def composite_kernel(records, tile_offsets, shots, images, transmittances, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr):
+def composite_kernel(
+    records, tile_offsets, shots, images, transmittances, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr, VIEWER: tl.constexpr
+):
     """Composite one tile of one view into `images` and `transmittances`."""
     view = shots + tl.program_id(1) * NUMBERS
     px, py, at, inside = pixels(view, most_pixels, TILE)
     slot, end = slots(tile_offsets)
-    least, stop = tl.load(view + MIN_ALPHA), tl.load(view + MIN_TRANSMITTANCE)
+    limits, stop = cut_offs(view), tl.load(view + MIN_TRANSMITTANCE)
     running = tl.where(inside, 1.0, 0.0)  # transmittance if pixels never stopped; once it is below `stop`, the pixel is finished
     transmittance = tl.zeros_like(running) + 1
     red, green, blue = tl.zeros_like(running), tl.zeros_like(running), tl.zeros_like(running)
     while (slot < end) & (largest(running) >= stop.to(tl.int32, bitcast=True)):
         for _ in tl.static_range(BATCH):
             record = record_at(records, slot, end)
-            _dy, _u, _raw, alpha = alpha_at(record, px, py, least)
+            _dy, _u, _raw, alpha = alpha_at(record, px, py, limits, VIEWER)
+            alpha = drawn(record, alpha, VIEWER)
             behind = running * (1 - alpha)
             weight = tl.where(behind >= stop, running * alpha, 0.0)
             red, green, blue = red + weight * record[6], green + weight * record[7], blue + weight * record[8]

@@ -11,11 +11,11 @@ import triton
 import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
-from mipmap_plugin.backends.triton_kernels.compositing import MAX_ALPHA, alpha_at, largest, pixels, record_at, slots
+from mipmap_plugin.backends.triton_kernels.compositing import USUAL_MAX_ALPHA, alpha_at, cut_offs, drawn, is_culled, largest, pixels, record_at, slots
 from mipmap_plugin.backends.triton_kernels.records import LN_2, RECORD
 from mipmap_plugin.backends.triton_kernels.vectors import load3
 
-MIN_ALPHA, MIN_TRANSMITTANCE, NUMBERS = views.MIN_ALPHA, views.MIN_TRANSMITTANCE, views.NUMBERS
+MIN_TRANSMITTANCE, NUMBERS = views.MIN_TRANSMITTANCE, views.NUMBERS
 
 
 @triton.jit
@@ -26,16 +26,33 @@ def nine(a, b, c, d, e, f, g, h, i):
     return field, tl.where(field == 6, g, tl.where(field == 7, h, tl.where(field == 8, i, row)))
 
 
+@triton.jit
+def grad_as_viewed(record, raw, alpha, weight, d_weight, rest, limits):
+    """For the pixels [P]: the new `rest`, the gradients of ln alpha as it peaks and as it falls off, and the weight that is drawn.
+
+    Of a culled splat it is the gradient of its gate, as if it were drawn first; nothing else of it has one. A splat that fades has
+    alpha = opacity · (w - w_end), of which only opacity · w falls off.
+    """
+    _least, most, _cut, end = limits
+    culled, added = is_culled(record), weight * d_weight
+    rest = tl.where(culled, rest, rest - added)
+    root = tl.rsqrt(1 - alpha)
+    d_log = added - alpha * rest * tl.where(culled, 1.0, root * root)
+    d_log = tl.where((weight > 0) & (raw <= tl.where(culled, float("inf"), most)), d_log, 0.0)
+    falls = d_log + d_log * (end * tl.exp2(record[5])) / tl.where(raw > 0, raw, 1.0)
+    return rest, d_log, tl.where(culled, 0.0, falls), tl.where(culled, 0.0, weight)
+
+
 @triton.jit(do_not_specialize=["most_pixels"])
 def composite_back_kernel(
     records, tile_offsets, splat_ids, places, shots, images, transmittances, d_images, d_alphas, d_records, most_pixels,
-    TILE: tl.constexpr, BATCH: tl.constexpr, DETERMINISTIC: tl.constexpr,
+    TILE: tl.constexpr, BATCH: tl.constexpr, DETERMINISTIC: tl.constexpr, VIEWER: tl.constexpr,
 ):  # fmt: skip
     """Add the gradients of one tile's pixels to `d_records`, which are in the order of the splats; the `records` are in that of the lists."""
     view = shots + tl.program_id(1) * NUMBERS
     px, py, at, inside = pixels(view, most_pixels, TILE)
     slot, end = slots(tile_offsets)
-    least, stop = tl.load(view + MIN_ALPHA), tl.load(view + MIN_TRANSMITTANCE)
+    limits, stop = cut_offs(view), tl.load(view + MIN_TRANSMITTANCE)
     running = tl.where(inside, 1.0, 0.0)
     d_red, d_green, d_blue = load3(d_images + 3 * at, inside)
     shown = load3(images + 3 * at, inside)
@@ -45,8 +62,8 @@ def composite_back_kernel(
         batch, heaviest = (), tl.zeros_like(running)
         for nth in tl.static_range(BATCH):
             record = record_at(records, slot + nth, end)
-            dy, u, raw, alpha = alpha_at(record, px, py, least)
-            behind = running * (1 - alpha)
+            dy, u, raw, alpha = alpha_at(record, px, py, limits, VIEWER)
+            behind = running * (1 - drawn(record, alpha, VIEWER))
             weight = tl.where(behind >= stop, running * alpha, 0.0)
             batch += ((record, dy, u, raw, alpha, weight),)
             heaviest, running = tl.maximum(heaviest, weight), behind
@@ -55,12 +72,16 @@ def composite_back_kernel(
                 record, dy, u, raw, alpha, weight = batch[nth]
                 _x, _y, along, shear, across, _opacity, red, green, blue = record
                 d_weight = d_red * red + d_green * green + d_blue * blue
-                rest -= weight * d_weight
                 # The gradient of ln alpha is alpha · d_alpha, and 0 where alpha was cut off or the pixel had stopped.
-                root = tl.rsqrt(1 - alpha)  # a division takes several instructions more
-                d_log = weight * d_weight - alpha * rest * (root * root)
-                d_log = tl.where((weight > 0) & (raw <= MAX_ALPHA), d_log, 0.0)
-                d_log_u, d_log_y = d_log * u, d_log * dy
+                if VIEWER:
+                    rest, d_log, d_shape, weight = grad_as_viewed(record, raw, alpha, weight, d_weight, rest, limits)
+                else:
+                    rest -= weight * d_weight
+                    root = tl.rsqrt(1 - alpha)  # a division takes several instructions more
+                    d_log = weight * d_weight - alpha * rest * (root * root)
+                    d_log = tl.where((weight > 0) & (raw <= USUAL_MAX_ALPHA), d_log, 0.0)
+                    d_shape = d_log
+                d_log_u, d_log_y = d_shape * u, d_shape * dy
                 along, across = -2 * LN_2 * along, -2 * LN_2 * across
                 d_u = across * tl.sum(d_log_u, axis=0)
                 field, sums = nine(

@@ -16,15 +16,18 @@ from mipmap_plugin.backends.triton_kernels.compositing import composite_kernel
 from mipmap_plugin.backends.triton_kernels.compositing_back import composite_back_kernel, gather_kernel
 from mipmap_plugin.backends.triton_kernels.projection import project_kernel
 from mipmap_plugin.backends.triton_kernels.projection_back import project_back_kernel
-from mipmap_plugin.backends.triton_kernels.views import view_parameters
+from mipmap_plugin.backends.triton_kernels.rounding import round_kernel
+from mipmap_plugin.backends.triton_kernels.views import Shot, view_parameters
 from mipmap_plugin.backends.triton_kernels.weighing import weigh_kernel
-from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.render_settings import USUAL
 
 # Rows of one splat that are summed at a time: one per lane of a warp.
 ROWS = 32
 
-Shots = Sequence[tuple[Camera, Effects]]
+Shots = Sequence[Shot]
+
+# Added to the bits of a rank: so they are those of a normal number.
+LEAST_NORMAL = 0x00800000
 
 
 class KernelSplats(NamedTuple):
@@ -49,11 +52,13 @@ class KernelSplats(NamedTuple):
         covariances = self.quats if self.covariances is None else self.covariances
         return self.means, self.quats, self.scales, covariances, self.opacities, self.sh
 
-    def constants(self, effects: Effects) -> dict[str, int | bool]:
-        """What the projection kernels are compiled for."""
-        bands = self.sh.shape[1]
-        degree = min(effects.sh_degree, round(bands**0.5) - 1)
-        return {"HAS_COVARIANCES": self.covariances is not None, "RAW": self.raw, "DEGREE": degree, "BANDS": bands, "BLOCK": SPLATS}
+    def constants(self, shots: Shots) -> dict[str, int | bool]:
+        """What the projection kernels are compiled for. Where there are viewers, whose degrees of SH differ, kernels have all bands."""
+        bands, viewer = self.sh.shape[1], any(shot.effects.settings != USUAL for shot in shots)
+        most = round(bands**0.5) - 1
+        degree = most if viewer else min(max(shot.effects.sh_degree for shot in shots), most)
+        shape = {"HAS_COVARIANCES": self.covariances is not None, "RAW": self.raw, "DEGREE": degree, "BANDS": bands}
+        return {**shape, "VIEWER": viewer, "BLOCK": SPLATS}
 
     def new_gradients(self) -> KernelSplats:
         """Arrays for the gradients; None for the shape that is not in use."""
@@ -73,8 +78,13 @@ class Projected:
     most_pixels: int  # of a view
     views: Tensor  # [V, numbers of `views.py`]
     listed: Tensor  # [pairs, 9], the records in the order of the lists: a program reads them one after the other
-    depths: Tensor  # [V · N], infinite where a splat is not drawn
+    depths: Tensor  # [V · N], or other numbers in the same order; infinite where a splat is not drawn
     bins: Bins
+
+    @property
+    def viewer(self) -> bool:
+        """Whether some view's settings are not the usual ones."""
+        return bool(self.constants["VIEWER"])
 
     @property
     def lists(self) -> tuple[Tensor, Tensor]:
@@ -91,7 +101,7 @@ class Drawing(NamedTuple):
 
     def views_of(self, array: Tensor) -> list[Tensor]:
         """The part of each view [h, w, ...] of an array [V, pixels, ...]."""
-        cameras = [camera for camera, _ in self.projected.shots]
+        cameras = [shot.camera for shot in self.projected.shots]
         return [row[: camera.width * camera.height].unflatten(0, camera.size) for row, camera in zip(array, cameras, strict=True)]
 
     def packed(self, views: Sequence[Tensor]) -> Tensor:
@@ -105,32 +115,47 @@ class Drawing(NamedTuple):
         return array
 
 
-def project(splats: KernelSplats, shots: Shots) -> Projected:
-    """Project splats to all views, whose effects have the same SH degree, and list those of each tile."""
+def project(splats: KernelSplats, shots: Shots, *, gradients: bool = True) -> Projected:
+    """Project splats to all views, and list those of each tile; for gradients culled ones, too."""
     means, rows = splats.means, len(shots) * len(splats.means)
-    sizes = [camera.size for camera, _ in shots]
+    sizes = [shot.camera.size for shot in shots]
     pixels = [height * width for height, width in sizes]
     tile = tile_for(sum(pixels))
     most_tiles = max(triton.cdiv(height, tile) * triton.cdiv(width, tile) for height, width in sizes)
-    views, constants = view_parameters(shots, tile, means), splats.constants(shots[0][1])
+    views, constants = view_parameters(shots, tile, gradients, means), splats.constants(shots)
     records, depths = means.new_empty(rows, RECORD), means.new_empty(rows)
     boxes = torch.empty(rows, 4, dtype=torch.int32, device=means.device)
     if rows:
         grid = triton.cdiv(len(means), SPLATS), len(shots)
         project_kernel[grid](*splats.arrays, views, records, depths, boxes, len(means), TILE=tile, **constants)
+    for shot, keys in zip(shots, depths.view(len(shots), -1), strict=True):
+        if shot.ranks is not None:
+            keys.copy_(torch.where(keys < torch.inf, (shot.ranks + LEAST_NORMAL).view(keys.dtype), keys))
     bins = bin_splats(records, depths, boxes, views, most_tiles, tile)
     return Projected(shots, constants, tile, (most_tiles, len(shots)), max(pixels), views, records[bins.splat_ids], depths, bins)
 
 
-def draw(splats: KernelSplats, shots: Shots) -> Drawing:
-    """Draw all views, each over its background."""
-    projected = project(splats, shots)
+def draw(splats: KernelSplats, shots: Shots, *, gradients: bool = True) -> Drawing:
+    """Draw all views, each over its background, before any rounding of pictures. gradients: whether `draw_back` will be called."""
+    projected = project(splats, shots, gradients=gradients)
     pixels = projected.most_pixels
     images, transmittances = splats.means.new_empty(len(shots), pixels, 3), splats.means.new_empty(len(shots), pixels)
     composite_kernel[projected.grid](
-        *projected.lists, projected.views, images, transmittances, pixels, TILE=projected.tile, BATCH=BATCH, num_warps=WARPS
-    )
+        *projected.lists, projected.views, images, transmittances, pixels,
+        TILE=projected.tile, BATCH=BATCH, VIEWER=projected.viewer, num_warps=WARPS,
+    )  # fmt: skip
     return Drawing(projected, images, transmittances)
+
+
+def rounded(drawing: Drawing) -> Tensor:
+    """The images [V, pixels, 3], of which those that views round are drawn again."""
+    projected = drawing.projected
+    if all(shot.effects.settings.picture_step is None for shot in projected.shots):
+        return drawing.images
+    images = drawing.images.clone()
+    arrays = *projected.lists, projected.views, images
+    round_kernel[projected.grid](*arrays, projected.most_pixels, TILE=projected.tile, BATCH=BATCH, num_warps=WARPS)
+    return images
 
 
 def draw_back(drawing: Drawing, d_images: Tensor, d_alphas: Tensor, *, deterministic: bool) -> Tensor:
@@ -141,7 +166,7 @@ def draw_back(drawing: Drawing, d_images: Tensor, d_alphas: Tensor, *, determini
     composite_back_kernel[projected.grid](
         *projected.lists, bins.splat_ids, bins.places, projected.views, drawing.images, drawing.transmittances, d_images, d_alphas, target,
         projected.most_pixels,
-        TILE=projected.tile, BATCH=BACK_BATCH[projected.tile], DETERMINISTIC=deterministic, num_warps=WARPS,
+        TILE=projected.tile, BATCH=BACK_BATCH[projected.tile], DETERMINISTIC=deterministic, VIEWER=projected.viewer, num_warps=WARPS,
     )  # fmt: skip
     if deterministic and len(d_records):
         gather_kernel[(len(d_records),)](target, bins.starts, bins.counts, d_records, ROWS=ROWS, num_warps=1)
@@ -162,10 +187,10 @@ def project_back(splats: KernelSplats, projected: Projected, d_records: Tensor, 
 
 def weigh(splats: KernelSplats, shots: Shots) -> Tensor:
     """The sum of each splat's blend weights over each image, [V, N]."""
-    projected = project(splats, shots)
+    projected = project(splats, shots, gradients=False)
     sums = torch.zeros_like(projected.depths)
     weigh_kernel[projected.grid](
         *projected.lists, projected.bins.splat_ids, projected.views, sums, projected.most_pixels,
-        TILE=projected.tile, BATCH=BATCH, num_warps=WARPS,
+        TILE=projected.tile, BATCH=BATCH, VIEWER=projected.viewer, num_warps=WARPS,
     )  # fmt: skip
     return sums.view(len(shots), -1)

@@ -16,21 +16,33 @@ C40, C41, C42, C43, C44, C45, C46, C47, C48 = (tl.constexpr(c) for c in harmonic
 
 
 @triton.jit
-def color(sh, x, y, z, mask, DEGREE: tl.constexpr):
-    """Colors [B, channels] in unit directions of that shape, before 0.5 is added and negative values are clamped. `sh`: the first coefficients."""
+def at_most(degree, mask, of: tl.constexpr):
+    """`mask` where the bands of degree `of` are evaluated, up to the view's `degree`."""
+    return tl.where(degree >= of, mask, mask != mask)
+
+
+@triton.jit
+def color(sh, x, y, z, degree, mask, DEGREE: tl.constexpr):
+    """Colors [B, channels] in unit directions of that shape, before 0.5 is added and negative values are clamped. `sh`: the first coefficients.
+
+    degree: of the view, which may be less than DEGREE, the largest of the views that are drawn at once.
+    """
     value = C0 * tl.load(sh, mask, 0.0)
     if DEGREE > 0:
+        mask = at_most(degree, mask, 1)
         value += (y * -C1) * tl.load(sh + 3 * 1, mask, 0.0)
         value += (z * C1) * tl.load(sh + 3 * 2, mask, 0.0)
         value += (x * -C1) * tl.load(sh + 3 * 3, mask, 0.0)
     xx, yy, zz = x * x, y * y, z * z
     if DEGREE > 1:
+        mask = at_most(degree, mask, 2)
         value += (x * C20 * y) * tl.load(sh + 3 * 4, mask, 0.0)
         value += (y * C21 * z) * tl.load(sh + 3 * 5, mask, 0.0)
         value += ((2 * zz - xx - yy) * C22) * tl.load(sh + 3 * 6, mask, 0.0)
         value += (x * C23 * z) * tl.load(sh + 3 * 7, mask, 0.0)
         value += ((xx - yy) * C24) * tl.load(sh + 3 * 8, mask, 0.0)
     if DEGREE > 2:
+        mask = at_most(degree, mask, 3)
         value += (y * C30 * (3 * xx - yy)) * tl.load(sh + 3 * 9, mask, 0.0)
         value += (x * C31 * y * z) * tl.load(sh + 3 * 10, mask, 0.0)
         value += (y * C32 * (4 * zz - xx - yy)) * tl.load(sh + 3 * 11, mask, 0.0)
@@ -39,6 +51,7 @@ def color(sh, x, y, z, mask, DEGREE: tl.constexpr):
         value += (z * C35 * (xx - yy)) * tl.load(sh + 3 * 14, mask, 0.0)
         value += (x * C36 * (xx - 3 * yy)) * tl.load(sh + 3 * 15, mask, 0.0)
     if DEGREE > 3:
+        mask = at_most(degree, mask, 4)
         value += (x * C40 * y * (xx - yy)) * tl.load(sh + 3 * 16, mask, 0.0)
         value += (y * C41 * z * (3 * xx - yy)) * tl.load(sh + 3 * 17, mask, 0.0)
         value += (x * C42 * y * (7 * zz - 1)) * tl.load(sh + 3 * 18, mask, 0.0)
@@ -130,7 +143,7 @@ def _band_4(sh, d_sh, x, y, z, d_color, drawn, inside, further):
 
 
 @triton.jit
-def color_back(sh, d_sh, x, y, z, d_color, drawn, inside, further, DEGREE: tl.constexpr):
+def color_back(sh, d_sh, x, y, z, degree, d_color, drawn, inside, further, DEGREE: tl.constexpr):
     """Backward pass of `color`: add the gradients of the coefficients `inside` at the pointers `d_sh` [B], return those of x, y, z.
 
     d_red, d_green and d_blue are 0 where not `drawn`.
@@ -138,15 +151,19 @@ def color_back(sh, d_sh, x, y, z, d_color, drawn, inside, further, DEGREE: tl.co
     _add_back(sh, d_sh, tl.zeros_like(x) + C0, d_color, 0, drawn, inside, further)
     dx, dy, dz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     if DEGREE >= 1:
+        d_color, drawn = tl.where(degree >= 1, d_color, 0.0), at_most(degree, drawn, 1)
         px, py, pz = _band_1(sh, d_sh, x, y, z, d_color, drawn, inside, further)
         dx, dy, dz = dx + px, dy + py, dz + pz
     if DEGREE >= 2:
+        d_color, drawn = tl.where(degree >= 2, d_color, 0.0), at_most(degree, drawn, 2)
         px, py, pz = _band_2(sh, d_sh, x, y, z, d_color, drawn, inside, further)
         dx, dy, dz = dx + px, dy + py, dz + pz
     if DEGREE >= 3:
+        d_color, drawn = tl.where(degree >= 3, d_color, 0.0), at_most(degree, drawn, 3)
         px, py, pz = _band_3(sh, d_sh, x, y, z, d_color, drawn, inside, further)
         dx, dy, dz = dx + px, dy + py, dz + pz
     if DEGREE >= 4:
+        d_color, drawn = tl.where(degree >= 4, d_color, 0.0), at_most(degree, drawn, 4)
         px, py, pz = _band_4(sh, d_sh, x, y, z, d_color, drawn, inside, further)
         dx, dy, dz = dx + px, dy + py, dz + pz
     return dx, dy, dz

@@ -5,16 +5,18 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from mipmap_plugin.backends.triton_kernels import views
+from mipmap_plugin.backends.triton_kernels import culling, views
 from mipmap_plugin.backends.triton_kernels.harmonics import color
-from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD, store_six
+from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD, end_of, store_six
+from mipmap_plugin.backends.triton_kernels.rounding import round_to
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes, from_covariance, load_quat
-from mipmap_plugin.backends.triton_kernels.vectors import finite, load3
+from mipmap_plugin.backends.triton_kernels.vectors import LARGEST, finite, load3
 from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_camera
 
-NEAR, EPS2D, MIN_ALPHA, LOG2_MIN_ALPHA = views.NEAR, views.EPS2D, views.MIN_ALPHA, views.LOG2_MIN_ALPHA
+NEAR, EPS2D, MIN_ALPHA, W_END, SH_DEGREE = views.NEAR, views.EPS2D, views.MIN_ALPHA, views.W_END, views.SH_DEGREE
 COMPENSATES, LEAST_COMPENSATION = views.COMPENSATES, views.LEAST_COMPENSATION
 FX, FY, CX, CY = views.FX, views.FY, views.CX, views.CY
+FRAME, RADIAL, MAX_COLOR, COLOR_STEPS, LISTS_CULLED = views.FRAME, views.RADIAL, views.MAX_COLOR, views.COLOR_STEPS, views.LISTS_CULLED
 WIDTH, HEIGHT, TILES_X, TILES_Y, NUMBERS = views.WIDTH, views.HEIGHT, views.TILES_X, views.TILES_Y, views.NUMBERS
 
 
@@ -80,10 +82,34 @@ def bounds(center, extent, tiles, TILE: tl.constexpr):
     return first, tl.maximum(last - first, 0.0)
 
 
+@triton.jit
+def reshaped(view, xx, xy, yy, det, opacity):
+    """Dilated shapes as they are drawn, stretched and limited, and which splats are not culled. opacity: before any compensation."""
+    kept = culling.is_drawn(view, xx, xy, yy, det, opacity)
+    xx, xy, yy, det = culling.stretched(view, xx, xy, yy, det, kept)
+    xx, xy, yy, det = culling.limited(view, xx, xy, yy, det)
+    return xx, xy, yy, det, kept
+
+
+@triton.jit
+def in_frame(view, x, y):
+    """Whether centers lie where the view draws splats."""
+    aside = tl.maximum(tl.abs(x * (2 / tl.load(view + WIDTH)) - 1), tl.abs(y * (2 / tl.load(view + HEIGHT)) - 1))
+    return aside <= tl.load(view + FRAME)
+
+
+@triton.jit
+def viewed_color(view, value, channel):
+    """Colors [B, channels], limited and rounded."""
+    step = tl.load(view + COLOR_STEPS + channel, channel < 3, 0.0)
+    return round_to(tl.minimum(value, tl.load(view + MAX_COLOR)), step)
+
+
 @triton.jit(do_not_specialize=["count"])
 def project_kernel(
     means, quats, scales, covariances, opacities, sh, shots, records, depths, boxes, count,
-    HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr,
+    HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, VIEWER: tl.constexpr, TILE: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Project `count` splats to the view of the program's second number."""
     view = shots + tl.program_id(1) * NUMBERS
@@ -96,23 +122,37 @@ def project_kernel(
     eps2d = tl.load(view + EPS2D)
     det_blur = det + eps2d * (xx + yy) + eps2d * eps2d
     compensation = tl.sqrt(tl.maximum(det / det_blur, tl.load(view + LEAST_COMPENSATION)))
-    opacity = load_opacity(opacities, at, ahead, RAW) * tl.where(tl.load(view + COMPENSATES) > 0, compensation, 1.0)
-    xx, yy = xx + eps2d, yy + eps2d
+    opacity = load_opacity(opacities, at, ahead, RAW)
+    xx, yy, kept = xx + eps2d, yy + eps2d, inside
+    if VIEWER:
+        xx, xy, yy, det_blur, kept = reshaped(view, xx, xy, yy, det_blur, opacity)
+    opacity *= tl.where(tl.load(view + COMPENSATES) > 0, compensation, 1.0)
     x = eye[0] / safe * tl.load(view + FX) + tl.load(view + CX)
     y = eye[1] / safe * tl.load(view + FY) + tl.load(view + CY)
     all_finite = finite(x) & finite(y) & finite(xx) & finite(xy) & finite(yy) & finite(det_blur) & finite(opacity)
-    shear, across, log2_opacity = xy / yy, det_blur / yy, tl.log2(opacity)
+    shear, across, along = xy / yy, det_blur / yy, (-1 / yy) * HALF_LOG2_E
     drawn = ahead & all_finite & (opacity >= tl.load(view + MIN_ALPHA)) & (across > 0)
-    reach = tl.sqrt(tl.maximum(log2_opacity - tl.load(view + LOG2_MIN_ALPHA), 0.0) * (2 * LN_2))
+    if VIEWER:
+        drawn &= in_frame(view, x, y) & tl.where(tl.load(view + LISTS_CULLED) > 0, inside, kept)
+        along, opacity = tl.where(kept, along, -along), opacity / (1 - tl.load(view + W_END))
+    log2_opacity = tl.log2(opacity)
+    reach = tl.sqrt(end_of(view, log2_opacity) * (2 * LN_2))
     reach_x, reach_y = reach * tl.sqrt(xx), reach * tl.sqrt(yy)
     drawn &= (x + reach_x > 0) & (x - reach_x < tl.load(view + WIDTH)) & (y + reach_y > 0) & (y - reach_y < tl.load(view + HEIGHT))
     rows, channel, shown = by_channel(at, drawn)
     dx, dy, dz, _ = direction(from_eye(view, *load3(means + 3 * rows, shown)))
-    value = color(sh + rows * (3 * BANDS) + channel, dx, dy, dz, shown, DEGREE)
+    value = color(sh + rows * (3 * BANDS) + channel, dx, dy, dz, tl.load(view + SH_DEGREE), shown, DEGREE)
     drawn &= tl.min(finite(value).to(tl.int32), axis=1) > 0
-    tl.store(records + (tl.program_id(1).to(tl.int64) * count + rows) * RECORD + 6 + channel, tl.maximum(value + 0.5, 0.0), shown)
-    store_six(records + row * RECORD, x, y, (-1 / yy) * HALF_LOG2_E, shear, (-1 / across) * HALF_LOG2_E, log2_opacity, drawn)
-    tl.store(depths + row, tl.where(drawn, eye[2], float("inf")), inside)
+    value = tl.maximum(value + 0.5, 0.0)
+    if VIEWER:
+        value = viewed_color(view, value, channel)
+    tl.store(records + (tl.program_id(1).to(tl.int64) * count + rows) * RECORD + 6 + channel, value, shown)
+    store_six(records + row * RECORD, x, y, along, shear, (-1 / across) * HALF_LOG2_E, log2_opacity, drawn)
+    depth = eye[2]
+    if VIEWER:
+        distance = tl.minimum(tl.sqrt(eye[0] * eye[0] + eye[1] * eye[1] + eye[2] * eye[2]), LARGEST)  # infinity is for what is not drawn
+        depth = tl.where(tl.load(view + RADIAL) > 0, distance, depth)
+    tl.store(depths + row, tl.where(drawn, depth, float("inf")), inside)
     first_x, wide_x = bounds(x, reach_x, tl.load(view + TILES_X), TILE)
     first_y, wide_y = bounds(y, reach_y, tl.load(view + TILES_Y), TILE)
     box = boxes + 4 * row

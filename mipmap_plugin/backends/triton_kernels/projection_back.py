@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from mipmap_plugin.backends.triton_kernels import views
+from mipmap_plugin.backends.triton_kernels import culling, views
 from mipmap_plugin.backends.triton_kernels.harmonics import color, color_back
 from mipmap_plugin.backends.triton_kernels.projection import by_channel, direction, image_covariance, load_opacity, load_scale, relative_position
 from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD
@@ -14,24 +14,48 @@ from mipmap_plugin.backends.triton_kernels.vectors import add, add3, dot, load3
 from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_world, rotation_row
 
 EPS2D, COMPENSATES, LEAST_COMPENSATION = views.EPS2D, views.COMPENSATES, views.LEAST_COMPENSATION
-FX, FY, NUMBERS = views.FX, views.FY, views.NUMBERS
+FX, FY, SH_DEGREE, MAX_COLOR, NUMBERS = views.FX, views.FY, views.SH_DEGREE, views.MAX_COLOR, views.NUMBERS
 
 
 @triton.jit
-def filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity):
+def record_back(xy, yy, det, d_along, d_shear, d_across):
+    """Gradients of xy, yy and det as drawn from those of a record."""
+    across = det / yy
+    d_width = d_across * HALF_LOG2_E / (across * across)
+    return d_shear / yy, (d_along * HALF_LOG2_E / yy - d_shear * xy / yy - d_width * across) / yy, d_width / yy
+
+
+@triton.jit
+def reshaped_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity):
+    """Gradients of the dilated shape, of the logarithm of the opacity as drawn, and of the opacity itself, from those of a record."""
+    kept = culling.is_drawn(view, xx, xy, yy, det, opacity)
+    sxx, sxy, syy, sdet = culling.stretched(view, xx, xy, yy, det, kept)
+    _lxx, lxy, lyy, ldet = culling.limited(view, sxx, sxy, syy, sdet)
+    d_xy, d_yy, d_det = record_back(lxy, lyy, ldet, d_along, d_shear, d_across)
+    d_xx, d_xy, d_yy, d_det = culling.limited_back(view, sxx, sxy, syy, sdet, tl.zeros_like(d_yy), d_xy, d_yy, d_det)
+    d_xx, d_xy, d_yy, d_det = culling.stretched_back(view, xx, xy, yy, kept, d_xx, d_xy, d_yy, d_det)
+    g_xx, g_xy, g_yy, g_det, d_opacity = culling.gate_back(view, xx, xy, yy, det, opacity, d_log2_opacity / LN_2)
+    return d_xx + g_xx, d_xy + g_xy, d_yy + g_yy, d_det + g_det, tl.where(kept, d_log2_opacity, 0.0), d_opacity
+
+
+@triton.jit
+def filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity, VIEWER: tl.constexpr):
     """Gradients of xx, xy, yy and det before the screen filter, and of the opacity, from those of a record."""
     eps2d = tl.load(view + EPS2D)
-    yy_blur = yy + eps2d
     det_blur = det + eps2d * (xx + yy) + eps2d * eps2d
-    across = det_blur / yy_blur
-    d_width = d_across * HALF_LOG2_E / (across * across)
-    d_yy = (d_along * HALF_LOG2_E / yy_blur - d_shear * xy / yy_blur - d_width * across) / yy_blur
-    d_det_blur, d_xy = d_width / yy_blur, d_shear / yy_blur
+    if VIEWER:
+        d_xx, d_xy, d_yy, d_det_blur, d_log2_opacity, d_opacity = reshaped_back(
+            view, opacity, xx + eps2d, xy, yy + eps2d, det_blur, d_along, d_shear, d_across, d_log2_opacity
+        )
+    else:
+        d_xy, d_yy, d_det_blur = record_back(xy, yy + eps2d, det_blur, d_along, d_shear, d_across)
+        d_xx, d_opacity = tl.zeros_like(d_yy), tl.zeros_like(d_yy)
     ratio = det / det_blur
     d_ratio = tl.where(ratio < tl.load(view + LEAST_COMPENSATION), 0.0, d_log2_opacity / (ratio * (2 * LN_2)))
     d_ratio = tl.where(tl.load(view + COMPENSATES) > 0, d_ratio, 0.0)
     d_det, d_det_blur = d_ratio / det_blur, d_det_blur - d_ratio * ratio / det_blur
-    return d_det_blur * eps2d, d_xy, d_yy + d_det_blur * eps2d, d_det + d_det_blur, d_log2_opacity / (opacity * LN_2)
+    d_opacity += d_log2_opacity / (opacity * LN_2)
+    return d_xx + d_det_blur * eps2d, d_xy, d_yy + d_det_blur * eps2d, d_det + d_det_blur, d_opacity
 
 
 @triton.jit
@@ -49,18 +73,23 @@ def relative_position_back(view, eye, safe, u, v, dt, dr, d_x, d_y):
 
 
 @triton.jit
-def direction_gradient(view, means, sh, d_color, d_sh, rows, drawn, written, adds, DEGREE: tl.constexpr):
+def direction_gradient(view, means, sh, d_color, d_sh, rows, drawn, written, adds, DEGREE: tl.constexpr, VIEWER: tl.constexpr):
     """Add the gradients of the coefficients, by channel; return those of the direction [B], summed over the channels."""
     dx, dy, dz, _ = direction(from_eye(view, *load3(means + 3 * rows, drawn)))
-    d_color = tl.where(color(sh, dx, dy, dz, drawn, DEGREE) < -0.5, 0.0, tl.load(d_color, drawn, 0.0))
-    px, py, pz = color_back(sh, d_sh, dx, dy, dz, d_color, drawn, written, adds, DEGREE)
+    degree = tl.load(view + SH_DEGREE)
+    value, d_color = color(sh, dx, dy, dz, degree, drawn, DEGREE), tl.load(d_color, drawn, 0.0)
+    d_color = tl.where(value < -0.5, 0.0, d_color)
+    if VIEWER:
+        d_color = tl.where(value + 0.5 > tl.load(view + MAX_COLOR), 0.0, d_color)
+    px, py, pz = color_back(sh, d_sh, dx, dy, dz, degree, d_color, drawn, written, adds, DEGREE)
     return tl.sum(px, axis=1), tl.sum(py, axis=1), tl.sum(pz, axis=1)
 
 
 @triton.jit(do_not_specialize=["count", "views", "further"])
 def project_back_kernel(
     means, quats, scales, covariances, opacities, sh, shots, depths, d_records, d_means, d_quats, d_scales, d_covariances, d_opacities, d_sh,
-    count, views, further, HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, BLOCK: tl.constexpr,
+    count, views, further,
+    HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, VIEWER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients of the splats, summed over the views, or add them to what is there if `further` is 1."""
     at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
@@ -81,13 +110,13 @@ def project_back_kernel(
         dx, dy, dz, per = direction(world)
         px, py, pz = direction_gradient(
             view, means, sh + rows * (3 * BANDS) + channel, d_records + (number.to(tl.int64) * count + rows) * RECORD + 6 + channel,
-            d_coefficients, rows, drawn[:, None] & written, written, adds, DEGREE,
+            d_coefficients, rows, drawn[:, None] & written, written, adds, DEGREE, VIEWER,
         )  # fmt: skip
         along = px * dx + py * dy + pz * dz  # removed below: the color does not change along the ray
 
         xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, drawn, HAS_COVARIANCES, RAW)
         opacity = tl.where(drawn, load_opacity(opacities, at, drawn, RAW), 1.0)
-        d_xx, d_xy, d_yy, d_det, d_opacity = filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity)
+        d_xx, d_xy, d_yy, d_det, d_opacity = filter_back(view, opacity, xx, xy, yy, det, d_along, d_shear, d_across, d_log2_opacity, VIEWER)
         if RAW:
             d_opacity *= opacity * (1 - opacity)
         add(d_opacities + at, tl.where(drawn, d_opacity, 0.0), inside, adds)

@@ -11,9 +11,12 @@ from torch import Tensor
 from mipmap_plugin.backends.base import AdamStep, Rendered
 from mipmap_plugin.backends.triton_kernels import NUMBERS_MOVED
 from mipmap_plugin.backends.triton_kernels.adam import adam_kernel
-from mipmap_plugin.backends.triton_kernels.drawing import Drawing, KernelSplats, Shots, draw, draw_back, project_back
+from mipmap_plugin.backends.triton_kernels.drawing import Drawing, KernelSplats, draw, draw_back, project_back, rounded
+from mipmap_plugin.backends.triton_kernels.views import Shot
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.splatting.buckets import ranks_of_views
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 RATES = ("means", "quats", "scales", "opacities", "sh0", "shN")  # as `adam.py` reads them
@@ -31,11 +34,21 @@ class TritonStepper:
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
         return self.render_all([(camera, effects)], number)[0]
 
-    def render_all(self, shots: Shots, number: int = 0) -> list[Rendered]:
+    def render_all(self, shots: Sequence[tuple[Camera, Effects]], number: int = 0) -> list[Rendered]:
         with torch.cuda.device_of(self._splats.means):
-            drawn = self._drawn[number] = draw(self._splats, shots)
+            drawn = self._drawn[number] = draw(self._splats, self._ranked(shots))
+            images = rounded(drawn)
         alphas = (1 - drawn.transmittances)
-        return [Rendered(image, alpha) for image, alpha in zip(drawn.views_of(drawn.images), drawn.views_of(alphas), strict=True)]
+        return [Rendered(image, alpha) for image, alpha in zip(drawn.views_of(images), drawn.views_of(alphas), strict=True)]
+
+    def _ranked(self, shots: Sequence[tuple[Camera, Effects]]) -> list[Shot]:
+        """The shots, with the order of the splats where it is that of buckets."""
+        if not any(effects.settings.bucketed or effects.settings.even_buckets for _, effects in shots):
+            return [Shot(*shot) for shot in shots]
+        splats = self._splats
+        activated = Gaussians(splats.means, splats.quats, splats.scales.exp(), splats.opacities.sigmoid(), splats.sh)
+        ranks = ranks_of_views(activated, [(camera, effects.settings) for camera, effects in shots])
+        return [Shot(*shot, own) for shot, own in zip(shots, ranks, strict=True)]
 
     def differentiate(self, number: int, d_image: Tensor, d_alpha: Tensor | None = None) -> None:
         self.differentiate_all([d_image], None if d_alpha is None else [d_alpha], number)

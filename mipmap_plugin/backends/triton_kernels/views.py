@@ -1,10 +1,11 @@
-"""The cameras and screen filters as an array on the device, and transformations between world, camera and image."""
+"""The cameras, screen filters and settings as an array on the device, and transformations between world, camera and image."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 import triton
@@ -13,29 +14,46 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.render_settings import FRUSTUM_MARGIN
+from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.splatting import filters
+
+
+class Shot(NamedTuple):
+    """A view to be drawn."""
+
+    camera: Camera
+    effects: Effects
+    ranks: Tensor | None = None  # [N] int32, front to back; sorts splats instead of their depths
+
 
 # Indices into a view's numbers. They begin with the rotation, row by row, at 0.
 EYE, FX, FY, CX, CY = tl.constexpr(9), tl.constexpr(12), tl.constexpr(13), tl.constexpr(14), tl.constexpr(15)
 LEFT, RIGHT, TOP, BOTTOM = tl.constexpr(16), tl.constexpr(17), tl.constexpr(18), tl.constexpr(19)  # bounds of the slopes in the Jacobian
 NEAR, EPS2D, MIN_ALPHA = tl.constexpr(20), tl.constexpr(21), tl.constexpr(23)
 LEAST_COMPENSATION = tl.constexpr(22)  # squared
-LOG2_MIN_ALPHA, MIN_TRANSMITTANCE = tl.constexpr(24), tl.constexpr(25)
+SH_DEGREE, MIN_TRANSMITTANCE = tl.constexpr(24), tl.constexpr(25)
 RED, GREEN, BLUE = tl.constexpr(26), tl.constexpr(27), tl.constexpr(28)  # of the background
 COMPENSATES = tl.constexpr(29)  # 1 or 0
 WIDTH, HEIGHT, TILES_X, TILES_Y = tl.constexpr(30), tl.constexpr(31), tl.constexpr(32), tl.constexpr(33)  # px, and tiles
-NUMBERS = tl.constexpr(34)  # of each view
+# Read where a view's settings are not the usual ones (`render_settings.RenderSettings`); what is off is 0, or infinite where it is a maximum.
+MAX_ALPHA, FRAME, MAX_COLOR, COLOR_STEPS = tl.constexpr(34), tl.constexpr(35), tl.constexpr(36), tl.constexpr(37)  # three steps
+W_END, LOG2_W_CUT = tl.constexpr(40), tl.constexpr(41)  # weights where splats have faded to 0, and where they are cut off, here -infinity if not
+RADIAL, BOXED, ROOTED, LISTS_CULLED = tl.constexpr(42), tl.constexpr(43), tl.constexpr(44), tl.constexpr(45)  # 1 or 0
+MIN_VARIANCE, MIN_CONTRIBUTION, LEAST_SPREAD = tl.constexpr(46), tl.constexpr(47), tl.constexpr(48)
+MAX_VARIANCE, PICTURE_STEP = tl.constexpr(49), tl.constexpr(50)
+NUMBERS = tl.constexpr(51)  # of each view
 
 
-def view_parameters(shots: Sequence[tuple[Camera, Effects]], tile: int, like: Tensor) -> Tensor:
+def view_parameters(shots: Sequence[Shot], tile: int, gradients: bool, like: Tensor) -> Tensor:
     """The array [V, NUMBERS], on the device of `like`. A copy of some hundred bytes that does not synchronize."""
-    return torch.tensor([_numbers(*shot, tile) for shot in shots], dtype=like.dtype).to(like.device, non_blocking=True)
+    rows = [_of_camera(shot.camera, shot.effects, tile) + _of_settings(shot.camera, shot.effects.settings, gradients) for shot in shots]
+    return torch.tensor(rows, dtype=like.dtype).to(like.device, non_blocking=True)
 
 
 @lru_cache(maxsize=1024)
-def _numbers(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]:
-    margin_x, margin_y = FRUSTUM_MARGIN * camera.width / camera.fx / 2, FRUSTUM_MARGIN * camera.height / camera.fy / 2
+def _of_camera(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]:
+    margin = effects.settings.frozen_beyond / 2
+    margin_x, margin_y = margin * camera.width / camera.fx, margin * camera.height / camera.fy
     return (
         *camera.viewmat[:3, :3].flatten().tolist(),
         *camera.center.tolist(),
@@ -43,10 +61,23 @@ def _numbers(camera: Camera, effects: Effects, tile: int) -> tuple[float, ...]:
         *(-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
         *(-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
         *(effects.near_plane, effects.eps2d, filters.LEAST_COMPENSATION[effects.screen_filter] ** 2, effects.settings.min_alpha),
-        *(math.log2(effects.settings.min_alpha), effects.settings.min_transmittance),
+        *(effects.sh_degree, effects.settings.min_transmittance),
         *effects.background,
         float(filters.compensates(effects.screen_filter)),
         *(camera.width, camera.height, triton.cdiv(camera.width, tile), triton.cdiv(camera.height, tile)),
+    )
+
+
+@lru_cache(maxsize=1024)
+def _of_settings(camera: Camera, settings: RenderSettings, gradients: bool) -> tuple[float, ...]:
+    is_cut = settings.radius is not None and not settings.fades
+    return (
+        *(settings.max_alpha, settings.frame, math.inf if settings.max_color is None else settings.max_color),
+        *(settings.color_steps or (0.0, 0.0, 0.0)),
+        *(filters.w_end(settings), -(settings.radius**2) / 2 / math.log(2) if is_cut else -math.inf),
+        *(float(settings.radial), float(settings.boxed), float(settings.rooted), float(gradients)),
+        *(settings.min_variance, settings.min_contribution, settings.least_spread),
+        *(settings.max_variance(camera.width, camera.height), settings.picture_step or 0.0),
     )
 
 

@@ -6,22 +6,26 @@ import triton
 import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
-from mipmap_plugin.backends.triton_kernels.compositing import alpha_at, largest, pixels, record_at, slots
+from mipmap_plugin.backends.triton_kernels.compositing import alpha_at, cut_offs, drawn, largest, pixels, record_at, slots
 
-MIN_ALPHA, MIN_TRANSMITTANCE, NUMBERS = views.MIN_ALPHA, views.MIN_TRANSMITTANCE, views.NUMBERS
+MIN_TRANSMITTANCE, NUMBERS = views.MIN_TRANSMITTANCE, views.NUMBERS
 
 
 @triton.jit(do_not_specialize=["most_pixels"])
-def weigh_kernel(records, tile_offsets, splat_ids, shots, sums, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr):
+def weigh_kernel(
+    records, tile_offsets, splat_ids, shots, sums, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr, VIEWER: tl.constexpr
+):
     """Add the blend weights in one tile to `sums`, in the same order of operations as `composite_kernel`."""
     view = shots + tl.program_id(1) * NUMBERS
     px, py, _at, inside = pixels(view, most_pixels, TILE)
     slot, end = slots(tile_offsets)
-    least, stop = tl.load(view + MIN_ALPHA), tl.load(view + MIN_TRANSMITTANCE)
+    limits, stop = cut_offs(view), tl.load(view + MIN_TRANSMITTANCE)
     running = tl.where(inside, 1.0, 0.0)
     while (slot < end) & (largest(running) >= stop.to(tl.int32, bitcast=True)):
         for _ in tl.static_range(BATCH):
-            _dy, _u, _raw, alpha = alpha_at(record_at(records, slot, end), px, py, least)
+            record = record_at(records, slot, end)
+            _dy, _u, _raw, alpha = alpha_at(record, px, py, limits, VIEWER)
+            alpha = drawn(record, alpha, VIEWER)
             behind = running * (1 - alpha)
             total = tl.sum(tl.where(behind >= stop, running * alpha, 0.0), axis=0)
             splat = tl.load(splat_ids + slot, slot < end, 0)
