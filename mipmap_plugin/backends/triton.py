@@ -5,7 +5,8 @@ The kernels are also compiled for compute capability 7.5, 8.0 and 9.0, and run o
 first for a viewer, whose settings are not the usual ones.
 
 The gradients of a splat are summed by atomic additions, in the order in which tiles finish. With
-`torch.use_deterministic_algorithms(True)` they are summed in a fixed order, for 36 bytes of memory per (splat, tile) pair.
+`torch.use_deterministic_algorithms(True)` they are summed in a fixed order, for 36 bytes of memory per (splat, tile) pair; so are blend
+weights, for 4.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def adam_kernel(
 ):  # fmt: skip
     """Move `count` splats: the program's second number is that of the parameter, each of which is followed by its moments and gradient."""
     at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    which = tl.program_id(1)
+    which, count = tl.program_id(1), count.to(tl.int64)  # 45 million splats have more than 2^31 coefficients
     if which == 0:
         rate = tl.where(at % (3 * BANDS) < 3, tl.load(step + SH0), tl.load(step + SHN))
         move(sh, sh_1, sh_2, d_sh, at, count * (3 * BANDS), step, rate)

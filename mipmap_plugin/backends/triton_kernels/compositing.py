@@ -1,7 +1,6 @@
 """Compositing: one program renders one tile, splat by splat, front to back, until no pixel is open.
 
-With many tiles a program is a single warp, whose lanes hold eight pixels each: a splat's record is read once for all eight, they hide
-each other's latency, and sums over the tile need no barrier.
+A program is a single warp, whose lanes hold up to two pixels each: a splat's record is read once for the tile, and sums over it need no barrier.
 """
 
 from __future__ import annotations

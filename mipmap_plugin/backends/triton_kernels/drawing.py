@@ -187,10 +187,13 @@ def project_back(splats: KernelSplats, projected: Projected, d_records: Tensor, 
 
 def weigh(splats: KernelSplats, shots: Shots) -> Tensor:
     """The sum of each splat's blend weights over each image, [V, N]."""
-    projected = project(splats, shots, gradients=False)
-    sums = torch.zeros_like(projected.depths)
+    projected, in_order = project(splats, shots, gradients=False), torch.are_deterministic_algorithms_enabled()
+    sums, splat_ids = torch.zeros_like(projected.depths), projected.bins.splat_ids
+    target = sums.new_zeros(len(splat_ids)) if in_order else sums
     weigh_kernel[projected.grid](
-        *projected.lists, projected.bins.splat_ids, projected.views, sums, projected.most_pixels,
-        TILE=projected.tile, BATCH=BATCH, VIEWER=projected.viewer, num_warps=WARPS,
+        *projected.lists, splat_ids, projected.views, target, projected.most_pixels,
+        TILE=projected.tile, BATCH=BATCH, DETERMINISTIC=in_order, VIEWER=projected.viewer, num_warps=WARPS,
     )  # fmt: skip
-    return sums.view(len(shots), -1)
+    if in_order:
+        sums.index_add_(0, splat_ids.long(), target)  # by torch, in a fixed order
+    return sums.view(len(shots), len(splats.means))

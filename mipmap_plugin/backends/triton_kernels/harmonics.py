@@ -146,7 +146,7 @@ def _band_4(sh, d_sh, x, y, z, d_color, drawn, inside, further):
 def color_back(sh, d_sh, x, y, z, degree, d_color, drawn, inside, further, DEGREE: tl.constexpr):
     """Backward pass of `color`: add the gradients of the coefficients `inside` at the pointers `d_sh` [B], return those of x, y, z.
 
-    d_red, d_green and d_blue are 0 where not `drawn`.
+    d_color is 0 where not `drawn`.
     """
     _add_back(sh, d_sh, tl.zeros_like(x) + C0, d_color, 0, drawn, inside, further)
     dx, dy, dz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)

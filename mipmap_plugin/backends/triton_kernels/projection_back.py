@@ -137,3 +137,4 @@ def project_back_kernel(
         mx, my, mz = mx + per * (px - along * dx), my + per * (py - along * dy), mz + per * (pz - along * dz)
         add3(d_means + 3 * at, tl.where(drawn, mx, 0.0), tl.where(drawn, my, 0.0), tl.where(drawn, mz, 0.0), inside, adds)
         number += 1
+        tl.debug_barrier()  # the next view's gradients are added to what another thread may have stored

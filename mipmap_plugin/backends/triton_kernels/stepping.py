@@ -38,7 +38,7 @@ class TritonStepper:
         with torch.cuda.device_of(self._splats.means):
             drawn = self._drawn[number] = draw(self._splats, self._ranked(shots))
             images = rounded(drawn)
-        alphas = (1 - drawn.transmittances)
+        alphas = 1 - drawn.transmittances
         return [Rendered(image, alpha) for image, alpha in zip(drawn.views_of(images), drawn.views_of(alphas), strict=True)]
 
     def _ranked(self, shots: Sequence[tuple[Camera, Effects]]) -> list[Shot]:
@@ -75,5 +75,6 @@ class TritonStepper:
         shared = 1 - beta1, 1 - beta2, (1 - beta1) * step.nesterov, step.correction, step.eps
         numbers = torch.tensor([*(step.rates[name] for name in RATES), *shared], dtype=means.dtype).to(means.device, non_blocking=True)
         arrays = [array for name in PARAMETERS for array in (step.raw[name], step.first[name], step.second[name], getattr(self._grads, name))]
-        grid = triton.cdiv(self._splats.sh.numel(), NUMBERS_MOVED), len(PARAMETERS)
+        most = max(self._splats.sh.numel(), self._splats.quats.numel())  # colors of one band have fewer numbers than quaternions
+        grid = triton.cdiv(most, NUMBERS_MOVED), len(PARAMETERS)
         adam_kernel[grid](*arrays, numbers, len(means), BANDS=self._splats.sh.shape[1], BLOCK=NUMBERS_MOVED)

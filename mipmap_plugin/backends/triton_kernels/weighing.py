@@ -13,9 +13,10 @@ MIN_TRANSMITTANCE, NUMBERS = views.MIN_TRANSMITTANCE, views.NUMBERS
 
 @triton.jit(do_not_specialize=["most_pixels"])
 def weigh_kernel(
-    records, tile_offsets, splat_ids, shots, sums, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr, VIEWER: tl.constexpr
-):
-    """Add the blend weights in one tile to `sums`, in the same order of operations as `composite_kernel`."""
+    records, tile_offsets, splat_ids, shots, sums, most_pixels,
+    TILE: tl.constexpr, BATCH: tl.constexpr, DETERMINISTIC: tl.constexpr, VIEWER: tl.constexpr,
+):  # fmt: skip
+    """Add the blend weights in one tile to `sums`, or with deterministic sums store them there by pair, in the order of `composite_kernel`."""
     view = shots + tl.program_id(1) * NUMBERS
     px, py, _at, inside = pixels(view, most_pixels, TILE)
     slot, end = slots(tile_offsets)
@@ -28,7 +29,10 @@ def weigh_kernel(
             alpha = drawn(record, alpha, VIEWER)
             behind = running * (1 - alpha)
             total = tl.sum(tl.where(behind >= stop, running * alpha, 0.0), axis=0)
-            splat = tl.load(splat_ids + slot, slot < end, 0)
-            tl.atomic_add(sums + splat, total, total > 0, sem="relaxed")
+            if DETERMINISTIC:
+                tl.store(sums + slot, total, slot < end)
+            else:
+                splat = tl.load(splat_ids + slot, slot < end, 0)
+                tl.atomic_add(sums + splat, total, total > 0, sem="relaxed")
             running = behind
             slot += 1
