@@ -87,8 +87,7 @@ class SteppingRenderer:
     def differentiate(self, stepper: Any, cameras: Sequence[Camera], draw: int, compare: Comparison) -> list[Tensor]:
         """Draw the views of a step, whose first is the `draw`-th since the beginning, and compare their images; return the mean square errors."""
         shots = _shots(cameras, self.targets, draw)
-        same_degree = len({effects.sh_degree for _, effects in shots}) == 1
-        if self.together and same_degree and hasattr(stepper, "render_all"):
+        if self.together and hasattr(stepper, "render_all"):
             compared = compare(range(len(shots)), [drawn.image for drawn in stepper.render_all(shots)])
             stepper.differentiate_all([gradient for gradient, _ in compared])
             return [square_error for _, square_error in compared]

@@ -190,8 +190,8 @@ class AdamStep:
 class Stepper(Protocol):
     """Draws splats of 3DGS and moves them, by their raw parameters, which only it changes.
 
-    Optional: `render_all(shots) -> list[Rendered]` and `differentiate_all(d_images)` draw and differentiate all views of a step, whose effects
-    have one SH degree, in one call each.
+    Optional: `render_all(shots) -> list[Rendered]` and `differentiate_all(d_images)` draw and differentiate all views of a step, each with effects
+    of its own, in one call each.
     """
 
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
@@ -218,8 +218,7 @@ class Backend(Protocol):
     # Optional: `note: str`, shown wherever the backend is listed or chosen. `own_threads: bool`: its kernels have threads of their own
     # (`threads.for_kernels`), return the same bytes on any number, and may run in several threads at once; then torch has one while adapting.
     # `blend_weights(gaussians, camera, effects) -> Tensor | None`: the sum of each splat's blend weights over the image, [N], or None where it has
-    # to be found from gradients; `weigh_views(gaussians, shots) -> Tensor`: those of several views, [V, N], each shot a (camera, effects), all
-    # of one SH degree.
+    # to be found from gradients; `weigh_views(gaussians, shots) -> Tensor`: those of several views, [V, N], each shot a (camera, effects).
     # `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call; adaptation steps are drawn so.
     # `stepper(raw) -> Stepper`: for splats of 3DGS, with `raw` as `AdamStep.raw`; it keeps gradients from autograd and hands them to Adam
     # itself, row by row, which takes less time, and far less memory.
