@@ -7,6 +7,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
+from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.start import compilation
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
@@ -198,6 +199,14 @@ def test_steps_with_the_usual_settings_and_with_others_are_compiled_first(monkey
     effects = [Effects(1), Effects(1, "mip"), find_viewer("unity").effects(Effects(1)), find_viewer("spark").effects(Effects(1))]
     compilation.warm_up(backend, tiny.gaussians(3), effects, gradients=True, merging=False, by_rows=True)
     assert len(stepped) == 2 and effects[0] in stepped and effects[2] in stepped
+
+
+@pytest.mark.parametrize(("views", "by_rows"), [(VIEWS_AT_ONCE, True), (VIEWS_AT_ONCE + 1, False)])
+def test_steps_of_more_views_than_are_drawn_at_once_take_autograds_way(views, by_rows, monkeypatch):
+    asked = []
+    monkeypatch.setattr("mipmap_plugin.adaptation.session.warm_up", lambda *_, **wanted: asked.append(wanted["by_rows"]))
+    adapted(views_per_step=views, steps=1)
+    assert asked == [by_rows]
 
 
 def test_a_start_is_computed_from_as_many_views_as_show_enough(monkeypatch):

@@ -27,6 +27,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
+from mipmap_plugin.adaptation.parallel import views_at_once
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
 from mipmap_plugin.adaptation.start.candidates import StartSearch
@@ -129,9 +130,9 @@ class Session:
             warn(remark)
         began = time.perf_counter()
         with self.phase("compilation"):
-            splats, effects = self.base.gaussians(self.views[0]), (self.base_effects, *self.targets.values())
-            merging = self.config.merge_to < 1 and self._has_blend_weights
-            warm_up(self.backend, splats, effects, gradients=self._takes_steps, merging=merging, by_rows=self.base.traits.plain)
+            merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.base_effects, *self.targets.values())
+            by_rows = self.base.traits.plain and self.config.views_per_step <= views_at_once(view.zoomed(self.scale) for view in self.views)
+            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self._takes_steps, merging=merging, by_rows=by_rows)
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
         initial, start = search.best()
