@@ -189,7 +189,8 @@ def test_what_cannot_be_measured_is_said(name):
 
 
 def test_the_slow_reference_is_measured_only_where_it_is_wanted():
-    assert set(gpu.served([], "cpu")[0]) == {"cpu"}
+    able = set(gpu.served([], "cpu")[0])
+    assert "cpu" in able and "reference" not in able  # other tests may have registered more
 
 
 def test_a_stand_in_for_a_larger_capture_is_made_on_the_device(tmp_path):

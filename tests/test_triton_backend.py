@@ -44,13 +44,24 @@ def compile_for(capability: int, kernel, warps: int = 4, **constants) -> str:
 def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeypatch):
     monkeypatch.setenv("TRITON_CACHE_DIR", str(tmp_path))
     from mipmap_plugin.backends import triton_kernels as sizes
-    from mipmap_plugin.backends.triton_kernels import adam, binning, compositing, compositing_back, projection, projection_back, rounding, weighing
+    from mipmap_plugin.backends.triton_kernels import (
+        adam,
+        binning,
+        colors_back,
+        compositing,
+        compositing_back,
+        projection,
+        projection_back,
+        rounding,
+        weighing,
+    )
 
-    splat, tile = {"RAW": True, "DEGREE": 1, "BANDS": 4, "BLOCK": sizes.SPLATS}, sizes.LARGE_TILE
+    bands, splat, tile = {"DEGREE": 1, "BANDS": 4}, {"RAW": True, "BLOCK": sizes.SPLATS}, sizes.LARGE_TILE
     for has_covariances in (False, True):  # and with other settings than the usual ones
         shape = {"HAS_COVARIANCES": has_covariances, "VIEWER": has_covariances}
-        compile_for(capability, projection.project_kernel, TILE=tile, **shape, **splat)
+        compile_for(capability, projection.project_kernel, TILE=tile, **shape, **splat, **bands)
         compile_for(capability, projection_back.project_back_kernel, **shape, **splat)
+        compile_for(capability, colors_back.color_back_kernel, VIEWER=has_covariances, BLOCK=sizes.SPLATS, **bands)
     compile_for(capability, binning.emit_kernel, TILE=tile, BLOCK=sizes.PAIRS)
     compile_for(capability, rounding.round_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH)
     for viewer in (False, True):

@@ -17,8 +17,8 @@ Memory layout. V views of N splats are drawn at once; all arrays are contiguous,
     pixel (v, y, x):     images [V, pixels, 3]  transmittances [V, pixels]; `tiles` and `pixels` are those of the largest view
 
 composite_back_kernel adds the gradients of a tile's pixels to d_records [V · N, 9]. With deterministic sums it writes one row per pair
-instead; the pairs of a splat lie side by side there, and gather_kernel sums them in order. project_back_kernel does the rest, view after
-view, and adam_kernel moves the splats, where no other module needs the gradients (`stepping.py`).
+instead; the pairs of a splat lie side by side there, and gather_kernel sums them in order. color_back_kernel and project_back_kernel do the
+rest, view after view, and adam_kernel moves the splats, where no other module needs the gradients (`stepping.py`).
 
 Compute capability 7.5 suffices: plain loads, stores and float32 atomics. The constants below set how work is divided; none of them
 changes an image.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mipmap_plugin.backends.triton_kernels import BACK_BATCH, BATCH, RECORD, SPLATS, WARPS, tile_for
 from mipmap_plugin.backends.triton_kernels.binning import Bins, bin_splats
+from mipmap_plugin.backends.triton_kernels.colors_back import color_back_kernel
 from mipmap_plugin.backends.triton_kernels.compositing import composite_kernel
 from mipmap_plugin.backends.triton_kernels.compositing_back import composite_back_kernel, gather_kernel
 from mipmap_plugin.backends.triton_kernels.projection import project_kernel
@@ -174,15 +175,22 @@ def draw_back(drawing: Drawing, d_images: Tensor, d_alphas: Tensor, *, determini
 
 
 def project_back(splats: KernelSplats, projected: Projected, d_records: Tensor, grads: KernelSplats, *, further: bool = False) -> None:
-    """Write the gradients of the splats, summed over the views, or add them where `further`."""
-    count = len(splats.means)
-    if count:
-        unused = grads.means
-        d_quats, d_scales, d_covariances = (unused if array is None else array for array in (grads.quats, grads.scales, grads.covariances))
-        project_back_kernel[(triton.cdiv(count, SPLATS),)](
-            *splats.arrays, projected.views, projected.depths, d_records, grads.means, d_quats, d_scales, d_covariances, grads.opacities, grads.sh,
-            count, len(projected.shots), int(further), **projected.constants,
-        )  # fmt: skip
+    """Write the gradients of the splats, summed over the views, or add them where `further`. `d_records` are those of the directions then."""
+    count, constants = len(splats.means), projected.constants
+    if not count:
+        return
+    grid, last = (triton.cdiv(count, SPLATS),), (count, len(projected.shots), int(further))
+    arrays, shared = splats.arrays, {name: constants[name] for name in ("VIEWER", "BLOCK")}
+    color_back_kernel[grid](
+        splats.means, splats.sh, projected.views, projected.depths, d_records, grads.sh, *last,
+        DEGREE=constants["DEGREE"], BANDS=constants["BANDS"], **shared,
+    )  # fmt: skip
+    unused = grads.means
+    d_quats, d_scales, d_covariances = (unused if array is None else array for array in (grads.quats, grads.scales, grads.covariances))
+    project_back_kernel[grid](
+        *arrays[:-1], projected.views, projected.depths, d_records, grads.means, d_quats, d_scales, d_covariances, grads.opacities, *last,
+        HAS_COVARIANCES=constants["HAS_COVARIANCES"], RAW=constants["RAW"], **shared,
+    )  # fmt: skip
 
 
 def weigh(splats: KernelSplats, shots: Shots) -> Tensor:

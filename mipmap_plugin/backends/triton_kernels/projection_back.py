@@ -6,15 +6,14 @@ import triton
 import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import culling, views
-from mipmap_plugin.backends.triton_kernels.harmonics import color, color_back
-from mipmap_plugin.backends.triton_kernels.projection import by_channel, direction, image_covariance, load_opacity, load_scale, relative_position
+from mipmap_plugin.backends.triton_kernels.projection import direction, image_covariance, load_opacity, load_scale, relative_position
 from mipmap_plugin.backends.triton_kernels.records import HALF_LOG2_E, LN_2, RECORD
 from mipmap_plugin.backends.triton_kernels.shapes import from_axes_back, from_covariance_back, load_quat
 from mipmap_plugin.backends.triton_kernels.vectors import add, add3, dot, load3
-from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, from_eye, image_axis, in_world, rotation_row
+from mipmap_plugin.backends.triton_kernels.views import clamped_slopes, image_axis, in_world, rotation_row
 
 EPS2D, COMPENSATES, LEAST_COMPENSATION = views.EPS2D, views.COMPENSATES, views.LEAST_COMPENSATION
-FX, FY, SH_DEGREE, MAX_COLOR, NUMBERS = views.FX, views.FY, views.SH_DEGREE, views.MAX_COLOR, views.NUMBERS
+FX, FY, NUMBERS = views.FX, views.FY, views.NUMBERS
 
 
 @triton.jit
@@ -72,32 +71,14 @@ def relative_position_back(view, eye, safe, u, v, dt, dr, d_x, d_y):
     return in_world(view, d_u / safe, d_v / safe, d_depth)
 
 
-@triton.jit
-def direction_gradient(view, means, sh, d_color, d_sh, rows, drawn, written, adds, DEGREE: tl.constexpr, VIEWER: tl.constexpr):
-    """Add the gradients of the coefficients, by channel; return those of the direction [B], summed over the channels."""
-    dx, dy, dz, _ = direction(from_eye(view, *load3(means + 3 * rows, drawn)))
-    degree = tl.load(view + SH_DEGREE)
-    value, d_color = color(sh, dx, dy, dz, degree, drawn, DEGREE), tl.load(d_color, drawn, 0.0)
-    d_color = tl.where(value < -0.5, 0.0, d_color)
-    if VIEWER:
-        d_color = tl.where(value + 0.5 > tl.load(view + MAX_COLOR), 0.0, d_color)
-    px, py, pz = color_back(sh, d_sh, dx, dy, dz, degree, d_color, drawn, written, adds, DEGREE)
-    return tl.sum(px, axis=1), tl.sum(py, axis=1), tl.sum(pz, axis=1)
-
-
 @triton.jit(do_not_specialize=["count", "views", "further"])
 def project_back_kernel(
-    means, quats, scales, covariances, opacities, sh, shots, depths, d_records, d_means, d_quats, d_scales, d_covariances, d_opacities, d_sh,
-    count, views, further,
-    HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr, DEGREE: tl.constexpr, BANDS: tl.constexpr, VIEWER: tl.constexpr, BLOCK: tl.constexpr,
+    means, quats, scales, covariances, opacities, shots, depths, d_records, d_means, d_quats, d_scales, d_covariances, d_opacities,
+    count, views, further, HAS_COVARIANCES: tl.constexpr, RAW: tl.constexpr, VIEWER: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the gradients of the splats, summed over the views, or add them to what is there if `further` is 1."""
+    """Write the gradients of all but the colors, summed over the views, or add them to what is there if `further` is 1. After `color_back_kernel`."""
     at = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
     inside = at < count
-    rows, channel, written = by_channel(at, inside)
-    d_coefficients = d_sh + rows * (3 * BANDS) + channel
-    for band in tl.static_range((DEGREE + 1) * (DEGREE + 1), BANDS):
-        add(d_coefficients + 3 * band, tl.zeros([BLOCK, 4], tl.float32), written, further > 0)
     number = tl.program_id(0) * 0
     while number < views:
         view, row, adds = shots + number * NUMBERS, number.to(tl.int64) * count + at, number + further > 0
@@ -108,10 +89,7 @@ def project_back_kernel(
         world, eye, safe = relative_position(view, means, at, drawn)
         safe = tl.where(drawn, safe, 1.0)  # with a near plane of 0, the depth of a splat that is not drawn may be 0
         dx, dy, dz, per = direction(world)
-        px, py, pz = direction_gradient(
-            view, means, sh + rows * (3 * BANDS) + channel, d_records + (number.to(tl.int64) * count + rows) * RECORD + 6 + channel,
-            d_coefficients, rows, drawn[:, None] & written, written, adds, DEGREE, VIEWER,
-        )  # fmt: skip
+        px, py, pz = load3(d_record + 6, drawn)
         along = px * dx + py * dy + pz * dz  # removed below: the color does not change along the ray
 
         xx, xy, yy, det = image_covariance(view, eye, safe, quats, scales, covariances, at, drawn, HAS_COVARIANCES, RAW)

@@ -1,4 +1,4 @@
-"""Steps over the raw parameters of 3DGS (`backends.base.Stepper`): six launches for all views of a step, without autograd."""
+"""Steps over the raw parameters of 3DGS (`backends.base.Stepper`): seven launches for all views of a step, without autograd."""
 
 from __future__ import annotations
 

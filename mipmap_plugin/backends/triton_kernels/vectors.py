@@ -22,6 +22,13 @@ def load3(rows, mask):
 
 
 @triton.jit
+def store3(rows, a, b, c, mask):
+    tl.store(rows, a, mask)
+    tl.store(rows + 1, b, mask)
+    tl.store(rows + 2, c, mask)
+
+
+@triton.jit
 def add(rows, a, mask, further):
     """Store `a` at the pointers `rows`, or add it to what is there where `further`."""
     tl.store(rows, tl.load(rows, mask & further, 0.0) + a, mask)
