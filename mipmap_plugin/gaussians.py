@@ -49,8 +49,10 @@ class Gaussians:
         return self.means.shape[0]
 
     def __getitem__(self, rows: Tensor | slice) -> Gaussians:
-        """The splats at `rows`, a boolean mask [N], indices or a slice."""
+        """The splats at `rows`, a boolean mask [N], indices or a slice. Raises IndexError for a mask of another length."""
         if isinstance(rows, Tensor) and rows.dtype == torch.bool:
+            if rows.shape != (len(self),):
+                raise IndexError(f"a mask of {len(self)} splats has shape [{len(self)}], not {list(rows.shape)}")
             rows = rows.nonzero()[:, 0]  # once for all tensors: a GPU is waited for
         return self._map(lambda tensor: tensor[rows])
 
