@@ -47,6 +47,7 @@ class TritonBackend:
 
     name = "triton"
     api_version = API_VERSION
+    note = "viewers' settings were not tested on a GPU by this package's author"
 
     def __init__(self) -> None:
         self._check = CachedCheck(self)

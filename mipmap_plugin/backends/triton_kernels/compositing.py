@@ -93,6 +93,16 @@ def drawn(record, alpha, VIEWER: tl.constexpr):
     return alpha
 
 
+@triton.jit
+def blended(records, slot, end, px, py, running, stop, limits, VIEWER: tl.constexpr):
+    """The record in a slot, its blend weights [P], which are 0 in finished pixels, and the transmittance `running` [P] behind it."""
+    record = record_at(records, slot, end)
+    _dy, _u, _raw, alpha = alpha_at(record, px, py, limits, VIEWER)
+    alpha = drawn(record, alpha, VIEWER)
+    behind = running * (1 - alpha)
+    return record, tl.where(behind >= stop, running * alpha, 0.0), behind
+
+
 @triton.jit(do_not_specialize=["most_pixels"])
 def composite_kernel(
     records, tile_offsets, shots, images, transmittances, most_pixels, TILE: tl.constexpr, BATCH: tl.constexpr, VIEWER: tl.constexpr
@@ -107,11 +117,7 @@ def composite_kernel(
     red, green, blue = tl.zeros_like(running), tl.zeros_like(running), tl.zeros_like(running)
     while (slot < end) & (largest(running) >= stop.to(tl.int32, bitcast=True)):
         for _ in tl.static_range(BATCH):
-            record = record_at(records, slot, end)
-            _dy, _u, _raw, alpha = alpha_at(record, px, py, limits, VIEWER)
-            alpha = drawn(record, alpha, VIEWER)
-            behind = running * (1 - alpha)
-            weight = tl.where(behind >= stop, running * alpha, 0.0)
+            record, weight, behind = blended(records, slot, end, px, py, running, stop, limits, VIEWER)
             red, green, blue = red + weight * record[6], green + weight * record[7], blue + weight * record[8]
             transmittance = tl.where(behind >= stop, behind, transmittance)
             running = behind

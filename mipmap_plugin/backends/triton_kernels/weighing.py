@@ -6,7 +6,7 @@ import triton
 import triton.language as tl
 
 from mipmap_plugin.backends.triton_kernels import views
-from mipmap_plugin.backends.triton_kernels.compositing import alpha_at, cut_offs, drawn, largest, pixels, record_at, slots
+from mipmap_plugin.backends.triton_kernels.compositing import blended, cut_offs, largest, pixels, slots
 
 MIN_TRANSMITTANCE, NUMBERS = views.MIN_TRANSMITTANCE, views.NUMBERS
 
@@ -24,11 +24,8 @@ def weigh_kernel(
     running = tl.where(inside, 1.0, 0.0)
     while (slot < end) & (largest(running) >= stop.to(tl.int32, bitcast=True)):
         for _ in tl.static_range(BATCH):
-            record = record_at(records, slot, end)
-            _dy, _u, _raw, alpha = alpha_at(record, px, py, limits, VIEWER)
-            alpha = drawn(record, alpha, VIEWER)
-            behind = running * (1 - alpha)
-            total = tl.sum(tl.where(behind >= stop, running * alpha, 0.0), axis=0)
+            _record, weight, behind = blended(records, slot, end, px, py, running, stop, limits, VIEWER)
+            total = tl.sum(weight, axis=0)
             if DETERMINISTIC:
                 tl.store(sums + slot, total, slot < end)
             else:
