@@ -13,7 +13,8 @@ import torch
 from mipmap_plugin import cli, register_viewer, wrap_model
 from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import VISIBLE_ERROR, Validation
-from mipmap_plugin.adaptation.target.portable import MERGE_FACTOR, extreme_targets, median_target
+from mipmap_plugin.adaptation.start.candidates import StartSearch
+from mipmap_plugin.adaptation.target.portable import MERGE_FACTOR, MERGING_COSTS, extreme_targets, median_target
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.reference import ReferenceBackend
@@ -82,7 +83,7 @@ def test_a_model_is_drawn_by_the_viewers_that_it_is_for():
 
 def test_the_extremes_speak_for_all():
     every = {name: find_viewer(name).effects(Effects(3)) for name in viewers_for("portable")}
-    assert list(extreme_targets(every)) == ["classic", "antialiased", "playcanvas-webgpu", "gaussian-splats-3d", "antimatter15"]
+    assert list(extreme_targets(every)) == ["classic", "spark", "playcanvas-webgpu", "gaussian-splats-3d", "antimatter15"]
     assert median_target(every) is every["playcanvas"]
 
 
@@ -96,9 +97,25 @@ def test_settings_for_several_give_way_to_those_that_are_asked_for():
     def settings(viewer, **asked):
         return wrapped().adapt(1 / 4, viewer=viewer, steps=1, extra_views=1, **asked).report.settings
 
-    alone, several, asked = settings("spark"), settings("portable"), settings("portable", merge_to=0.5, loss="l1")
+    alone, several, asked = settings("spark"), settings("portable"), settings("portable", merge_to=0.5, loss="l1", merging_costs=0.2)
     assert several.merge_to == pytest.approx(alone.merge_to * MERGE_FACTOR) and (alone.loss, several.loss) == ("psnr", "l2")
-    assert (asked.merge_to, asked.loss) == (0.5, "l1")
+    assert (alone.merging_costs, several.merging_costs) == (0.3, MERGING_COSTS)
+    assert (asked.merge_to, asked.loss, asked.merging_costs) == (0.5, "l1", 0.2)
+
+
+@pytest.mark.parametrize(("viewer", "steps", "may_lose"), [("spark", 1, 0.0), ("portable", 1, MERGING_COSTS), ("portable", 0, 0.0)])
+def test_merged_splats_may_be_worse_than_the_base_where_steps_regain_it_in_several_viewers(monkeypatch, viewer, steps, may_lose):
+    problems = []
+
+    def watched(self, problem):
+        problems.append(problem)
+        begin(self, problem)
+
+    begin = StartSearch.__init__
+    monkeypatch.setattr(StartSearch, "__init__", watched)
+    wrapped().adapt(1 / 4, viewer=viewer, steps=steps, extra_views=1)
+    assert [problem.may_lose for problem in problems] == [may_lose]
+    assert problems[0].config.merging_costs == (may_lose or 0.3)  # without steps nothing is regained
 
 
 # Turns, and the judgement

@@ -151,6 +151,7 @@ class Session:
         from_base = StartProblem(
             lambda: self._for_target(self.base, shared=True), self.base_views, self._closest_of, self.scale, self.base_effects,
             self.start_target, self.config, self.backend, self._has_blend_weights, self.quality, self.phase,
+            may_lose=self.config.merging_costs if len(self.targets) > 1 and self.config.steps else 0.0,
         )  # fmt: skip
         if (finer := self.finer) is None:
             return from_base
@@ -197,8 +198,7 @@ class Session:
 
         def after_step(run: Run) -> bool:
             keeper.save_if_due(run)
-            answer = observe and observe(run.step, run.watch.seconds, first.of_model(run.student))
-            return is_true(answer)
+            return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
 
         if not run.ended_by:
             task, config = within_budget(run, task, self.config)
