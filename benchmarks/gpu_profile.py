@@ -94,14 +94,16 @@ def _of_launches(name: str, launches: Sequence[dict[str, Any]], runs: int, least
 
 def least_bytes(scene: Scene) -> dict[str, int]:
     """Bytes that each kernel of triton has to read and write at least, if every list is read to its end."""
+    from mipmap_plugin.backends.triton_kernels import RECORD
     from mipmap_plugin.backends.triton_kernels.drawing import KernelSplats, project
     from mipmap_plugin.backends.triton_kernels.views import Shot
 
     with torch.no_grad():
         g = activated(scene.raw)
         projected = project(KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None), [Shot(scene.camera, effects_of(g))])
-    pairs, splats, pixels = len(projected.listed), len(g.means), scene.camera.width * scene.camera.height
-    shape, colors, record = 4 * (3 + 4 + 3 + 1), 4 * g.sh[0].numel(), 4 * projected.listed.shape[1]
+    pairs = sum(len(part.listed) for part in projected.lists.parts())
+    splats, pixels = len(g.means), scene.camera.width * scene.camera.height
+    shape, colors, record = 4 * (3 + 4 + 3 + 1), 4 * g.sh[0].numel(), 4 * RECORD
     image = 4 * (3 + 1) * pixels
     return {
         "project_kernel": splats * (shape + colors + record + 4 * (1 + 4)),

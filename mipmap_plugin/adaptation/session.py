@@ -26,11 +26,10 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
-from mipmap_plugin.adaptation.parallel import views_at_once
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
 from mipmap_plugin.adaptation.start.candidates import StartSearch
-from mipmap_plugin.adaptation.start.compilation import warm_up
+from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import FinerLevel, StartProblem
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.detail import DetailLoss
@@ -131,8 +130,9 @@ class Session:
         began = now(self.device)
         with self.phase("compilation"):
             merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.base_effects, *self.targets.values())
-            by_rows = self.base.traits.plain and self.config.views_per_step <= views_at_once(view.zoomed(self.scale) for view in self.views)
-            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self._takes_steps, merging=merging, by_rows=by_rows)
+            takes_steps, per_step, plain = self._takes_steps, self.config.views_per_step, self.base.traits.plain
+            calls = calls_of(self.views, self.scale, per_step, gradients=takes_steps, merging=merging, plain=plain)
+            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, calls)
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
         initial, start = search.best()

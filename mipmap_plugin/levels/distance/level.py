@@ -28,7 +28,7 @@ from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import GOLDEN, choose_views, orbit_of
-from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.backends.base import Backend, Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.clock import now
 from mipmap_plugin.config import AdaptConfig
@@ -183,8 +183,9 @@ class LevelRun:
     def run(self, resume: Path | None) -> Adapted:
         """Make the level, or go on with the run that `resume` holds."""
         began = now(self.finest.means.device)
+        pixels = tuple(view.width * view.height for view in self.views)
         drawn_with = self.scene.target, self.scene.base.effects()
-        warm_up(self.scene.backend, self.finest, drawn_with, gradients=self.config.steps > 0, merging=True)
+        warm_up(self.scene.backend, self.finest, drawn_with, Calls(self.config.steps > 0, True, pixels=pixels))
         with announced(f"level {self.number}: merging"):
             student, name = self._start()
         initial, states, curve, ended_by, kept = student.copy(), {}, [], "0 steps", None
