@@ -19,6 +19,7 @@ from typing import Literal
 
 import gpu_adaptation
 import gpu_conformance
+import gpu_first_use
 import gpu_profile
 import gpu_speed
 import gpu_views
@@ -146,7 +147,8 @@ def _hard_cases(name: str, r: Request) -> Work:
 
 def _adaptations(name: str, r: Request, data: Path) -> list[Work]:
     place = gpu_adaptation.Place(data, name, r.device, r.ends)
-    return [*gpu_adaptation.works(place, gpu_adaptation.ROWS), *gpu_adaptation.works_for_viewers(place, gpu_adaptation.FOR_VIEWERS)]
+    rows, for_viewers = gpu_adaptation.works(place, gpu_adaptation.ROWS), gpu_adaptation.works_for_viewers(place, gpu_adaptation.FOR_VIEWERS)
+    return [*rows, *for_viewers, *gpu_first_use.works(name, data)]
 
 
 def bandwidth(device: str) -> Iterator[Bandwidth]:

@@ -12,6 +12,7 @@ from typing import Any
 
 from gpu_adaptation import Adaptation
 from gpu_conformance import Checked
+from gpu_first_use import FirstUse
 from gpu_profile import Kernel, Profile
 from gpu_tables import Failure, Speed, report
 from gpu_views import Views
@@ -19,14 +20,15 @@ from gpu_views import Views
 from mipmap_plugin.formats.atomic import write_json
 
 KINDS: dict[str, Any] = {
-    "speed": Speed, "views": Views, "profiles": Profile, "conformance": Checked, "adaptation": Adaptation, "failures": Failure,
+    "speed": Speed, "views": Views, "profiles": Profile, "conformance": Checked, "adaptation": Adaptation,
+    "first_uses": FirstUse, "failures": Failure,
 }  # fmt: skip
 
 # What tells a record from others of its kind; a later one of the same takes its place.
 KEYS = {
     "speed": ("backend", "mode", "splats", "width", "height"), "views": ("backend", "width", "views"),
     "profiles": ("backend", "splats", "width", "height"), "conformance": ("backend",), "adaptation": ("base", "scale", "backend", "viewer"),
-    "failures": ("backend", "what", "reason"),
+    "first_uses": ("backend", "viewer"), "failures": ("backend", "what", "reason"),
 }  # fmt: skip
 
 
@@ -48,6 +50,7 @@ class Results:
     profiles: list[Profile] = field(default_factory=list)
     conformance: list[Checked] = field(default_factory=list)
     adaptation: list[Adaptation] = field(default_factory=list)
+    first_uses: list[FirstUse] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
     done: list[str] = field(default_factory=list)  # titles of the pieces of work that ended, whatever they showed
 
@@ -66,7 +69,7 @@ class Results:
             results.bandwidth, results.done = known["bandwidth"], known.get("done", [])
             for key, kind in KINDS.items():
                 with suppress(TypeError):  # those of an earlier version may have other figures, and are measured again
-                    setattr(results, key, [kind(**row) for row in known[key]])
+                    setattr(results, key, [kind(**row) for row in known.get(key, [])])
             results.profiles = [replace(row, kernels=[Kernel(*kernel) for kernel in row.kernels]) for row in results.profiles]
         return results
 
@@ -77,6 +80,7 @@ class Results:
             return
         self.done = [title for title in self.done if title.split(":")[0] not in parts]
         self.adaptation = [row for row in self.adaptation if ("viewers" if row.viewer else "adaptation") not in parts]
+        self.first_uses = [] if "adaptation" in parts else self.first_uses
         for part in {"speed", "views", "profiles", "conformance"} & set(parts):
             setattr(self, part, [])
 

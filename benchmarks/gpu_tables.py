@@ -11,6 +11,7 @@ from mipmap_plugin.evaluation.report import markdown
 if TYPE_CHECKING:
     from gpu_adaptation import Adaptation
     from gpu_conformance import Checked
+    from gpu_first_use import FirstUse
     from gpu_profile import Kernel, Profile
     from gpu_results import Results
     from gpu_views import Views
@@ -141,6 +142,16 @@ def _phases(row: Adaptation) -> str:
     return ", ".join(f"{name} {seconds:.2f}" for name, seconds in longest if name not in ("total", "loading") and seconds >= 0.005)
 
 
+def first_use_table(rows: Sequence[FirstUse]) -> str:
+    """Empty where nothing was measured."""
+    body = [
+        [row.backend, row.viewer or "-", f"{row.first_s:.1f}", f"{row.compilation_s:.1f}", f"{row.again_s:.1f}", f"{row.again_compilation_s:.1f}"]
+        for row in rows
+    ]
+    table = markdown(["backend", "viewer", "first command, s", "of it compilation", "second command, s", "of it compilation"], body)
+    return f"## First use\n\nThe command `adapt` on lego_200 at x1/4 with ten steps, and the same again.\n\n{table}" if body else ""
+
+
 def report(results: Results) -> str:
     """Everything as one page."""
     known = results.machine
@@ -148,6 +159,7 @@ def report(results: Results) -> str:
     copied = f" A copy moves {results.bandwidth / 1e9:.0f} GB/s, read and written." if results.bandwidth else ""
     made = "Made by `python benchmarks/gpu.py --data DATA`"
     lines = [f"# {known['device']}", f"{made}; {machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
-    lines += [adaptation_table(results.adaptation), conformance_table(results.conformance), profile_table(results.profiles, results.bandwidth)]
+    lines += [adaptation_table(results.adaptation), first_use_table(results.first_uses), conformance_table(results.conformance)]
+    lines += [profile_table(results.profiles, results.bandwidth)]
     lines += [f"Not measured: {' '.join(filter(None, [failure.backend, failure.what]))}: {failure.reason}" for failure in results.failures]
     return "\n\n".join(filter(None, lines))

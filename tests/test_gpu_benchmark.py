@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pretended
@@ -20,6 +21,8 @@ sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names
 import gpu  # noqa: E402
 import gpu_adaptation  # noqa: E402
 import gpu_conformance  # noqa: E402
+import gpu_first_use  # noqa: E402
+import gpu_profile  # noqa: E402
 import gpu_speed  # noqa: E402
 from gpu_adaptation import Adaptation, Base, Place  # noqa: E402
 from gpu_conformance import Checked, check  # noqa: E402
@@ -34,6 +37,7 @@ from gpu_views import Shots, Views, measure, raw_of  # noqa: E402
 from mipmap_plugin import load_model  # noqa: E402
 from mipmap_plugin.backends.conformance import Outcome  # noqa: E402
 from mipmap_plugin.backends.reference import ReferenceBackend  # noqa: E402
+from mipmap_plugin.backends.triton import interpreted  # noqa: E402
 from mipmap_plugin.effects import Effects  # noqa: E402
 
 OURS = Speed("triton", "classic", 1_000_000, 1920, 1080, 1.0, 4.0, 100.0, 10**9, 2 * 10**9)
@@ -97,6 +101,14 @@ def test_small_views_are_timed_alone_and_together():
 
 def test_where_there_are_no_kernels_none_is_listed():
     assert kernels(lambda: torch.ones(3).sum()) == []
+
+
+@pytest.mark.interpreter
+@pytest.mark.skipif(not (interpreted() and find_spec("triton")), reason="triton is not installed, or TRITON_INTERPRET is not 1")
+def test_the_least_that_each_kernel_moves_is_counted():
+    least = gpu_profile.least_bytes(Scene.of(40, 16, 12, "cpu"))
+    assert least["project_kernel"] == 40 * 4 * (11 + 48 + 9 + 5) and least["composite_kernel"] > 16 * 12 * 16
+    assert (least["composite_kernel"] - 16 * 12 * 16) % 36 == 0
 
 
 def test_kernels_are_read_from_a_trace_with_what_they_leave_idle():
@@ -168,6 +180,19 @@ def test_bases_are_adapted_and_judged(tmp_path):
     assert larger.base == "ball_32 in 90"
     [late] = gpu_adaptation.adapt_one(ball, 1 / 2, "playcanvas", replace(place, until=time.monotonic()))
     assert (late.viewer, late.steps, late.ended_by) == ("playcanvas", 0, "the end of the time")
+
+
+def test_what_a_first_command_waits_for_is_measured(tmp_path, monkeypatch):
+    tiny.folder(tmp_path / "checkpoints" / "bases" / gpu_first_use.BASE, tiny.cameras())
+    usual, viewer = gpu_first_use.works("reference", tmp_path)
+    assert (usual.what, viewer.what) == ("first use", "first use playcanvas")
+    monkeypatch.setattr(gpu_first_use, "STEPS", 1)
+    [row] = usual.function(*usual.arguments)
+    assert row.first_s > row.compilation_s > 0 and row.again_s > 0
+    page = report(Results(MACHINE, first_uses=[gpu_first_use.FirstUse("triton", "", 21.04, 9.5, 8.0, 0.4)]))
+    assert cells(page.split("\n\n")[-1], 0) == ["triton", "-", "21.0", "9.5", "8.0", "0.4"]
+    with pytest.raises(RuntimeError, match="nobody"):
+        list(gpu_first_use.measure("nobody", "", tmp_path))
 
 
 def test_adaptations_stand_beside_the_processors_and_the_papers():
