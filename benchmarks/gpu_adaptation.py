@@ -7,12 +7,11 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from gpu_work import Work
+from gpu_work import Work, kept
 from workloads import split_into
 
 from mipmap_plugin import load_model, load_scene, wrap_model
@@ -150,7 +149,7 @@ def denser(model: SplatModel, splats: int) -> SplatModel:
         return VanillaModel.from_gaussians(split_into(model.gaussians(own_cameras(model)[0]), splats), model.trained)
 
 
-@lru_cache(maxsize=1)
+@kept
 def subject_of(base: Base, place: Place) -> Subject:
     """The subject, kept for further scales; what its first adaptation compiles is compiled."""
     subject = Subject.of(base, place)

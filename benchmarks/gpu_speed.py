@@ -6,7 +6,6 @@ import gc
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 from multiprocessing import get_context
 from typing import Literal
 
@@ -14,7 +13,7 @@ import torch
 from gpu_gsplat import find, with_itself
 from gpu_tables import Failure, Speed
 from gpu_timing import Clock
-from gpu_work import Work
+from gpu_work import Work, kept
 from scenes import Scene as Generated
 from scenes import Spec, make_to
 from torch import Tensor
@@ -105,7 +104,7 @@ def needs_of(mode: Mode, device: str) -> Needs:
     return Needs.of(empty, effects_in(mode, empty), gradients=True)
 
 
-@lru_cache(maxsize=1)
+@kept
 def scene_of(case: Case, device: str, cases: Sequence[Case]) -> Scene:
     """The scene of a case, kept for the next piece of work on it; what all `cases` are made from is generated with the first."""
     return Scene.of(*case, device, generated(cases)[spec_of(*case)])

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
 from gpu_gsplat import ITSELF, find, rasterized, with_itself
 from gpu_timing import Clock
-from gpu_work import Work
+from gpu_work import Work, kept
 from torch import Tensor
 from workloads import activated, effects_of
 
@@ -48,7 +47,7 @@ class Shots:
     cameras: Sequence[Camera]
 
 
-@lru_cache(maxsize=1)
+@kept
 def of_base(data: Path, device: str) -> Shots:
     """The raw parameters of the base, and its first views."""
     model = load_model(data / "checkpoints" / "bases" / BASE)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, TypeVar
 
 from gpu_tables import Failure
+
+Result = TypeVar("Result")
 
 # After an error of CUDA's a process can launch nothing more.
 BROKEN = ("CUDA error", "CUDA driver error")
@@ -93,20 +97,40 @@ class Worker:
         return Failure(work.backend, work.what, reason, late)
 
 
+_kept: list[Any] = []  # functions that keep what they returned last
+
+
+def kept(function: Callable[..., Result]) -> Callable[..., Result]:
+    """A function that keeps what it returned last, for the next piece of the same part."""
+    _kept.append(lru_cache(maxsize=1)(function))
+    return _kept[-1]
+
+
 def _serve(pipe: Connection) -> None:
     """Do what comes through the pipe until its other end is closed."""
     os.setsid()  # so that what is started here can be ended together
+    part = ""
     while True:
         try:
             work: Work = pipe.recv()
         except EOFError:
             return
+        if work.part != part:
+            forget()
+        part = work.part
         try:
             for record in work.function(*work.arguments):
                 pipe.send(record)
         except Exception as error:  # a kernel that does not compile, or memory that does not suffice, is a finding
             pipe.send(Failure.of(work.backend, work.what, error))
         pipe.send(DONE)
+
+
+def forget() -> None:
+    """Free what is kept, so that it does not count as memory of another part."""
+    for function in _kept:
+        function.cache_clear()
+    gc.collect()
 
 
 def carry_out(works: list[Work], began: float, ends: float, until: dict[str, float]) -> Iterator[tuple[Work, Any]]:

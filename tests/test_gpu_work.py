@@ -20,7 +20,7 @@ import gpu_views  # noqa: E402
 from gpu_adaptation import Base  # noqa: E402
 from gpu_results import Results  # noqa: E402
 from gpu_tables import Failure  # noqa: E402
-from gpu_work import DONE, Work, carry_out  # noqa: E402
+from gpu_work import DONE, Work, carry_out, forget, kept  # noqa: E402
 
 WHOLE = {"part": 1.0, "other": 1.0}
 
@@ -66,9 +66,9 @@ def test_what_breaks_a_piece_is_a_line_and_the_next_piece_begins():
 
 
 def test_what_takes_too_long_is_cut_off_and_not_done(monkeypatch):
-    monkeypatch.setattr("gpu_work.STARTING_S", 20.0)
-    records = done([piece(what_never_ends), piece(numbers, 5)])
-    assert records == [1, Failure("b", "what_never_ends", "it was cut off, for its time was over", late=True), 5, DONE]
+    monkeypatch.setattr("gpu_work.STARTING_S", 3.0)
+    records = done([piece(numbers, 4, seconds=30.0), piece(what_never_ends), piece(numbers, 5, seconds=30.0)])
+    assert records == [4, DONE, 1, Failure("b", "what_never_ends", "it was cut off, for its time was over", late=True), 5, DONE]
 
 
 def test_parts_wait_for_others_where_their_share_of_the_time_is_over():
@@ -76,6 +76,14 @@ def test_parts_wait_for_others_where_their_share_of_the_time_is_over():
     *records, last = done(works, until={"part": 0.0, "other": 1.0})
     assert records == [2, DONE, 1, DONE]
     assert last == Failure("b", "numbers", "no time was left, for it takes 1000000 s", late=True)
+
+
+def test_what_a_part_keeps_is_freed_before_the_next():
+    made = []
+    make = kept(lambda number: made.append(number) or number)
+    assert [make(1), make(1)] == [1, 1] and made == [1]
+    forget()
+    assert make(1) == 1 and made == [1, 1]
 
 
 @pytest.fixture
