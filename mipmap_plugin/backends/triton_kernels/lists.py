@@ -1,7 +1,7 @@
 """What tiles list: those of all views at once or, where that takes too much memory, those of one strip of a view after the other.
 
 Splats as wide as the picture are in every tile: a view of 4K that is full of them lists each one 129,600 times. Strips are listed anew for the
-backward pass, so that the lists of one only are in memory.
+backward pass, so that those of one, and while these are made of the one before, are all that is in memory.
 """
 
 from __future__ import annotations
