@@ -1,11 +1,11 @@
-"""Speed, memory and conformance of every backend on a CUDA GPU, and the adaptation of real bases there.
+"""Conformance, speed and memory of every backend on a CUDA GPU, and the adaptation of real bases there, in the order of what is worth most.
 
-    python benchmarks/gpu.py                                        # every backend, 0.1 to 4 million splats, 800 x 800 px to 4K
-    python benchmarks/gpu.py --data DATA --splats 1000000 --size 1080p --backend triton --backend gsplat
-    python benchmarks/gpu.py --part conformance --processes 12
+    python benchmarks/gpu.py --data DATA                            # everything, in a quarter of an hour
+    python benchmarks/gpu.py --data DATA --further                  # what an earlier run had no time for
+    python benchmarks/gpu.py --part speed --splats 1000000 --size 1080p --backend triton --backend gsplat
 
-Prints Markdown, and saves it with all figures as <output>/<device>.md and .json after each part; parts that are not measured again are kept.
-Without a GPU it says so and ends with exit code 2.
+Prints each figure, and saves all as <output>/<device>.md and .json as soon as it is there. Each piece is done in another process: what breaks
+it, or takes too long, is a line of the results, and the next piece begins. Without a GPU it says so and ends with exit code 2.
 """
 
 from __future__ import annotations
@@ -14,35 +14,41 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+import gpu_adaptation
+import gpu_conformance
+import gpu_first_use
+import gpu_profile
+import gpu_speed
+import gpu_views
 import torch
 import tyro
-from gpu_adaptation import BASES, Adaptation, Base, of_base
-from gpu_conformance import check_all
-from gpu_profile import profiles
-from gpu_results import Results
-from gpu_speed import MODES, Case, Mode, Scene, measure, measure_all
+from gpu_results import Bandwidth, Results
+from gpu_speed import MODES, Case, Mode
 from gpu_tables import Failure, report
 from gpu_timing import copied_per_second
-from gpu_views import measure_views
+from gpu_work import DONE, Work, carry_out
 
 from mipmap_plugin.adaptation.report import versions
-from mipmap_plugin.backends import survey
+from mipmap_plugin.backends import get_backend, survey
 from mipmap_plugin.backends.base import Needs
 
-__all__ = ["Scene", "measure"]
-
 SizeName = Literal["800", "1080p", "4K"]
-Part = Literal["conformance", "speed", "views", "profiles", "adaptation"]
-PARTS: tuple[Part, ...] = ("conformance", "speed", "views", "profiles", "adaptation")
+Part = Literal["conformance", "speed", "views", "profiles", "adaptation", "viewers"]
+
+# The parts in their order, and the fraction of the time after which nothing of them is begun, as long as other parts wait.
+UNTIL: dict[Part, float] = {"conformance": 0.2, "speed": 0.5, "views": 0.57, "profiles": 0.63, "adaptation": 0.88, "viewers": 1.0}
+NEED_DATA = ("views", "adaptation", "viewers")
+
 SIZES: dict[SizeName, tuple[int, int]] = {"800": (800, 800), "1080p": (1920, 1080), "4K": (3840, 2160)}  # px
+
+# One for each number of splats: these come first, and are profiled.
+FIRST: tuple[Case, ...] = ((1_000_000, 1920, 1080), (4_000_000, 3840, 2160), (100_000, 800, 800))
 SPLATS = (100_000, 1_000_000, 4_000_000)
 
-# One for each number of splats.
-PROFILED: tuple[Case, ...] = ((100_000, 800, 800), (1_000_000, 1920, 1080), (4_000_000, 3840, 2160))
+HARD_CASES_S = 60.0
 
 NO_GPU = "benchmarks/gpu.py: torch sees no CUDA GPU here; run it on a machine that has one, with torch's CUDA build"
 
@@ -51,14 +57,16 @@ NO_GPU = "benchmarks/gpu.py: torch sees no CUDA GPU here; run it on a machine th
 class Request:
     """What is measured."""
 
-    backends: Sequence[str]
+    backends: Sequence[str]  # the most important first
     cases: Sequence[Case]
     modes: Sequence[Mode]
     data: Path | None
     runs: int
     processes: int
-    ends: float  # of `time.monotonic`, after which nothing is begun
+    ends: float  # of `time.monotonic`
     device: str = "cuda"
+    parts: Sequence[Part] = tuple(UNTIL)
+    began: float = 0.0
 
 
 def main(
@@ -70,8 +78,9 @@ def main(
     data: Path | None = None,
     output: Path = Path("benchmarks/results/gpu"),
     runs: int = 7,
-    processes: int = 4,
-    seconds: float = 600.0,
+    processes: int = 15,
+    seconds: float = 840.0,
+    further: bool = False,
 ) -> None:
     """Measure, print and save.
 
@@ -85,66 +94,80 @@ def main(
         output: The folder of the results; the files are named after the device.
         runs: How many of each; the median counts.
         processes: That share the hard cases.
-        seconds: After which nothing more is begun.
+        seconds: After which all has ended.
+        further: Keep what is in the files, and measure only what is not.
     """
+    began = time.monotonic()
     if not torch.cuda.is_available():
         print(NO_GPU, file=sys.stderr)
         raise SystemExit(2)
-    ends = time.monotonic() + seconds
     able, reasons = served(backend, "cuda")
-    results = Results.of(facts(), output)
-    results.failures = [Failure(name, "", reason) for name, reason in reasons.items()]
     cases = [(count, *SIZES[name]) for count in splats or SPLATS for name in size or SIZES]
-    request = Request(able, cases, mode or MODES, data, runs, processes, ends)
-    for each in part or PARTS:
-        setattr(results, each, [])
-        for record in measured(each, request, results):
-            results.add(record)
-            results.save(output)
-    results.save(output)
+    parts = part or tuple(UNTIL)
+    request = Request(able, sorted(cases, key=_rank), mode or MODES, data, runs, processes, began + seconds, "cuda", parts, began)
+    results = Results.of(facts(), output)
+    results.begin(parts, further)
+    for name, reason in reasons.items():
+        results.add(Failure(name, "", reason))
+    carry_on(request, results, output)
     print(report(results))
 
 
-def measured(part: Part, request: Request, results: Results) -> Iterator[Any]:
-    """The records of one part, as they come."""
-    r = request
-    if part == "conformance":
-        yield from check_all(r.backends, r.device, r.processes)
-    elif part == "speed":
-        results.bandwidth = copied_per_second(r.device)
-        yield from measure_all(r.backends, r.cases, r.device, r.runs, r.modes)
-    elif part == "profiles":
-        yield from profiles(r.backends, [case for case in PROFILED if case in r.cases], r.device)
-    elif r.data is None:
-        yield Failure("", part, "no --data was given")
-    elif part == "views":
-        yield from measure_views(r.data, r.backends, r.device, r.runs)
-    else:
-        yield from adaptations(r, r.data)
+def carry_on(request: Request, results: Results, output: Path) -> None:
+    """Do what is not done yet, and save each record as it comes."""
+    if request.data is None:
+        for name in (name for name in request.parts if name in NEED_DATA):
+            results.add(Failure("", name, "no --data was given"))
+    works = [work for work in plan(request) if work.part in request.parts and work.title not in results.done]
+    for work, record in carry_out(works, request.began, request.ends, UNTIL):
+        if record == DONE:
+            results.done.append(work.title)
+        else:
+            results.add(record)
+        results.save(output)
+    results.save(output)
 
 
-def adaptations(request: Request, data: Path, bases: Sequence[Base] = BASES, **settings: Any) -> Iterator[Adaptation | Failure]:
-    """Every base of `data` that is there by the first backend, then by the next. `settings` override the recipe's."""
-    there = [base for base in bases if (data / base.path).is_dir()]
-    for backend, base in product(request.backends, there):
-        if time.monotonic() > request.ends:
-            yield Failure(backend, base.title, "no time was left")
-            continue
-        try:
-            for row in of_base(base, data, backend, request.device, **settings):
-                yield row
-                if time.monotonic() > request.ends and row.scale != base.scales[-1]:
-                    yield Failure(backend, f"{base.title} after x{row.scale:g}", "no time was left")
-                    break
-        except Exception as error:  # as in `gpu_speed.py`
-            yield Failure.of(backend, base.title, error)
+def plan(request: Request) -> list[Work]:
+    """All pieces of work: what compares backends for all of them, the rest for the most important one and then for the others."""
+    r, (first, *others) = request, request.backends
+    profiled = [case for case in FIRST if case in r.cases]
+    works = [_hard_cases(first, r), Work("speed", "", "copy", 5.0, bandwidth, (r.device,))]
+    works += gpu_speed.works(r.backends, r.cases, r.device, r.runs, r.modes)
+    works += gpu_views.works(r.data, r.backends, r.device, r.runs) if r.data else []
+    works += gpu_profile.works(r.backends, profiled, r.device)
+    for name in (first, *others):
+        works += _adaptations(name, r, r.data) if r.data else []
+    return [*works, *(_hard_cases(name, r) for name in others)]
+
+
+def _hard_cases(name: str, r: Request) -> Work:
+    return Work("conformance", name, "hard cases", HARD_CASES_S, gpu_conformance.check, (name, r.device, r.processes))
+
+
+def _adaptations(name: str, r: Request, data: Path) -> list[Work]:
+    place = gpu_adaptation.Place(data, name, r.device, r.ends)
+    rows, for_viewers = gpu_adaptation.works(place, gpu_adaptation.ROWS), gpu_adaptation.works_for_viewers(place, gpu_adaptation.FOR_VIEWERS)
+    return [*rows, *for_viewers, *gpu_first_use.works(name, data)]
+
+
+def bandwidth(device: str) -> Iterator[Bandwidth]:
+    """What a copy moves."""
+    yield Bandwidth(copied_per_second(device))
+
+
+def _rank(case: Case) -> int:
+    """Those of `FIRST` come first; others in their order."""
+    return FIRST.index(case) if case in FIRST else len(FIRST)
 
 
 def served(wanted: Sequence[str], device: str) -> tuple[list[str], dict[str, str]]:
-    """The backends that can be measured on `device`, and why the others cannot; the reference, which is slow, only where it is wanted."""
+    """The backends that can be measured on `device`, the fastest first, and why the others cannot; the slow reference only where it is wanted."""
     found = survey(Needs(device, torch.float32, gradients=True, sh_degree=3, screen_filter="classic"))
     selected = {name: found.get(name, ["there is no such backend"]) for name in wanted or [name for name in found if name != "reference"]}
-    return [name for name, lacks in selected.items() if not lacks], {name: "; ".join(lacks) for name, lacks in selected.items() if lacks}
+    able = [name for name, lacks in selected.items() if not lacks]
+    ranked = able if wanted else sorted(able, key=lambda name: -get_backend(name).speed)
+    return ranked, {name: "; ".join(lacks) for name, lacks in selected.items() if lacks}
 
 
 def facts() -> dict[str, str | int | float]:

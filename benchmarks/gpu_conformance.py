@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 
 import torch
+from gpu_work import BROKEN
 
 from mipmap_plugin.backends import get_backend
 from mipmap_plugin.backends.conformance import CASES, Outcome, check_backend
@@ -21,55 +22,49 @@ OPTIONAL = {"views": ("render_views", check_views), "steps": ("stepper", check_s
 USUAL = "sh-degree-3"
 ALL = (*CASES, *OPTIONAL)
 
-# After an error of CUDA's a process can launch nothing more.
-BROKEN = ("CUDA error", "CUDA driver error")
-
 
 @dataclass(frozen=True)
 class Checked:
-    """What the hard cases showed of one backend."""
+    """What the hard cases have shown of one backend so far."""
 
     backend: str
     cases: int
     skipped: int
     failed: dict[str, str]  # case -> what is wrong
+    unchecked: int = 0
 
     @classmethod
-    def of(cls, backend: str, outcomes: Sequence[Outcome]) -> Checked:
+    def of(cls, backend: str, outcomes: Sequence[Outcome], unchecked: int = 0) -> Checked:
         failed = {outcome.case: outcome.message for outcome in outcomes if not outcome.passed}
-        return cls(backend, len(outcomes), sum(outcome.skipped for outcome in outcomes), failed)
+        return cls(backend, len(outcomes), sum(outcome.skipped for outcome in outcomes), failed, unchecked)
 
 
-def check_all(backends: Sequence[str], device: str, processes: int, cases: Sequence[str] = ALL) -> Iterator[Checked]:
-    """Every backend on every case, all backends at once, each in processes of its own. A case that breaks its process fails alone."""
-    each = max(1, processes // len(backends))
-    rounds = {name: Round(name, device, each, cases) for name in backends}
-    for name, first in rounds.items():
-        outcomes = first.outcomes()
-        for _ in range(1, ROUNDS):
-            if left := [case for case in cases if case not in outcomes]:
-                outcomes |= Round(name, device, each, left).outcomes()
-        missing = {case: Outcome(case, float("nan"), False, False, "its process broke") for case in cases if case not in outcomes}
-        yield Checked.of(name, list((outcomes | missing).values()))
+def check(name: str, device: str, processes: int, cases: Sequence[str] = ALL) -> Iterator[Checked]:
+    """A backend on every case: what is known of it, after each share of them. A case that breaks its process fails alone."""
+    known = dict[str, Outcome]()
+    for _ in range(ROUNDS):
+        if left := [case for case in cases if case not in known]:
+            for outcomes in _round(name, device, processes, left):
+                known |= {outcome.case: outcome for outcome in outcomes}
+                yield Checked.of(name, list(known.values()), len(cases) - len(known))
+    if missing := [Outcome(case, float("nan"), False, False, "its process broke") for case in cases if case not in known]:
+        yield Checked.of(name, [*known.values(), *missing])
 
 
-class Round:
-    """Processes that check cases until all are done, or all of them are broken."""
-
-    def __init__(self, name: str, device: str, processes: int, cases: Sequence[str]) -> None:
-        self._pool = ProcessPoolExecutor(processes, get_context("spawn"), torch.set_num_threads, (1,))
-        cases = sorted(cases, key=_kind)
-        shares = [cases[first : first + SHARE] for first in range(0, len(cases), SHARE)]
-        self._jobs: list[Future[list[Outcome]]] = [self._pool.submit(_outcomes, name, device, share) for share in shares]
-
-    def outcomes(self) -> dict[str, Outcome]:
-        """By case, as far as there are any."""
-        with self._pool:
-            return {outcome.case: outcome for job in self._jobs if not job.exception() for outcome in job.result()}
+def _round(name: str, device: str, processes: int, cases: Sequence[str]) -> Iterator[list[Outcome]]:
+    """The outcomes of shares of the cases, by processes that go on until all are done, or all of them are broken."""
+    cases = sorted(cases, key=_kind)
+    shares = [cases[first : first + SHARE] for first in range(0, len(cases), SHARE)]
+    step = -(-len(shares) // processes)
+    shares = [share for first in range(step) for share in shares[first::step]]
+    with ProcessPoolExecutor(processes, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        for job in as_completed([pool.submit(_outcomes, name, device, share) for share in shares]):
+            if not job.exception():
+                yield job.result()
 
 
 def _kind(case: str) -> tuple[int, str, bool]:
-    """Cases of one kind need the same kernels: where they lie side by side, each process compiles others. Those that take longest come first."""
+    """Cases of one kind need the same kernels: where they lie side by side, processes that begin far from one another compile others."""
     built = CASES[USUAL if case in OPTIONAL else case]()
     return -built.effects.sh_degree, built.effects.screen_filter, built.gaussians.covariances is not None
 

@@ -1,30 +1,47 @@
-"""What was measured on a GPU, saved after each part, so that a run that is cut off keeps what it has."""
+"""What was measured on a GPU, saved with each figure, so that a run that is cut off keeps what it has."""
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from gpu_adaptation import Adaptation
 from gpu_conformance import Checked
-from gpu_profile import Profile
+from gpu_first_use import FirstUse
+from gpu_profile import Kernel, Profile
 from gpu_tables import Failure, Speed, report
 from gpu_views import Views
 
 from mipmap_plugin.formats.atomic import write_json
 
 KINDS: dict[str, Any] = {
-    "speed": Speed, "views": Views, "profiles": Profile, "conformance": Checked, "adaptation": Adaptation, "failures": Failure,
+    "speed": Speed, "views": Views, "profiles": Profile, "conformance": Checked, "adaptation": Adaptation,
+    "first_uses": FirstUse, "failures": Failure,
 }  # fmt: skip
+
+# What tells a record from others of its kind; a later one of the same takes its place.
+KEYS = {
+    "speed": ("backend", "mode", "splats", "width", "height"), "views": ("backend", "width", "views"),
+    "profiles": ("backend", "splats", "width", "height"), "conformance": ("backend",), "adaptation": ("base", "scale", "backend", "viewer"),
+    "first_uses": ("backend", "viewer"), "failures": ("backend", "what", "reason"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Bandwidth:
+    """Of a copy within the device's memory, read and written."""
+
+    bytes_a_second: float
 
 
 @dataclass
 class Results:
-    """Of one machine; the parts that are not measured again are those of an earlier run."""
+    """Of one machine, from one run or from several."""
 
     machine: dict[str, Any]
     bandwidth: float = 0.0  # bytes a second of a copy within the device's memory
@@ -33,7 +50,9 @@ class Results:
     profiles: list[Profile] = field(default_factory=list)
     conformance: list[Checked] = field(default_factory=list)
     adaptation: list[Adaptation] = field(default_factory=list)
+    first_uses: list[FirstUse] = field(default_factory=list)
     failures: list[Failure] = field(default_factory=list)
+    done: list[str] = field(default_factory=list)  # titles of the pieces of work that ended, whatever they showed
 
     @property
     def name(self) -> str:
@@ -47,21 +66,41 @@ class Results:
         file = folder / f"{results.name}.json"
         if file.exists():
             known = json.loads(file.read_text())
-            results.bandwidth = known["bandwidth"]
+            results.bandwidth, results.done = known["bandwidth"], known.get("done", [])
             for key, kind in KINDS.items():
                 with suppress(TypeError):  # those of an earlier version may have other figures, and are measured again
-                    setattr(results, key, [] if key == "failures" else [kind(**row) for row in known[key]])
+                    setattr(results, key, [kind(**row) for row in known.get(key, [])])
+            results.profiles = [replace(row, kernels=[Kernel(*kernel) for kernel in row.kernels]) for row in results.profiles]
         return results
 
+    def begin(self, parts: Sequence[str], further: bool) -> None:
+        """Forget what is measured again: all of the parts, or `further` what was missing only."""
+        self.failures = [failure for failure in self.failures if further and not failure.late]
+        if further:
+            return
+        self.done = [title for title in self.done if title.split(":")[0] not in parts]
+        self.adaptation = [row for row in self.adaptation if ("viewers" if row.viewer else "adaptation") not in parts]
+        self.first_uses = [] if "adaptation" in parts else self.first_uses
+        for part in {"speed", "views", "profiles", "conformance"} & set(parts):
+            setattr(self, part, [])
+
     def add(self, record: Any) -> None:
-        """Put a record to those of its kind, and say so."""
+        """Put a record to those of its kind, in place of an earlier one of the same, and say so."""
+        if isinstance(record, Bandwidth):
+            self.bandwidth = record.bytes_a_second
+            return
         key = next(key for key, kind in KINDS.items() if isinstance(record, kind))
-        getattr(self, key).append(record)
+        rows = getattr(self, key)
+        same = [number for number, row in enumerate(rows) if all(getattr(row, name) == getattr(record, name) for name in KEYS[key])]
+        if same:
+            rows[same[0]] = record
+        else:
+            rows.append(record)
         print(f"{key}: {', '.join(str(value) for value in asdict(record).values())[:300]}", flush=True)
 
     def save(self, folder: Path) -> None:
         """Write the page and the figures, named after the device."""
-        facts = {"machine": self.machine, "bandwidth": self.bandwidth}
+        facts = {"machine": self.machine, "bandwidth": self.bandwidth, "done": self.done}
         lists = {key: [asdict(row) for row in getattr(self, key)] for key in KINDS}
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / f"{self.name}.json", facts | lists, overwrite=True)

@@ -13,6 +13,7 @@ import torch
 from gpu_gsplat import find, with_itself
 from gpu_tables import Failure, Speed
 from gpu_timing import Clock
+from gpu_work import Work, kept
 from scenes import Scene as Generated
 from scenes import Spec, make_to
 from torch import Tensor
@@ -32,6 +33,8 @@ MODES: tuple[Mode, ...] = ("classic", "antialiased", "playcanvas")
 
 SPREAD = 0.47  # as in scenes A and C: about 44 splats reach a pixel, more where they are smaller than one
 MOST_GENERATED = 1_000_000  # splats; numpy needs 4 s for so many, so more are made from these on the device
+
+EXPECTED_S = 6.0  # of one backend on one case in one mode
 
 Case = tuple[int, int, int]  # splats, width, height
 
@@ -101,22 +104,33 @@ def needs_of(mode: Mode, device: str) -> Needs:
     return Needs.of(empty, effects_in(mode, empty), gradients=True)
 
 
-def measure_all(
-    backends: Sequence[str], cases: Sequence[Case], device: str, runs: int, modes: Sequence[Mode] = ("classic",)
-) -> Iterator[Speed | Failure]:
-    """Every backend on every case in every mode. A failure of one, such as too little memory, does not end the others."""
-    lacks = {(name, mode): find(name).lacking(needs_of(mode, device)) for name in with_itself(backends) for mode in modes}
-    yield from (Failure(name, f"as {mode}", "; ".join(reasons)) for (name, mode), reasons in lacks.items() if reasons)
-    made = generated(cases)
-    for case in cases:
-        scene = Scene.of(*case, device, made[spec_of(*case)])
-        for name, mode in (key for key, reasons in lacks.items() if not reasons):
-            try:
-                yield measure(find(name), scene, device, runs, mode)
-            except Exception as error:  # a kernel that does not compile, or memory that does not suffice, is a finding
-                yield Failure.of(name, "{:,} splats at {} x {} px as {}".format(*case, mode), error)
-            gc.collect()
-        del scene
+@kept
+def scene_of(case: Case, device: str, cases: Sequence[Case]) -> Scene:
+    """The scene of a case, kept for the next piece of work on it; what all `cases` are made from is generated with the first."""
+    return Scene.of(*case, device, generated(cases)[spec_of(*case)])
+
+
+def measure_one(name: str, mode: Mode, case: Case, device: str, runs: int, cases: Sequence[Case]) -> Iterator[Speed | Failure]:
+    """One backend on one case in one mode; `cases`: those of the whole run."""
+    backend = find(name)
+    if reasons := backend.lacking(needs_of(mode, device)):
+        yield Failure(name, f"as {mode}", "; ".join(reasons))
+        return
+    yield measure(backend, scene_of(case, device, cases), device, runs, mode)
+    gc.collect()
+
+
+def title(case: Case) -> str:
+    return "{:,} splats at {} x {} px".format(*case)
+
+
+def works(backends: Sequence[str], cases: Sequence[Case], device: str, runs: int, modes: Sequence[Mode]) -> list[Work]:
+    """Every backend on every case in every mode, each scene once after the other."""
+    cases = tuple(cases)
+    return [
+        Work("speed", name, f"{title(case)} as {mode}", EXPECTED_S, measure_one, (name, mode, case, device, runs, cases))
+        for case in cases for mode in modes for name in with_itself(backends)
+    ]  # fmt: skip
 
 
 def measure(backend: Backend, scene: Scene, device: str, runs: int, mode: Mode = "classic") -> Speed:

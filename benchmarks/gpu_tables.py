@@ -11,7 +11,8 @@ from mipmap_plugin.evaluation.report import markdown
 if TYPE_CHECKING:
     from gpu_adaptation import Adaptation
     from gpu_conformance import Checked
-    from gpu_profile import Profile
+    from gpu_first_use import FirstUse
+    from gpu_profile import Kernel, Profile
     from gpu_results import Results
     from gpu_views import Views
 
@@ -42,6 +43,7 @@ class Failure:
     backend: str
     what: str
     reason: str
+    late: bool = False  # no time was left
 
     @classmethod
     def of(cls, backend: str, what: str, error: Exception) -> Failure:
@@ -58,7 +60,8 @@ def speed_table(rows: Sequence[Speed], bandwidth: float) -> str:
         times = f"{other.forward_ms / row.forward_ms:.2f} / {other.both_ms / row.both_ms:.2f}" if other else "-"
         moved = row.both_bytes / row.both_ms * 1000
         place = [f"{row.splats:,}", f"{row.width} x {row.height}", row.mode, row.backend]
-        figures = [f"{row.forward_ms:.2f}", f"{row.both_ms:.2f}", times, f"{moved / 1e9:.0f}", f"{moved / bandwidth:.1%}", f"{row.peak_mib:.0f}"]
+        part = f"{moved / bandwidth:.1%}" if bandwidth else "-"
+        figures = [f"{row.forward_ms:.2f}", f"{row.both_ms:.2f}", times, f"{moved / 1e9:.0f}", part, f"{row.peak_mib:.0f}"]
         body.append(place + figures)
     intro = (
         "From raw parameters to the image, and back to all of them. x gsplat: how many times faster than gsplat as its own users call it, without "
@@ -80,15 +83,28 @@ def views_table(rows: Sequence[Views]) -> str:
     return f"## Small views\n\n{intro}\n\n{markdown(head, body)}" if body else ""
 
 
-def profile_table(rows: Sequence[Profile]) -> str:
+def profile_table(rows: Sequence[Profile], bandwidth: float) -> str:
     """Empty where nothing was profiled."""
+    head = ["splats", "px", "backend", "kernel", "us", "of all kernels'", "launches", "GB/s", "of a copy's", "occupancy", "registers"]
     body = [
-        [f"{row.splats:,}", f"{row.width} x {row.height}", row.backend, f"`{name}`", f"{us:.0f}", f"{us / row.all_us:.0%}", f"{launches:g}"]
-        for row in rows
-        for name, us, launches in row.kernels
-    ]
-    table = markdown(["splats", "px", "backend", "kernel", "us", "of all kernels'", "launches"], body)
-    return f"## Kernels\n\nThose that take the most time of an image and its gradients.\n\n{table}" if body else ""
+        [f"{row.splats:,}", f"{row.width} x {row.height}", row.backend, f"`{kernel.name}`", f"{kernel.us:.0f}", f"{kernel.us / row.all_us:.0%}",
+         f"{kernel.launches:g}", *_moved(kernel, bandwidth), "-" if kernel.occupancy is None else f"{kernel.occupancy:g}%",
+         str(kernel.registers or "-")]
+        for row in rows for kernel in row.kernels
+    ]  # fmt: skip
+    intro = (
+        "Those that take the most time of an image and its gradients. GB/s: only what has to move at least, if lists are read to their ends, which "
+        "tiles that are opaque before do not. Occupancy: as the profiler estimates it."
+    )
+    return f"## Kernels\n\n{intro}\n\n{markdown(head, body)}" if body else ""
+
+
+def _moved(kernel: Kernel, bandwidth: float) -> tuple[str, str]:
+    """GB/s, and the part that they are of a copy's."""
+    if kernel.least_bytes is None or not kernel.us:
+        return "-", "-"
+    moved = kernel.least_bytes / kernel.us * 1e6
+    return f"{moved / 1e9:.0f}", f"{moved / bandwidth:.0%}" if bandwidth else "-"
 
 
 def conformance_table(checked: Sequence[Checked]) -> str:
@@ -96,23 +112,26 @@ def conformance_table(checked: Sequence[Checked]) -> str:
     body, wrong = [], []
     for row in checked:
         drawn = row.cases - row.skipped
-        body.append([row.backend, f"{drawn - len(row.failed)} of {drawn}", str(row.skipped), ", ".join(row.failed) or "-"])
+        figures = [f"{drawn - len(row.failed)} of {drawn}", str(row.skipped), str(row.unchecked)]
+        body.append([row.backend, *figures, ", ".join(row.failed) or "-"])
         wrong += [f"- {row.backend}, {case}: {message[:240]}" for case, message in row.failed.items()]
-    table = markdown(["backend", "hard cases right", "not served", "wrong"], body)
+    table = markdown(["backend", "hard cases right", "not served", "not reached", "wrong"], body)
     return "\n\n".join(filter(None, ["## Hard cases", table, "\n".join(wrong)])) if body else ""
 
 
 def adaptation_table(rows: Sequence[Adaptation]) -> str:
     """Empty where nothing was adapted."""
-    head = ["base", "zoom", "backend", "seconds", "again", "steps", "dB", "on a processor", "peak, MiB", "phases, s", "ended by"]
+    head = ["base", "zoom", "viewer", "backend", "seconds", "again", "steps", "dB", "on a processor", "peak, MiB", "phases, s", "ended by"]
     body = [
-        [row.base, f"x{row.scale:g}", row.backend, f"{row.seconds:.2f}", f"{row.again_seconds:.2f}", str(row.steps), f"{row.psnr_db:.2f}",
+        [row.base, f"x{row.scale:g}", row.viewer or "-", row.backend, f"{row.seconds:.2f}", f"{row.again_seconds:.2f}", str(row.steps),
+         f"{row.psnr_db:.2f}",
          "-" if row.processor_db is None else f"{row.processor_db:.2f}",
          "-" if row.peak_mib is None else f"{row.peak_mib:.0f}", _phases(row), row.ended_by]
         for row in rows
     ]  # fmt: skip
     intro = (
-        "Recipe `default`. dB: of lego and chair on real test images that nothing was adapted to, of flowers on the base's own views, held out. "
+        "Recipe `default`. dB: of lego and chair on real test images that nothing was adapted to; of flowers, and for viewers, on held-out views of "
+        "the base's own. "
         f"Again: of a second adaptation, which has the base's images. {PAPER}"
     )
     return f"## Adaptation\n\n{intro}\n\n{markdown(head, body)}" if body else ""
@@ -123,6 +142,16 @@ def _phases(row: Adaptation) -> str:
     return ", ".join(f"{name} {seconds:.2f}" for name, seconds in longest if name not in ("total", "loading") and seconds >= 0.005)
 
 
+def first_use_table(rows: Sequence[FirstUse]) -> str:
+    """Empty where nothing was measured."""
+    body = [
+        [row.backend, row.viewer or "-", f"{row.first_s:.1f}", f"{row.compilation_s:.1f}", f"{row.again_s:.1f}", f"{row.again_compilation_s:.1f}"]
+        for row in rows
+    ]
+    table = markdown(["backend", "viewer", "first command, s", "of it compilation", "second command, s", "of it compilation"], body)
+    return f"## First use\n\nThe command `adapt` on lego_200 at x1/4 with ten steps, and the same again.\n\n{table}" if body else ""
+
+
 def report(results: Results) -> str:
     """Everything as one page."""
     known = results.machine
@@ -130,6 +159,7 @@ def report(results: Results) -> str:
     copied = f" A copy moves {results.bandwidth / 1e9:.0f} GB/s, read and written." if results.bandwidth else ""
     made = "Made by `python benchmarks/gpu.py --data DATA`"
     lines = [f"# {known['device']}", f"{made}; {machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
-    lines += [adaptation_table(results.adaptation), conformance_table(results.conformance), profile_table(results.profiles)]
+    lines += [adaptation_table(results.adaptation), first_use_table(results.first_uses), conformance_table(results.conformance)]
+    lines += [profile_table(results.profiles, results.bandwidth)]
     lines += [f"Not measured: {' '.join(filter(None, [failure.backend, failure.what]))}: {failure.reason}" for failure in results.failures]
     return "\n\n".join(filter(None, lines))

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 from gpu_gsplat import ITSELF, find, rasterized, with_itself
-from gpu_tables import Failure
 from gpu_timing import Clock
+from gpu_work import Work, kept
 from torch import Tensor
 from workloads import activated, effects_of
 
@@ -21,6 +21,7 @@ from mipmap_plugin.wrap import own_cameras
 BASE = "lego_200"
 WIDTHS = (50, 100, 200, 400)  # px
 COUNTS = (1, 4, 8)  # views
+EXPECTED_S = 6.0  # of one backend at one width
 
 # The raw parameters' names in an `AdamStep`, and here.
 NAMES = {"means": "means", "quats": "quats", "scales": "log_scales", "opacities": "logits", "sh": "sh"}
@@ -46,19 +47,28 @@ class Shots:
     cameras: Sequence[Camera]
 
 
-def measure_views(data: Path, backends: Sequence[str], device: str, runs: int) -> Iterator[Views | Failure]:
-    """Every backend on every size and number of views of one base."""
+@kept
+def of_base(data: Path, device: str) -> Shots:
+    """The raw parameters of the base, and its first views."""
     model = load_model(data / "checkpoints" / "bases" / BASE)
     cameras = own_cameras(model)[: max(COUNTS)]
-    raw = raw_of(model.gaussians(cameras[0]).detach(), device)
-    for width in WIDTHS:
-        sized = [camera.resized(width, round(width * camera.height / camera.width)) for camera in cameras]
-        for name in with_itself(backends):
-            try:
-                for count in COUNTS:
-                    yield measure(name, Shots(raw, sized[:count]), device, runs)
-            except Exception as error:  # as in `gpu_speed.py`
-                yield Failure.of(name, f"views of {width} px", error)
+    return Shots(raw_of(model.gaussians(cameras[0]).detach(), device), cameras)
+
+
+def measure_views(name: str, width: int, data: Path, device: str, runs: int) -> Iterator[Views]:
+    """One backend on every number of views of one width of the base."""
+    shots = of_base(data, device)
+    sized = [camera.resized(width, round(width * camera.height / camera.width)) for camera in shots.cameras]
+    for count in COUNTS:
+        yield measure(name, Shots(shots.raw, sized[:count]), device, runs)
+
+
+def works(data: Path, backends: Sequence[str], device: str, runs: int) -> list[Work]:
+    """Every backend on every width."""
+    return [
+        Work("views", name, f"views of {width} px", EXPECTED_S, measure_views, (name, width, data, device, runs))
+        for width in WIDTHS for name in with_itself(backends)
+    ]  # fmt: skip
 
 
 def raw_of(gaussians: Gaussians, device: str) -> dict[str, Tensor]:

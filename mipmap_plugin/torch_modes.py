@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from threading import Lock
+from typing import Any
 
 import torch
+
+# What torch says of a precision that nobody set: float32.
+UNSET = "none"
 
 
 @contextmanager
 def usual_modes() -> Iterator[None]:
-    """Inside, there is no autocast and no inference mode, and new tensors are of float32 and on the processor by default. Also a decorator."""
+    """Inside, there is no autocast and no inference mode, new tensors are of float32 and on the processor by default, and products of matrices
+    are exact to float32. Also a decorator."""
     with ExitStack() as stack:
         for kind in ("cpu", "cuda"):
             if torch.is_autocast_enabled(kind):
@@ -20,31 +26,41 @@ def usual_modes() -> Iterator[None]:
             stack.enter_context(torch.inference_mode(False))
         if torch.get_default_device().type != "cpu":
             stack.enter_context(torch.device("cpu"))
-        _usual_dtype.enter()
-        stack.callback(_usual_dtype.leave)
+        for setting in _shared:
+            setting.enter()
+            stack.callback(setting.leave)
         yield
 
 
-class _UsualDtype:
-    """The default type, which all threads share: it is float32 from the first that enters to the last that leaves, and then the caller's again."""
+class _Shared:
+    """A setting of all threads: it is `usual` from the first that enters to the last that leaves, and then the caller's again."""
 
-    def __init__(self) -> None:
+    def __init__(self, read: Callable[[], Any], write: Callable[[Any], object], usual: Any) -> None:
         self._lock, self._inside = Lock(), 0
-        self._callers: torch.dtype | None = None
+        self._read, self._write, self._usual = read, write, usual
+        self._callers: Any = None
 
     def enter(self) -> None:
         with self._lock:
             self._inside += 1
-            if (now := torch.get_default_dtype()) != torch.float32:
+            if (now := self._read()) not in (self._usual, UNSET):
                 self._callers = now
-                torch.set_default_dtype(torch.float32)
+                self._write(self._usual)
 
     def leave(self) -> None:
         with self._lock:
             self._inside -= 1
             if not self._inside and self._callers is not None:
-                torch.set_default_dtype(self._callers)
+                self._write(self._callers)
                 self._callers = None
 
 
-_usual_dtype = _UsualDtype()
+def _precisions() -> list[_Shared]:
+    """How products of float32 matrices are rounded: a GPU may have been asked for TF32, with 3 decimal digits, a processor for bfloat16."""
+    if not hasattr(torch.backends, "fp32_precision"):  # before torch 2.9
+        return [_Shared(torch.get_float32_matmul_precision, torch.set_float32_matmul_precision, "highest")]
+    kinds: tuple[Any, ...] = (torch.backends.cuda.matmul, torch.backends.mkldnn.matmul)  # type: ignore[attr-defined]  # torch's
+    return [_Shared(partial(getattr, kind, "fp32_precision"), partial(setattr, kind, "fp32_precision"), "ieee") for kind in kinds]
+
+
+_shared = [_Shared(torch.get_default_dtype, torch.set_default_dtype, torch.float32), *_precisions()]

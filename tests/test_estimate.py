@@ -61,7 +61,6 @@ def run_and_estimates(clock, monkeypatch, base=None, **settings):
         base.gaussians(view)  # `evaluate_moments`
     evaluate = memory.Memory.evaluate
     monkeypatch.setattr(memory.Memory, "evaluate", lambda *each: clock(EVALUATION) or evaluate(*each))
-    monkeypatch.setattr(memory, "perf_counter", time.perf_counter)
     monkeypatch.setattr(Validation, "quality", lambda self, model: clock(CHECK) or Quality(20.0, 20.0))
     monkeypatch.setattr(loop.Bar, "update", lambda bar, *_: told.append((run.watch.seconds, bar.seconds_left)))
     task = Task(views, SCALE, truth, render, False, Validation([], [], SCALE, truth, render, config.resize))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
+import time
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import pretended
@@ -20,12 +21,15 @@ sys.path.append(str(BENCHMARKS))  # its modules import one another by bare names
 import gpu  # noqa: E402
 import gpu_adaptation  # noqa: E402
 import gpu_conformance  # noqa: E402
-from gpu_adaptation import Adaptation, Base  # noqa: E402
-from gpu_conformance import Checked, check_all  # noqa: E402
+import gpu_first_use  # noqa: E402
+import gpu_profile  # noqa: E402
+import gpu_speed  # noqa: E402
+from gpu_adaptation import Adaptation, Base, Place  # noqa: E402
+from gpu_conformance import Checked, check  # noqa: E402
 from gpu_gsplat import Itself  # noqa: E402
-from gpu_profile import Profile, kernels  # noqa: E402
+from gpu_profile import Kernel, Profile, kernels, of_trace  # noqa: E402
 from gpu_results import Results  # noqa: E402
-from gpu_speed import Scene, denser, measure_all  # noqa: E402
+from gpu_speed import Scene, denser  # noqa: E402
 from gpu_tables import Failure, Speed, report, speed_table  # noqa: E402
 from gpu_timing import Clock, copied_per_second  # noqa: E402
 from gpu_views import Shots, Views, measure, raw_of  # noqa: E402
@@ -33,6 +37,7 @@ from gpu_views import Shots, Views, measure, raw_of  # noqa: E402
 from mipmap_plugin import load_model  # noqa: E402
 from mipmap_plugin.backends.conformance import Outcome  # noqa: E402
 from mipmap_plugin.backends.reference import ReferenceBackend  # noqa: E402
+from mipmap_plugin.backends.triton import interpreted  # noqa: E402
 from mipmap_plugin.effects import Effects  # noqa: E402
 
 OURS = Speed("triton", "classic", 1_000_000, 1920, 1080, 1.0, 4.0, 100.0, 10**9, 2 * 10**9)
@@ -50,8 +55,12 @@ def test_without_a_gpu_it_says_so():
     assert (done.returncode, done.stdout, done.stderr.strip()) == (2, "", gpu.NO_GPU)
 
 
+def measured(names, modes, case=(300, 64, 48)):
+    return [record for work in gpu_speed.works(names, [case], "cpu", 1, modes) for record in work.function(*work.arguments)]
+
+
 def test_every_backend_is_measured_on_every_scene():
-    records = list(measure_all(["reference", "gsplat"], [(300, 64, 48)], "cpu", 1, ("classic", "playcanvas")))
+    records = measured(["reference", "gsplat"], ("classic", "playcanvas"))
     rows = [record for record in records if isinstance(record, Speed)]
     assert [(row.backend, row.mode, row.splats, row.width, row.height) for row in rows] == [
         ("reference", mode, 300, 64, 48) for mode in ("classic", "playcanvas")
@@ -59,21 +68,15 @@ def test_every_backend_is_measured_on_every_scene():
     assert all(row.forward_ms > 0 and row.both_ms > 0 for row in rows)
     failures = [record for record in records if isinstance(record, Failure)]
     assert [(failure.backend, failure.what) for failure in failures] == [
-        (name, f"as {mode}") for name in ("gsplat", "gsplat itself") for mode in ("classic", "playcanvas")
+        (name, f"as {mode}") for mode in ("classic", "playcanvas") for name in ("gsplat", "gsplat itself")
     ]
-    assert "it runs on cuda, not on cpu" in failures[0].reason and "splats that fade to 0" in failures[1].reason
-
-
-def test_a_failure_does_not_end_the_others(monkeypatch):
-    monkeypatch.setattr("gpu_speed.measure", lambda *args: 1 / 0)
-    (failure,) = measure_all(["reference"], [(300, 64, 48)], "cpu", 1)
-    assert failure == Failure("reference", "300 splats at 64 x 48 px as classic", "ZeroDivisionError: division by zero")
+    assert "it runs on cuda, not on cpu" in failures[0].reason and "splats that fade to 0" in failures[2].reason
 
 
 def test_the_least_that_moves_is_counted():
     scene = Scene.of(300, 64, 48, "cpu")
     assert scene.parameter_bytes == 300 * (3 + 3 + 4 + 1 + 48) * 4
-    (row,) = measure_all(["reference"], [(300, 64, 48)], "cpu", 1)
+    (row,) = measured(["reference"], ("classic",))
     pixels = 64 * 48 * 4 * 4  # bytes of an image and its alpha
     assert (row.forward_bytes, row.both_bytes) == (scene.parameter_bytes + pixels, 3 * scene.parameter_bytes + 2 * pixels)
 
@@ -100,6 +103,24 @@ def test_where_there_are_no_kernels_none_is_listed():
     assert kernels(lambda: torch.ones(3).sum()) == []
 
 
+@pytest.mark.interpreter
+@pytest.mark.skipif(not (interpreted() and find_spec("triton")), reason="triton is not installed, or TRITON_INTERPRET is not 1")
+def test_the_least_that_each_kernel_moves_is_counted():
+    least = gpu_profile.least_bytes(Scene.of(40, 16, 12, "cpu"))
+    assert least["project_kernel"] == 40 * 4 * (11 + 48 + 9 + 5) and least["composite_kernel"] > 16 * 12 * 16
+    assert (least["composite_kernel"] - 16 * 12 * 16) % 36 == 0
+
+
+def test_kernels_are_read_from_a_trace_with_what_they_leave_idle():
+    args = {"est. achieved occupancy %": 40, "registers per thread": 64}
+    launch = dict(cat="kernel", name="composite_kernel", dur=30.0, args=args)
+    others = [dict(cat="gpu_memset", name="Memset", dur=4.0), dict(cat="cpu_op", name="add", dur=9.0), {"ph": "M"}]
+    events = [launch, {**launch, "dur": 50.0}, *others]
+    assert of_trace(events, 2, {"composite_kernel": 1000}) == [
+        Kernel("composite_kernel", 40.0, 1.0, 40.0, 64, 1000), Kernel("Memset", 2.0, 0.5, None, None, None)
+    ]  # fmt: skip
+
+
 def test_speeds_are_compared_with_gsplat_in_the_same_run():
     table = speed_table([THEIRS, OURS], bandwidth=1e12).split("\n\n")[-1]
     assert cells(table, 1) == ["1,000,000", "1920 x 1080", "classic", "triton", "1.00", "4.00", "2.00 / 1.25", "500", "50.0%", "100"]
@@ -110,11 +131,11 @@ def test_speeds_are_compared_with_gsplat_in_the_same_run():
 def test_wrong_cases_are_named():
     outcomes = [Outcome("fine", 0.0, True, True, ""), Outcome("odd", 0.5, True, False, "differs"), Outcome("left", 0.0, True, True, "", skipped=True)]
     page = report(Results(MACHINE, conformance=[Checked.of("triton", outcomes)]))
-    assert "| triton  | 1 of 2           | 1          | odd   |" in page and "- triton, odd: differs" in page
+    assert "| triton  | 1 of 2           | 1          | 0           | odd   |" in page and "- triton, odd: differs" in page
 
 
 def test_hard_cases_are_shared_among_processes():
-    (checked,) = check_all(["reference"], "cpu", 2, ("one-splat", "sh-degree-0", "views"))
+    *_, checked = check("reference", "cpu", 2, ("one-splat", "sh-degree-0", "views"))
     assert checked == Checked("reference", 3, 1, {})
 
 
@@ -135,32 +156,49 @@ def test_the_report_and_its_files_are_named_after_the_device(tmp_path):
     results = Results(MACHINE, 4e12)
     for record in (OURS, Failure("inria", "", "it is not there"), ADAPTED, Views("triton", 50, 4, 0.5, None, 0.6), Checked("triton", 2, 1, {})):
         results.add(record)
-    results.add(Profile("triton", 300, 64, 48, 200.0, [("kernel", 100.0, 2.0)]))
+    results.add(Profile("triton", 300, 64, 48, 200.0, [Kernel("kernel", 100.0, 2.0, 31.5, 64, 10**8)]))
+    results.add(replace(OURS, both_ms=4.5))
     results.save(tmp_path)
     text = (tmp_path / "nvidia_h200_sxm.md").read_text()
     assert text.startswith("# NVIDIA H200 (SXM)\n\nMade by `python benchmarks/gpu.py --data DATA`; memory_gib 139. A copy moves 4000 GB/s")
-    assert "Not measured: inria: it is not there" in text and "| `kernel` | 100 | 50%" in text
+    assert "Not measured: inria: it is not there" in text
+    assert "| `kernel` | 100 | 50%             | 2        | 1000 | 25%         | 31.5%     | 64 " in text
     again = Results.of(MACHINE, tmp_path)
-    assert (again.speed, again.adaptation, again.conformance, again.failures) == ([OURS], [ADAPTED], results.conformance, [])
+    assert again == results and again.speed == [replace(OURS, both_ms=4.5)]
 
 
 def test_bases_are_adapted_and_judged(tmp_path):
     tiny.folder(tmp_path / "checkpoints" / "bases" / "ball_32", tiny.cameras())
     tiny.scene(tmp_path / "images" / "ball")
-    request = gpu.Request(["reference"], [], [], tmp_path, 1, 1, math.inf, "cpu")
-    bases = [Base("ball_32", (1 / 2,)), Base("absent_100", (2,)), Base("ball_32", (1 / 2,), 90)]
-    row, split = gpu.adaptations(request, tmp_path, bases, steps=4, extra_views=4)
+    place = Place(tmp_path, "reference", "cpu", settings=(("steps", 4), ("extra_views", 4)))
+    ball, absent, split = Base("ball_32", 1), Base("absent_100", 1), Base("ball_32", 1, 90)
+    works = gpu_adaptation.works(place, [(ball, 1 / 2), (absent, 2), (split, 1 / 2)])
+    assert [work.title for work in works] == ["adaptation: reference: ball_32 x0.5", "adaptation: reference: ball_32 in 90 x0.5"]
+    row, larger = (record for work in works for record in work.function(*work.arguments))
     assert (row.base, row.scale, row.backend, row.ended_by, row.processor_db) == ("ball_32", 0.5, "reference", "4 steps", None)
     assert row.psnr_db > 15 and row.seconds > 0 and row.again_seconds > 0 and row.phases["total"] == row.seconds
-    assert split.base == "ball_32 in 90"
-    late = gpu.Request(["reference"], [], [], tmp_path, 1, 1, 0.0, "cpu")
-    assert list(gpu.adaptations(late, tmp_path, bases[:1])) == [Failure("reference", "ball_32", "no time was left")]
+    assert larger.base == "ball_32 in 90"
+    [late] = gpu_adaptation.adapt_one(ball, 1 / 2, "playcanvas", replace(place, until=time.monotonic()))
+    assert (late.viewer, late.steps, late.ended_by) == ("playcanvas", 0, "the end of the time")
+
+
+def test_what_a_first_command_waits_for_is_measured(tmp_path, monkeypatch):
+    tiny.folder(tmp_path / "checkpoints" / "bases" / gpu_first_use.BASE, tiny.cameras())
+    usual, viewer = gpu_first_use.works("reference", tmp_path)
+    assert (usual.what, viewer.what) == ("first use", "first use playcanvas")
+    monkeypatch.setattr(gpu_first_use, "STEPS", 1)
+    [row] = usual.function(*usual.arguments)
+    assert row.first_s > row.compilation_s > 0 and row.again_s > 0
+    page = report(Results(MACHINE, first_uses=[gpu_first_use.FirstUse("triton", "", 21.04, 9.5, 8.0, 0.4)]))
+    assert cells(page.split("\n\n")[-1], 0) == ["triton", "-", "21.0", "9.5", "8.0", "0.4"]
+    with pytest.raises(RuntimeError, match="nobody"):
+        list(gpu_first_use.measure("nobody", "", tmp_path))
 
 
 def test_adaptations_stand_beside_the_processors_and_the_papers():
     page = report(Results(MACHINE, adaptation=[ADAPTED]))
     table = next(part for part in page.split("\n\n") if part.startswith("| base"))
-    expected = ["lego_200", "x0.25", "triton", "2.94", "2.50", "400", "33.87", "33.90", "612", "optimization 2.50", "400 steps"]
+    expected = ["lego_200", "x0.25", "-", "triton", "2.94", "2.50", "400", "33.87", "33.90", "612", "optimization 2.50", "400 steps"]
     assert cells(table, 0) == expected and "40 s for a zoom-out and 75 s for a zoom-in" in page
 
 

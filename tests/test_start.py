@@ -13,6 +13,7 @@ from mipmap_plugin.adaptation.start import compilation
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.start.pixel_size import mean_pixel_size, pixel_size
+from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.base import TrainedScale
@@ -197,14 +198,14 @@ def test_steps_with_the_usual_settings_and_with_others_are_compiled_first(monkey
     backend.stepper = None
     monkeypatch.setattr(compilation, "_step", lambda _backend, _splats, effects: stepped.append(effects))
     effects = [Effects(1), Effects(1, "mip"), find_viewer("unity").effects(Effects(1)), find_viewer("spark").effects(Effects(1))]
-    compilation.warm_up(backend, tiny.gaussians(3), effects, gradients=True, merging=False, by_rows=True)
+    compilation.warm_up(backend, tiny.gaussians(3), effects, Calls(gradients=True, merging=False, by_rows=True))
     assert len(stepped) == 2 and effects[0] in stepped and effects[2] in stepped
 
 
 @pytest.mark.parametrize(("views", "by_rows"), [(VIEWS_AT_ONCE, True), (VIEWS_AT_ONCE + 1, False)])
 def test_steps_of_more_views_than_are_drawn_at_once_take_autograds_way(views, by_rows, monkeypatch):
     asked = []
-    monkeypatch.setattr("mipmap_plugin.adaptation.session.warm_up", lambda *_, **wanted: asked.append(wanted["by_rows"]))
+    monkeypatch.setattr("mipmap_plugin.adaptation.session.warm_up", lambda *args: asked.append(args[-1].by_rows))
     adapted(views_per_step=views, steps=1)
     assert asked == [by_rows]
 

@@ -60,3 +60,22 @@ def test_a_thread_that_ends_leaves_the_default_dtype_to_those_that_go_on() -> No
         assert torch.get_default_dtype() == torch.float32
         second.__exit__(None, None, None)
         assert torch.get_default_dtype() == torch.float64
+
+
+def precisions() -> list[str]:
+    if hasattr(torch.backends, "fp32_precision"):
+        return [torch.backends.cuda.matmul.fp32_precision, torch.backends.mkldnn.matmul.fp32_precision]
+    return [torch.get_float32_matmul_precision()]
+
+
+@pytest.mark.parametrize("precision", ["high", "medium"])
+def test_products_of_matrices_are_exact_whatever_the_caller_has_set(precision: str) -> None:
+    before = precisions()
+    try:
+        torch.set_float32_matmul_precision(precision)
+        asked = precisions()
+        with usual_modes():
+            assert all(inside in ("ieee", "highest") for inside in precisions())
+        assert precisions() == asked != before
+    finally:
+        torch.set_float32_matmul_precision("highest")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 from dataclasses import replace
 
@@ -10,12 +11,13 @@ import torch
 from samples import camera, gaussians
 
 from mipmap_plugin.backends import BACKENDS, survey
-from mipmap_plugin.backends.base import Needs
+from mipmap_plugin.backends.base import AdamStep, Calls, Needs
 from mipmap_plugin.backends.conformance import check_backend
 from mipmap_plugin.backends.external import NO_CUDA
 from mipmap_plugin.backends.triton import NO_TRITON, TritonBackend, interpreted
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.splatting.viewers import find_viewer
 
 MISSING = importlib.util.find_spec("triton") is None
 pytestmark = pytest.mark.skipif(interpreted(), reason="under the interpreter nothing is compiled, and the CPU is supported")
@@ -75,6 +77,66 @@ def test_the_kernels_compile_where_there_is_no_gpu(capability, tmp_path, monkeyp
         ptx = compile_for(capability, weighing.weigh_kernel, sizes.WARPS, TILE=tile, BATCH=sizes.BATCH, DETERMINISTIC=in_order, VIEWER=in_order)
         assert ("atom" in ptx or "red.global" in ptx) != in_order
     compile_for(capability, adam.adam_kernel, BANDS=4, BLOCK=sizes.NUMBERS_MOVED)
+
+
+class PretendedDriver:
+    """What Triton asks of a machine before it compiles."""
+
+    get_current_device = staticmethod(lambda: 99)  # none of a machine that has some
+    get_current_stream = staticmethod(lambda device: 0)
+
+    @staticmethod
+    def get_current_target():
+        from triton.backends.compiler import GPUTarget
+
+        return GPUTarget("cuda", 90, 32)
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What Triton is asked to compile; nothing is compiled, nor run."""
+    jit = pytest.importorskip("triton.runtime.jit")
+    from triton.runtime.driver import driver
+
+    if not hasattr(jit.JITFunction, "_do_compile"):
+        pytest.skip("this version of triton compiles elsewhere")
+    found = set()
+
+    def compiled(kernel, key, signature, device, constants, options, attributes, warmup):
+        found.add((kernel.__name__, str(signature), str(constants), options.num_warps, str(attributes)))
+
+    monkeypatch.setattr(jit.JITFunction, "_do_compile", compiled)
+    monkeypatch.setattr(torch.cuda, "device", lambda device: contextlib.nullcontext())
+    monkeypatch.setattr(TritonBackend, "lacking", lambda self, needs: [])
+    monkeypatch.setattr(torch, "empty", lambda *size, **kinds: torch.ones(*size, **kinds))  # as if each splat were in one tile
+    monkeypatch.setattr(driver, "_active", PretendedDriver())
+    return found
+
+
+@pytest.mark.skipif(MISSING, reason="triton is not installed")
+@pytest.mark.parametrize("by_rows", [False, True])
+@pytest.mark.parametrize("viewer", [None, "playcanvas"])
+def test_what_is_compiled_ahead_is_what_a_run_calls(asked, viewer, by_rows, monkeypatch):
+    g, small, large = gaussians(6, dtype=torch.float32), camera(16, 12), camera(600, 600)
+    effects = [Effects(1)] if viewer is None else [Effects(1), find_viewer(viewer).effects(Effects(1))]
+    backend, sizes = TritonBackend(), (small, large)
+    backend.compile_ahead(g, effects, Calls(gradients=True, merging=True, by_rows=by_rows, pixels=(16 * 12, 600 * 600)))
+    ahead = set(asked)
+    asked.clear()
+    raw = {name: getattr(g, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
+    moments, rates = {name: torch.zeros_like(tensor) for name, tensor in raw.items()}, dict.fromkeys(("means", "quats", "scales", "opacities"), 0.0)
+    for view in sizes:
+        for each in effects:
+            backend.weigh_views(g, [(view, each)])
+            leaf = g.means.clone().requires_grad_(not by_rows)
+            image = backend.render(replace(g, means=leaf), view, each).image
+            if by_rows:
+                stepper = backend.stepper(raw)
+                stepper.differentiate(0, stepper.render(0, view, each).image)
+                stepper.step(AdamStep(raw, moments, moments, rates | {"sh0": 0.0, "shN": 0.0}, (0.9, 0.9), 1.0, 1.0))
+            else:
+                image.sum().backward()
+    assert asked == ahead
 
 
 def test_what_is_missing_is_reported(monkeypatch):

@@ -141,15 +141,17 @@ def test_sums_in_one_order_are_the_same_sums():
         torch.testing.assert_close(grad, right[2][name], atol=1e-6 * float(grad.abs().max()), rtol=1e-4)
 
 
-def test_a_tile_lists_its_visible_splats_front_to_back_and_few_others():
+def test_a_tile_lists_its_visible_splats_front_to_back_and_few_others(monkeypatch):
     from mipmap_plugin.backends.triton_kernels import drawing
     from mipmap_plugin.backends.triton_kernels.records import WIDTH
 
     g, view = gaussians(150, dtype=torch.float32), camera(64, 48)
     splats = drawing.KernelSplats.of(g.means, g.quats, g.scales, g.opacities, g.sh, None)
+    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: True)  # so that it is counted how often a splat is listed
     drawn = drawing.project(splats, [drawing.Shot(view, Effects(1))])
-    assert drawn.listed.shape[1] == WIDTH
-    records = torch.zeros(150, WIDTH).index_copy(0, drawn.bins.splat_ids.long(), drawn.listed)
+    [part] = drawn.lists.parts()
+    assert part.listed.shape[1] == WIDTH
+    records = torch.zeros(150, WIDTH).index_copy(0, part.bins.splat_ids.long(), part.listed)
     x, y, along, shear, across, log2_opacity = records[:, :6].T[:, :, None, None]
     ys, xs = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     u = xs - x - shear * (ys - y)
@@ -159,13 +161,60 @@ def test_a_tile_lists_its_visible_splats_front_to_back_and_few_others():
     needed = seen.unflatten(2, (tiles_x, drawn.tile)).unflatten(1, (tiles_y, drawn.tile)).any(4).any(2).flatten(1)  # [N, tiles]
     listed = torch.zeros_like(needed)
     for tile in range(tiles_x * tiles_y):
-        ids = drawn.bins.splat_ids[drawn.bins.tile_offsets[tile] : drawn.bins.tile_offsets[tile + 1]].long()
+        ids = part.bins.splat_ids[part.bins.tile_offsets[tile] : part.bins.tile_offsets[tile + 1]].long()
         listed[ids, tile] = True
         assert (drawn.depths[ids].diff() >= 0).all()
     assert not (needed & ~listed).any()
-    boxed = int(drawn.bins.counts.sum())
+    boxed = int(part.bins.owned.counts.sum())
     assert needed.sum() <= listed.sum() < boxed
     assert listed.sum() - needed.sum() < 0.2 * (boxed - needed.sum())  # far fewer than by boxes
+
+
+ROUNDED = replace(OF_VIEWERS[1][1], settings=replace(OF_VIEWERS[1][1].settings, picture_step=1 / 255))
+
+
+@pytest.mark.parametrize("in_order", [False, True])
+@pytest.mark.parametrize(
+    "shots",
+    [[(camera(12, 10), Effects(1)), (camera(8, 9), Effects(1, "antialiased"))], [(camera(12, 10), OF_VIEWERS[0][1]), (camera(8, 9), ROUNDED)]],
+    ids=["usual", "viewers"],
+)
+def test_where_lists_take_too_much_memory_strips_are_drawn_one_after_the_other(shots, in_order, monkeypatch):
+    from mipmap_plugin.backends.triton_kernels import lists
+
+    g, strips, listed, made = gaussians(5, dtype=torch.float32), [], [], lists.Lists._strip
+    g = replace(g, scales=4 * g.scales)  # most are as wide as the picture
+
+    def together(splats, _view, _effects):
+        drawn = TritonBackend().render_views(splats, shots)
+        return torch.cat([each.image.flatten(0, 1) for each in drawn])[None], torch.cat([each.alpha.flatten() for each in drawn])[None]
+
+    def strip(self, *args):
+        part = made(self, *args)
+        strips.append(part.pixels)
+        listed.append(len(part.listed))
+        return part
+
+    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: in_order)
+    whole, weights = draw(together, g, None, None), TritonBackend().weigh_views(g, shots)
+    monkeypatch.setattr(lists, "most_pairs", lambda device: 12)
+    monkeypatch.setattr(lists.Lists, "_strip", strip)
+    in_strips, weights_in_strips = draw(together, g, None, None), TritonBackend().weigh_views(g, shots)
+    assert len({(view.start, view.stop) for view in strips}) > 3 and max(listed) <= 12
+    assert torch.equal(in_strips[0], whole[0]) and torch.equal(in_strips[1], whole[1])
+    for name, gradient in in_strips[2].items():
+        torch.testing.assert_close(gradient, whole[2][name], atol=2e-6 * float(gradient.abs().max()), rtol=1e-4)
+    torch.testing.assert_close(weights_in_strips, weights, atol=1e-5, rtol=1e-5)
+
+
+def test_rows_of_tiles_are_grouped_up_to_so_many_pairs():
+    from mipmap_plugin.backends.triton_kernels import lists
+
+    boxes = torch.tensor([[0, 1, 3, 6], [1, 0, 2, 2], [0, 0, 0, 0]], dtype=torch.int32)
+    assert lists.pairs_by_row(boxes, 4) == [2, 3, 3, 0]
+    assert list(lists.grouped([2, 3, 3, 0], 5)) == [(0, 2), (2, 4)]
+    assert list(lists.grouped([9, 3], 5)) == [(0, 1), (1, 2)] and list(lists.grouped([0, 0], 5)) == [(0, 2)]
+    assert lists.within(boxes, 2, 4).tolist() == [[0, 2, 3, 3], [1, 2, 2, 0], [0, 2, 0, 0]]
 
 
 @pytest.mark.parametrize("case", HARD)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import time
 
 import torch
 from pydantic import BaseModel, ConfigDict
 
+from mipmap_plugin.clock import now
 from mipmap_plugin.config import AdaptConfig
 
 
@@ -55,9 +55,7 @@ class Stopwatch:
         return self.seconds if self._start is None else self.seconds + self._now() - self._start
 
     def _now(self) -> float:
-        if self._device is not None and self._device.type == "cuda":
-            torch.cuda.synchronize(self._device)
-        return time.perf_counter()
+        return now(self._device)
 
 
 def progress(step: int, seconds: float, config: AdaptConfig, before: float = 0.0) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -27,11 +26,10 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
-from mipmap_plugin.adaptation.parallel import views_at_once
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
 from mipmap_plugin.adaptation.start.candidates import StartSearch
-from mipmap_plugin.adaptation.start.compilation import warm_up
+from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import FinerLevel, StartProblem
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.adaptation.target.detail import DetailLoss
@@ -42,6 +40,7 @@ from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views, orbit_of, over_band, refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
+from mipmap_plugin.clock import now
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
 from mipmap_plugin.models.base import SplatModel, count_of, digest_of_parameters, effects_of
@@ -128,11 +127,12 @@ class Session:
             return Adapted(copy, self._report(copy, [], reason, AS_IT_IS, {}), self.backend, self.effects, self.targets)
         for remark in filter(None, [*remarks(self.base_views, self.base, near, orbit=self._orbits), too_unlike(self.base_views)]):
             warn(remark)
-        began = time.perf_counter()
+        began = now(self.device)
         with self.phase("compilation"):
             merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.base_effects, *self.targets.values())
-            by_rows = self.base.traits.plain and self.config.views_per_step <= views_at_once(view.zoomed(self.scale) for view in self.views)
-            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, gradients=self._takes_steps, merging=merging, by_rows=by_rows)
+            takes_steps, per_step, plain = self._takes_steps, self.config.views_per_step, self.base.traits.plain
+            calls = calls_of(self.views, self.scale, per_step, gradients=takes_steps, merging=merging, plain=plain)
+            warm_up(self.backend, self.base.gaussians(self.views[0]), effects, calls)
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
         initial, start = search.best()
@@ -141,7 +141,7 @@ class Session:
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked_steps, self.config.model_copy(update={"steps": 0}))
         pool.release_to_system()
-        self.seconds["total"] = time.perf_counter() - began
+        self.seconds["total"] = now(self.device) - began
         if self._takes_steps:
             run, ended_by = self._optimize(initial.copy(), resume, observe)
             curve, states = run.curve, states | run.states(initial)
@@ -159,12 +159,12 @@ class Session:
 
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
-        began, most = time.perf_counter(), self.config.most_splats or sys.maxsize
+        began, most = now(self.device), self.config.most_splats or sys.maxsize
         allowed = [name for name, model in states.items() if _rows(model) <= most]
         (base, start, *_), last = states, allowed[-1]
         with self.phase("validation"):
             best, psnrs = self.validation.choose(states, allowed)
-        self.seconds["total"] += time.perf_counter() - began
+        self.seconds["total"] += now(self.device) - began
         if self.config.returns == "last":
             best = last
         elif self.detail is not None and psnrs[last] >= max(psnrs[name] for name in allowed if name in (base, start)) - HARM_DB:

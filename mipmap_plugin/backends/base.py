@@ -161,6 +161,16 @@ class Capabilities:
 
 
 @dataclass(frozen=True)
+class Calls:
+    """What a run will ask of a backend: gradients, blend weights (for merging), steps by rows, and calls of so many pixels."""
+
+    gradients: bool
+    merging: bool
+    by_rows: bool = False
+    pixels: tuple[int, ...] = (1,)
+
+
+@dataclass(frozen=True)
 class AdamStep:
     """A step of Adam (Kingma and Ba 2015) over the raw parameters of 3DGS: log scales, logits, quaternions of any norm.
 
@@ -221,7 +231,7 @@ class Backend(Protocol):
     # to be found from gradients; `weigh_views(gaussians, shots) -> Tensor`: those of several views, [V, N], each shot a (camera, effects).
     # `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call; adaptation steps are drawn so.
     # `stepper(raw) -> Stepper`: for splats of 3DGS, with `raw` as `AdamStep.raw`; it keeps gradients from autograd and hands them to Adam
-    # itself, row by row, which takes less time, and far less memory.
+    # itself, row by row, which takes less time, and far less memory. `compile_ahead(gaussians, effects, calls)`: compile what such calls need.
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""

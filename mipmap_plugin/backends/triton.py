@@ -2,11 +2,13 @@
 
 The kernels are also compiled for compute capability 7.5, 8.0 and 9.0, and run on tiny images in Triton's interpreter on a CPU, in
 `tests/test_triton_backend.py` and `tests/test_triton_interpreted.py`. The first run on a machine compiles them, for half a minute, and so does the
-first for a viewer, whose settings are not the usual ones.
+first for a viewer, whose settings are not the usual ones; what an adaptation needs is compiled side by side, on all of torch's threads.
+
+A view whose lists of splats take too much memory is drawn in strips (`triton_kernels/lists.py`).
 
 The gradients of a splat are summed by atomic additions, in the order in which tiles finish. With
-`torch.use_deterministic_algorithms(True)` they are summed in a fixed order, for 36 bytes of memory per (splat, tile) pair; so are blend
-weights, for 4.
+`torch.use_deterministic_algorithms(True)` before an image is drawn they are summed in a fixed order, for 44 bytes of memory per (splat,
+tile) pair; so are blend weights, for 4.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
+from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Calls, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
@@ -32,6 +34,8 @@ from mipmap_plugin.splatting.packing import packed
 
 if TYPE_CHECKING:
     from mipmap_plugin.backends.triton_kernels.views import Shot
+
+ONE_PIXEL = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 OLDEST = (3, 3)  # versions before it compile no tuples
 NO_TRITON = "it needs triton, which comes with torch's CUDA wheels: pip install triton"
@@ -106,6 +110,15 @@ class TritonBackend:
         splats = [gaussians if packing is None else packed(gaussians, shot.camera, packing) for shot, packing in zip(ranked, packings, strict=True)]
         return [(_tensors(own), [shot]) for own, shot in zip(splats, ranked, strict=True)]
 
+    def compile_ahead(self, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
+        """Compile on all threads what draws such splats with any of the effects."""
+        if not interpreted():
+            from mipmap_plugin.backends.triton_kernels.ahead import compile_ahead
+            from mipmap_plugin.backends.triton_kernels.drawing import KernelSplats
+            from mipmap_plugin.backends.triton_kernels.views import Shot
+
+            compile_ahead(KernelSplats.of(*_tensors(gaussians)), [Shot(ONE_PIXEL, each) for each in effects], calls)
+
     def stepper(self, raw: Mapping[str, Tensor]) -> Stepper:
         """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`."""
         from mipmap_plugin.backends.triton_kernels.stepping import TritonStepper
@@ -150,8 +163,8 @@ class _Draw(torch.autograd.Function):
 
         *tensors, images, transmittances = ctx.saved_tensors
         splats, drawn = drawing.KernelSplats.of(*tensors), drawing.Drawing(ctx.projected, images, transmittances)
-        grads, in_order = splats.new_gradients(), torch.are_deterministic_algorithms_enabled()
+        grads = splats.new_gradients()
         with torch.cuda.device_of(images):
-            d_records = drawing.draw_back(drawn, drawn.packed(d_outputs[::2]), drawn.packed(d_outputs[1::2]), deterministic=in_order)
+            d_records = drawing.draw_back(drawn, drawn.packed(d_outputs[::2]), drawn.packed(d_outputs[1::2]))
             drawing.project_back(splats, drawn.projected, d_records, grads)
         return None, None, *grads[:-1]

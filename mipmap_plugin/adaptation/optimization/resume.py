@@ -163,8 +163,8 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     steering = Steering(**{**state["steering"], "best": Snapshot(**state["steering"]["best"]).to(device)})
     return Run(
         student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, steering, _trial(state["trial"], device), state["step"],
-        [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"], Costs(earlier=tuple(state["costs"])),
-        state["ended_by"], reserved=state["reserved"], planned=state["planned"],
+        [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"],
+        Costs(earlier=tuple(state["costs"]), device=device), state["ended_by"], reserved=state["reserved"], planned=state["planned"],
     )  # fmt: skip
 
 

@@ -116,7 +116,7 @@ class Run:
         means = student.parameters()["means"]
         optimizer, watch = make_optimizer(student, config, task.pixel(means)), Stopwatch(seconds=spent)
         with watch:
-            trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds)
+            trial, costs = Trial.begin(student, task, config), Costs(motion=lambda: task.follow.seconds, device=means.device)
             quality = costs.check(lambda: task.validation.quality(student))
             steering = Steering.begin(student, quality.visible)
         first = CurvePoint(step=0, seconds=watch.read(), psnr_db=None, validation_db=quality.psnr, gaussians=count_of(student, task.views[0]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,6 +20,7 @@ from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, mean_pixel_si
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
+from mipmap_plugin.clock import now
 from mipmap_plugin.effects import INTEGRATED, SURFEL
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, Thinned
@@ -73,7 +73,8 @@ class StartSearch:
         self._shown = torch.empty(0, dtype=torch.bool)  # of the base's splats (`may_show`), once blend weights are known
         self._least = 0.0  # fraction of the rows that stay
         self.notes: list[str] = []  # on what the views show of the base
-        self._clock = _Clock(START_SHARE * problem.config.time_budget_s if problem.config.time_budget_s else math.inf)
+        budget, device = problem.config.time_budget_s, problem.base().parameters()["means"].device
+        self._clock = _Clock(START_SHARE * budget if budget else math.inf, device)
         self._alike = draws_alike(problem.base_effects, problem.target)
         # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
         keeps = self._alike and problem.config.steps > 0 and problem.scale <= 1
@@ -246,17 +247,18 @@ class StartSearch:
 
 
 class _Clock:
-    """What the rest of a start's time allows."""
+    """What the rest of a start's time allows, that of a GPU included."""
 
-    def __init__(self, seconds: float) -> None:
-        self._end, self._took = time.perf_counter() + seconds, dict[str, float]()
+    def __init__(self, seconds: float, device: torch.device) -> None:
+        self._device, self._took = device, dict[str, float]()
+        self._end = now(device) + seconds
 
     @contextmanager
     def timing(self, work: str) -> Iterator[None]:
-        began = time.perf_counter()
+        began = now(self._device)
         yield
-        self._took[work] = time.perf_counter() - began
+        self._took[work] = now(self._device) - began
 
     def allows(self, work: str, times: int = 1) -> bool:
         """Whether there is time to do a work again, as long as the last time."""
-        return time.perf_counter() + times * self._took.get(work, 0.0) <= self._end
+        return now(self._device) + times * self._took.get(work, 0.0) <= self._end

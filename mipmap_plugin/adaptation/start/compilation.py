@@ -8,9 +8,10 @@ from typing import Any
 
 import torch
 
+from mipmap_plugin.adaptation.parallel import views_at_once
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.merging import merge
-from mipmap_plugin.backends.base import AdamStep, Backend
+from mipmap_plugin.backends.base import AdamStep, Calls
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -19,21 +20,31 @@ from mipmap_plugin.render_settings import USUAL
 CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 
-def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], *, gradients: bool, merging: bool, by_rows: bool = False) -> None:
-    """Let the backend compile what draws splats like these with all `effects`, and what their `gradients`, `merging` and steps `by_rows` need."""
+def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
+    """Let the backend compile what draws splats like these with all `effects` in such calls."""
     few = gaussians[torch.arange(min(2, len(gaussians)))].detach()
+    if hasattr(backend, "compile_ahead"):
+        backend.compile_ahead(few, effects, calls)
+    steps = calls.by_rows and hasattr(backend, "stepper")
     # The first with the usual settings, and the first with others, for which a backend may have kernels of their own.
     kinds = list({setting.settings == USUAL: setting for setting in reversed(effects)}.values())
     for setting in effects:
-        image = backend.render(replace(few, means=few.means.clone().requires_grad_(gradients)), CAMERA, setting).image
-        if merging and setting in kinds:  # here, because another process may be compiling the backward pass by now
+        image = backend.render(replace(few, means=few.means.clone().requires_grad_(calls.gradients)), CAMERA, setting).image
+        if calls.merging and setting in kinds:  # here, because another process may be compiling the backward pass by now
             weights = blend_weights(few, [CAMERA], backend, setting)
             merge(few, torch.ones_like(weights), weights, fraction=0.5)
-        if gradients and image.requires_grad and not (by_rows and hasattr(backend, "stepper")):
+        if calls.gradients and image.requires_grad and not steps:
             image.sum().backward()
-    if by_rows and gradients and hasattr(backend, "stepper"):
+    if steps and calls.gradients:
         for kind in kinds:
             _step(backend, few, kind)
+
+
+def calls_of(views: Sequence[Camera], scale: float, per_step: int, *, gradients: bool, merging: bool, plain: bool) -> Calls:
+    """What an adaptation over views of the base's scale calls; plain: whether the model's rows are splats, which a backend may move itself."""
+    zoomed = [view.zoomed(scale) for view in views]
+    pixels = [view.width * view.height for view in (*views, *zoomed)]
+    return Calls(gradients, merging, plain and per_step <= views_at_once(zoomed), (min(pixels), max(pixels) * per_step))
 
 
 def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:

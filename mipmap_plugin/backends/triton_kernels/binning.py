@@ -5,7 +5,8 @@ Sorting by depth first leaves pairs with 16-bit keys, where tile and depth toget
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from typing import NamedTuple
 
 import torch
 import triton
@@ -21,15 +22,29 @@ TILES_X, NUMBERS = views.TILES_X, views.NUMBERS
 EDGE = tl.constexpr(0.49)
 
 
-@dataclass(frozen=True, eq=False)
-class Bins:
+class Splatted(NamedTuple):
+    """N splats in V views, as `project_kernel` writes them, and the numbers of these views."""
+
+    records: Tensor  # [V · N, 9]
+    depths: Tensor  # [V · N]
+    boxes: Tensor  # [V · N, 4]
+    views: Tensor
+
+
+class Owned(NamedTuple):
+    """The pairs of each splat side by side, for sums over them in a fixed order."""
+
+    places: Tensor  # [pairs] int64, index of each pair in that order
+    starts: Tensor  # [V · N] int64, first index of each splat
+    counts: Tensor  # [V · N] int32, number of its pairs, in every fourth place
+
+
+class Bins(NamedTuple):
     """(splat, tile) pairs of V views, sorted by tile and then by depth. A splat's number in view v is v · N + n, a tile's v · tiles + t."""
 
     splat_ids: Tensor  # [pairs] int32
     tile_offsets: Tensor  # [V · tiles + 1] int64, where each tile's pairs begin and end; pairs in no tile follow after the last
-    places: Tensor  # [pairs] int64, index of each pair when the pairs of each splat lie side by side
-    starts: Tensor  # [V · N] int64, first index of each splat in that order
-    counts: Tensor  # [V · N] int32, number of its pairs
+    owned: Owned | None  # None: their sums have any order
 
 
 @triton.jit(do_not_specialize=["pairs", "count", "most_tiles", "no_tile", "least_key"])
@@ -59,17 +74,20 @@ def emit_kernel(records, boxes, starts, owners, tiles, shots, pairs, count, most
     tl.store(tiles + at, tl.where(outside, no_tile, tile) - least_key, inside)
 
 
-def bin_splats(records: Tensor, depths: Tensor, boxes: Tensor, shots: Tensor, most_tiles: int, tile: int) -> Bins:
-    """Pair the records [V · N, 9] with the tiles in their boxes [V · N, 4]. The host synchronizes once, for the number of pairs.
+def bin_splats(splatted: Splatted, most_tiles: int, tile: int, fixed_order: bool, most_pairs: float = math.inf) -> Bins | None:
+    """Pair splats with the tiles in their boxes; None if there are more than `most_pairs`. The host synchronizes once, for the number of pairs.
 
-    most_tiles: of a view. tile: px.
+    most_tiles: of a view. tile: px. fixed_order: whether sums over the pairs of a splat will have one.
     """
+    records, depths, boxes, shots = splatted
     order = depths.argsort(stable=True)
     counts = boxes[:, 3]
     in_order = counts[order]
     ends = in_order.cumsum(0, dtype=torch.int64)
     starts = torch.empty_like(ends).scatter_(0, order, ends - in_order)
     pairs = int(ends[-1]) if len(ends) else 0
+    if pairs > most_pairs:
+        return None
     owners = order.int().repeat_interleave(in_order, output_size=pairs)
     no_tile = len(shots) * most_tiles
     # A radix sort takes one pass per byte of the key. Torch has no sort for unsigned ones.
@@ -81,4 +99,4 @@ def bin_splats(records: Tensor, depths: Tensor, boxes: Tensor, shots: Tensor, mo
     by_tile, places = tiles.sort(stable=True)
     keys = torch.arange(-least_key, no_tile + 1 - least_key, dtype=key, device=tiles.device)
     tile_offsets = torch.searchsorted(by_tile, keys)
-    return Bins(owners[places], tile_offsets, places, starts, counts)
+    return Bins(owners[places], tile_offsets, Owned(places, starts, counts) if fixed_order else None)

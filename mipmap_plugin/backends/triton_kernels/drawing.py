@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,10 +11,11 @@ import triton
 from torch import Tensor
 
 from mipmap_plugin.backends.triton_kernels import BACK_BATCH, BATCH, RECORD, SPLATS, WARPS, tile_for
-from mipmap_plugin.backends.triton_kernels.binning import Bins, bin_splats
+from mipmap_plugin.backends.triton_kernels.binning import Splatted
 from mipmap_plugin.backends.triton_kernels.colors_back import color_back_kernel
 from mipmap_plugin.backends.triton_kernels.compositing import composite_kernel
 from mipmap_plugin.backends.triton_kernels.compositing_back import composite_back_kernel, gather_kernel
+from mipmap_plugin.backends.triton_kernels.lists import Lists, Part, Tiling
 from mipmap_plugin.backends.triton_kernels.projection import project_kernel
 from mipmap_plugin.backends.triton_kernels.projection_back import project_back_kernel
 from mipmap_plugin.backends.triton_kernels.rounding import round_kernel
@@ -75,22 +76,20 @@ class Projected:
     shots: Shots
     constants: dict[str, int | bool]
     tile: int  # px
-    grid: tuple[int, int]  # the most tiles of a view, and the number of views
     most_pixels: int  # of a view
     views: Tensor  # [V, numbers of `views.py`]
-    listed: Tensor  # [pairs, 9], the records in the order of the lists: a program reads them one after the other
     depths: Tensor  # [V · N], or other numbers in the same order; infinite where a splat is not drawn
-    bins: Bins
+    lists: Lists
 
     @property
     def viewer(self) -> bool:
         """Whether some view's settings are not the usual ones."""
         return bool(self.constants["VIEWER"])
 
-    @property
-    def lists(self) -> tuple[Tensor, Tensor]:
-        """The first arguments of what composites."""
-        return self.listed, self.bins.tile_offsets
+    def parts(self) -> Iterator[tuple[Part, tuple[Tensor, Tensor]]]:
+        """Each part that is drawn by one launch, and the first arguments of what composites it."""
+        for part in self.lists.parts():
+            yield part, (part.listed, part.bins.tile_offsets)
 
 
 class Drawing(NamedTuple):
@@ -117,12 +116,12 @@ class Drawing(NamedTuple):
 
 
 def project(splats: KernelSplats, shots: Shots, *, gradients: bool = True) -> Projected:
-    """Project splats to all views, and list those of each tile; for gradients culled ones, too."""
+    """Project splats to all views, and list those of each tile; for gradients culled ones, too, whose sums have a fixed order if torch is told so."""
     means, rows = splats.means, len(shots) * len(splats.means)
     sizes = [shot.camera.size for shot in shots]
     pixels = [height * width for height, width in sizes]
     tile = tile_for(sum(pixels))
-    most_tiles = max(triton.cdiv(height, tile) * triton.cdiv(width, tile) for height, width in sizes)
+    tiling = Tiling(tile, [(width, height) for height, width in sizes])
     views, constants = view_parameters(shots, tile, gradients, means), splats.constants(shots)
     records, depths = means.new_empty(rows, RECORD), means.new_empty(rows)
     boxes = torch.empty(rows, 4, dtype=torch.int32, device=means.device)
@@ -132,8 +131,8 @@ def project(splats: KernelSplats, shots: Shots, *, gradients: bool = True) -> Pr
     for shot, keys in zip(shots, depths.view(len(shots), -1), strict=True):
         if shot.ranks is not None:
             keys.copy_(torch.where(keys < torch.inf, (shot.ranks + LEAST_NORMAL).view(keys.dtype), keys))
-    bins = bin_splats(records, depths, boxes, views, most_tiles, tile)
-    return Projected(shots, constants, tile, (most_tiles, len(shots)), max(pixels), views, records[bins.splat_ids], depths, bins)
+    fixed_order = gradients and torch.are_deterministic_algorithms_enabled()
+    return Projected(shots, constants, tile, max(pixels), views, depths, Lists(Splatted(records, depths, boxes, views), tiling, fixed_order))
 
 
 def draw(splats: KernelSplats, shots: Shots, *, gradients: bool = True) -> Drawing:
@@ -141,10 +140,11 @@ def draw(splats: KernelSplats, shots: Shots, *, gradients: bool = True) -> Drawi
     projected = project(splats, shots, gradients=gradients)
     pixels = projected.most_pixels
     images, transmittances = splats.means.new_empty(len(shots), pixels, 3), splats.means.new_empty(len(shots), pixels)
-    composite_kernel[projected.grid](
-        *projected.lists, projected.views, images, transmittances, pixels,
-        TILE=projected.tile, BATCH=BATCH, VIEWER=projected.viewer, num_warps=WARPS,
-    )  # fmt: skip
+    for part, lists in projected.parts():
+        composite_kernel[part.grid](
+            *lists, part.views, part.of(images), part.of(transmittances), pixels,
+            TILE=projected.tile, BATCH=BATCH, VIEWER=projected.viewer, num_warps=WARPS,
+        )  # fmt: skip
     return Drawing(projected, images, transmittances)
 
 
@@ -154,23 +154,29 @@ def rounded(drawing: Drawing) -> Tensor:
     if all(shot.effects.settings.picture_step is None for shot in projected.shots):
         return drawing.images
     images = drawing.images.clone()
-    arrays = *projected.lists, projected.views, images
-    round_kernel[projected.grid](*arrays, projected.most_pixels, TILE=projected.tile, BATCH=BATCH, num_warps=WARPS)
+    for part, lists in projected.parts():
+        arrays = *lists, part.views, part.of(images)
+        round_kernel[part.grid](*arrays, projected.most_pixels, TILE=projected.tile, BATCH=BATCH, num_warps=WARPS)
     return images
 
 
-def draw_back(drawing: Drawing, d_images: Tensor, d_alphas: Tensor, *, deterministic: bool) -> Tensor:
+def draw_back(drawing: Drawing, d_images: Tensor, d_alphas: Tensor) -> Tensor:
     """Gradients of the records [V · N, 9] from those of the images [V, pixels, 3] and alphas [V, pixels]."""
-    projected, bins = drawing.projected, drawing.projected.bins
-    d_records = projected.listed.new_zeros(len(projected.depths), RECORD)
-    target = d_records.new_zeros(len(bins.splat_ids), RECORD) if deterministic else d_records
-    composite_back_kernel[projected.grid](
-        *projected.lists, bins.splat_ids, bins.places, projected.views, drawing.images, drawing.transmittances, d_images, d_alphas, target,
-        projected.most_pixels,
-        TILE=projected.tile, BATCH=BACK_BATCH[projected.tile], DETERMINISTIC=deterministic, VIEWER=projected.viewer, num_warps=WARPS,
-    )  # fmt: skip
-    if deterministic and len(d_records):
-        gather_kernel[(len(d_records),)](target, bins.starts, bins.counts, d_records, ROWS=ROWS, num_warps=1)
+    projected = drawing.projected
+    d_records = projected.depths.new_zeros(len(projected.depths), RECORD)
+    for part, lists in projected.parts():
+        rows, owned = d_records[part.rows], part.bins.owned
+        target = rows if owned is None else rows.new_zeros(len(part.listed), RECORD)
+        places = part.bins.tile_offsets if owned is None else owned.places  # the first are not read
+        arrays = drawing.images, drawing.transmittances, d_images, d_alphas
+        composite_back_kernel[part.grid](
+            *lists, part.bins.splat_ids, places, part.views, *(part.of(array) for array in arrays), target, projected.most_pixels,
+            TILE=projected.tile, BATCH=BACK_BATCH[projected.tile], DETERMINISTIC=owned is not None, VIEWER=projected.viewer, num_warps=WARPS,
+        )  # fmt: skip
+        if owned is not None and len(rows):
+            sums = torch.empty_like(rows)
+            gather_kernel[(len(rows),)](target, owned.starts, owned.counts, sums, ROWS=ROWS, num_warps=1)
+            rows += sums
     return d_records
 
 
@@ -196,12 +202,14 @@ def project_back(splats: KernelSplats, projected: Projected, d_records: Tensor, 
 def weigh(splats: KernelSplats, shots: Shots) -> Tensor:
     """The sum of each splat's blend weights over each image, [V, N]."""
     projected, in_order = project(splats, shots, gradients=False), torch.are_deterministic_algorithms_enabled()
-    sums, splat_ids = torch.zeros_like(projected.depths), projected.bins.splat_ids
-    target = sums.new_zeros(len(splat_ids)) if in_order else sums
-    weigh_kernel[projected.grid](
-        *projected.lists, splat_ids, projected.views, target, projected.most_pixels,
-        TILE=projected.tile, BATCH=BATCH, DETERMINISTIC=in_order, VIEWER=projected.viewer, num_warps=WARPS,
-    )  # fmt: skip
-    if in_order:
-        sums.index_add_(0, splat_ids.long(), target)  # by torch, in a fixed order
+    sums = torch.zeros_like(projected.depths)
+    for part, lists in projected.parts():
+        rows, splat_ids = sums[part.rows], part.bins.splat_ids
+        target = rows.new_zeros(len(splat_ids)) if in_order else rows
+        weigh_kernel[part.grid](
+            *lists, splat_ids, part.views, target, projected.most_pixels,
+            TILE=projected.tile, BATCH=BATCH, DETERMINISTIC=in_order, VIEWER=projected.viewer, num_warps=WARPS,
+        )  # fmt: skip
+        if in_order:
+            rows.index_add_(0, splat_ids.long(), target)  # by torch, in a fixed order
     return sums.view(len(shots), len(splats.means))

@@ -57,8 +57,7 @@ class TritonStepper:
         drawn = self._drawn[number]
         d_alpha = torch.zeros_like(drawn.transmittances) if d_alphas is None else drawn.packed(d_alphas)
         with torch.cuda.device_of(d_alpha):
-            in_order = torch.are_deterministic_algorithms_enabled()
-            self._gradients[number] = draw_back(drawn, drawn.packed(d_images), d_alpha, deterministic=in_order)
+            self._gradients[number] = draw_back(drawn, drawn.packed(d_images), d_alpha)
 
     def step(self, step: AdamStep) -> None:
         if not self._gradients:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -29,8 +28,9 @@ from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import GOLDEN, choose_views, orbit_of
-from mipmap_plugin.backends.base import Backend
+from mipmap_plugin.backends.base import Backend, Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
+from mipmap_plugin.clock import now
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.gaussians import Gaussians
@@ -182,14 +182,15 @@ class LevelRun:
 
     def run(self, resume: Path | None) -> Adapted:
         """Make the level, or go on with the run that `resume` holds."""
-        began = time.perf_counter()
+        began = now(self.finest.means.device)
+        pixels = tuple(view.width * view.height for view in self.views)
         drawn_with = self.scene.target, self.scene.base.effects()
-        warm_up(self.scene.backend, self.finest, drawn_with, gradients=self.config.steps > 0, merging=True)
+        warm_up(self.scene.backend, self.finest, drawn_with, Calls(self.config.steps > 0, True, pixels=pixels))
         with announced(f"level {self.number}: merging"):
             student, name = self._start()
         initial, states, curve, ended_by, kept = student.copy(), {}, [], "0 steps", None
         states[f"the start, {name}"] = initial
-        self.seconds["total"] = time.perf_counter() - began
+        self.seconds["total"] = now(self.finest.means.device) - began
         if self.config.steps:
             task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, size=self.size)
             keeper = StateKeeper(resume, self._fingerprint())

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from time import perf_counter
 
 import torch
 from torch import Tensor
 
+from mipmap_plugin.clock import now
 from mipmap_plugin.limits import memory
 from mipmap_plugin.threads import for_views, side_by_side, side_by_side_now
 
@@ -48,10 +48,10 @@ class Memory:
         with self._asked.setdefault(time, threading.Lock()):  # other threads may ask for the same moment
             if (known := self._find(means, time)) is not None:
                 return known
-            began = perf_counter()
+            began = now(means.device)
             changes = self.evaluate(means, time)
             with self._lock:
-                self.seconds += (perf_counter() - began) / side_by_side_now()  # of several side by side the time that passed
+                self.seconds += (now(means.device) - began) / side_by_side_now()  # of several side by side the time that passed
                 self.evaluations += 1
                 self._keep(means, time, changes)
         return changes

@@ -1,0 +1,44 @@
+"""What is timed on a GPU is timed until the GPU has done it."""
+
+from __future__ import annotations
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.start.candidates import _Clock
+from mipmap_plugin.clock import now
+
+GPU = torch.device("cuda")
+
+
+@pytest.fixture
+def waited(monkeypatch):
+    """The devices that the host waited for."""
+    devices = []
+    monkeypatch.setattr(torch.cuda, "synchronize", devices.append)
+    return devices
+
+
+def test_nothing_is_waited_for_on_a_processor(waited):
+    assert now(None) <= now(torch.device("cpu")) and not waited
+    assert now(GPU) and waited == [GPU]
+
+
+def test_truths_and_checks_cost_until_the_gpu_has_made_them(waited):
+    costs, (first, second) = Costs(device=GPU), tiny.cameras(2)
+    costs.truth(first, lambda view: torch.zeros(1))
+    assert len(waited) == 2
+    costs.truth(first, lambda view: torch.zeros(1))  # it is known by now, so that no step waits for it
+    assert len(waited) == 2
+    costs.prepare([second], lambda views: None)
+    costs.check(lambda: None)
+    assert waited == [GPU] * 6
+
+
+def test_a_start_counts_the_work_of_a_gpu(waited):
+    clock = _Clock(100.0, GPU)
+    with clock.timing("weights"):
+        pass
+    assert clock.allows("weights") and waited == [GPU] * 4
