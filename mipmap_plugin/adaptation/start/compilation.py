@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.backends.base import AdamStep, Backend
 from mipmap_plugin.camera import Camera
@@ -20,7 +21,9 @@ CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 
 def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], *, gradients: bool, merging: bool, by_rows: bool = False) -> None:
-    """Let the backend compile what draws splats like these with all `effects`, and what their `gradients`, `merging` and steps `by_rows` need."""
+    """Let the backend compile what draws splats like these with all `effects`, and what their `gradients`, `merging` (with the closed form) and
+    steps `by_rows` need.
+    """
     few = gaussians[torch.arange(min(2, len(gaussians)))].detach()
     # The first with the usual settings, and the first with others, for which a backend may have kernels of their own.
     kinds = list({setting.settings == USUAL: setting for setting in reversed(effects)}.values())
@@ -29,6 +32,7 @@ def warm_up(backend: Backend, gaussians: Gaussians, effects: Sequence[Effects], 
         if merging and setting in kinds:  # here, because another process may be compiling the backward pass by now
             weights = blend_weights(few, [CAMERA], backend, setting)
             merge(few, torch.ones_like(weights), weights, fraction=0.5)
+            closed_form(few, [CAMERA], 0.5, effects[0], setting)
         if gradients and image.requires_grad and not (by_rows and hasattr(backend, "stepper")):
             image.sum().backward()
     if by_rows and gradients and hasattr(backend, "stepper"):
