@@ -118,6 +118,32 @@ def test_views_of_a_step_may_be_differentiated_in_any_order_and_thread():
     assert all(torch.equal(one, other) for one, other in zip(*(model.parameters().values() for model in models), strict=True))
 
 
+def test_the_views_of_a_step_are_projected_together(monkeypatch):
+    """By rows, whose thread moves them too."""
+    from mipmap_plugin.backends.cpu_kernels import drawing
+
+    counts, project = [], drawing.project
+    monkeypatch.setattr(drawing, "project", lambda splats, shots, **options: counts.append(len(shots)) or project(splats, shots, **options))
+    images = []
+
+    def compare(_, xs):
+        images.extend(xs)
+        return [(torch.zeros_like(x), torch.zeros(())) for x in xs]
+
+    rows = of(student())
+    rows.differentiate(VIEWS, 0, compare)
+    assert counts == [3] and all(map(torch.equal, images, draw(rows)))
+
+
+def test_a_view_that_was_projected_before_a_step_is_projected_again():
+    model = student()
+    rows = of(model)
+    rows.stepper.prepare(SHOTS)
+    rows.stepper.differentiate(0, torch.ones_like(rows.stepper.render(0, *SHOTS[0]).image))
+    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    assert all(map(torch.equal, draw(rows), draw(of(model))))
+
+
 @pytest.mark.parametrize("nesterov", [False, True])
 def test_the_kernel_of_a_step_against_float64(nesterov):
     """One splat parameter, several steps: the formulas of Kingma and Ba, and Nesterov's momentum."""

@@ -91,6 +91,8 @@ class SteppingRenderer:
             compared = compare(range(len(shots)), [drawn.image for drawn in stepper.render_all(shots)])
             stepper.differentiate_all([gradient for gradient, _ in compared])
             return [square_error for _, square_error in compared]
+        if hasattr(stepper, "prepare"):
+            stepper.prepare(shots)
         at_once = math.gcd(len(shots), threads.for_views())
         return list(side_by_side(lambda number: self.differentiate_one(stepper, number, shots[number], compare), range(len(shots)), at_once))
 

@@ -64,7 +64,7 @@ class CpuBackend:
         _drawing()  # reports what numba lacks
         from mipmap_plugin.backends.cpu_kernels.stepping import CpuStepper
 
-        return CpuStepper(raw, self._prepared)
+        return CpuStepper(raw, self._refuse, _ranks)
 
     def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         prepared = [self._prepared(gaussians, camera, effects) for camera, effects in shots]
@@ -85,12 +85,16 @@ class CpuBackend:
 
     def _prepared(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[tuple[Any, ...], Any]:
         """The tensors of the splats, packed as a viewer's file does, and their ranks, where they are sorted by buckets. Raises BackendUnavailable."""
-        if reasons := self.lacking(Needs.of(gaussians, effects, gradients=True)):
-            raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
+        self._refuse(gaussians, effects)
         packing = effects.settings.packing
         g = gaussians if packing is None else packed(gaussians, camera, packing)
         ranks = _ranks(gaussians, camera, effects.settings)
         return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), ranks
+
+    def _refuse(self, gaussians: Gaussians, effects: Effects) -> None:
+        """Raise BackendUnavailable for what it cannot draw."""
+        if reasons := self.lacking(Needs.of(gaussians, effects, gradients=True)):
+            raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
 
 
 def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[float, float]) -> tuple[Tensor, Tensor] | None:
