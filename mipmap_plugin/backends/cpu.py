@@ -114,9 +114,19 @@ def summed_areas(means: Tensor, shapes: Iterable[tuple[Tensor, float]], views: S
     """
     if not _has_kernels_for(means):
         return None
-    from mipmap_plugin.backends.cpu_kernels import areas
+    from mipmap_plugin.backends.cpu_kernels import looking
 
-    return torch.from_numpy(np.stack([areas.areas(_array(means), _array(axes), views, near, variance) for axes, variance in shapes]))
+    return torch.from_numpy(np.stack([looking.areas(_array(means), _array(axes), views, near, variance) for axes, variance in shapes]))
+
+
+def finest_pixels(means: Tensor, views: Sequence[Camera], near: float) -> tuple[Tensor, Tensor] | None:
+    """What `cpu_kernels.looking.finest` finds for float32 means; None on another device, or without numba."""
+    if not len(views) or not _has_kernels_for(means):
+        return None
+    from mipmap_plugin.backends.cpu_kernels import looking
+
+    sizes, seeing = looking.finest(_array(means), views, near)
+    return torch.from_numpy(sizes), torch.from_numpy(seeing)
 
 
 def _has_kernels_for(means: Tensor) -> bool:

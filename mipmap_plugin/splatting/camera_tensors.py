@@ -10,8 +10,8 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 
-# Where some quantities begin among the numbers of a camera.
-ROTATION, CENTER, FOCAL, FIRST, HALF = 0, 9, 12, 18, 20
+# Where each quantity begins among the numbers of a camera.
+ROTATION, CENTER, FOCAL, MIDDLE, SIZE, FIRST, HALF = 0, 9, 12, 14, 16, 18, 20
 
 
 @dataclass(frozen=True, eq=False)

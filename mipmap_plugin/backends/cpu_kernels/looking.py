@@ -1,4 +1,4 @@
-"""The areas of splats on several images, for the closed form. Torch would write and read two dozen tensors for each image."""
+"""What several views show of splats, for the closed form: their areas, and pixel sizes. Torch would write and read a dozen tensors for each view."""
 
 # numba redefines calls and operators.
 # mypy: ignore-errors
@@ -12,7 +12,7 @@ from mipmap_plugin.backends.cpu_kernels import inner, kernel
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.render_settings import FRUSTUM_MARGIN
-from mipmap_plugin.splatting.camera_tensors import CENTER, FIRST, FOCAL, HALF, ROTATION, numbers_of
+from mipmap_plugin.splatting.camera_tensors import CENTER, FIRST, FOCAL, HALF, MIDDLE, ROTATION, SIZE, numbers_of
 
 
 def areas(means: np.ndarray, axes: np.ndarray, views: Sequence[Camera], near: float, variance: float) -> np.ndarray:
@@ -20,9 +20,20 @@ def areas(means: np.ndarray, axes: np.ndarray, views: Sequence[Camera], near: fl
 
     axes: [N, 3, 3], as of `splatting.projection.axes_of`; variance (px²): what the image adds.
     """
-    cameras, sums = np.array([numbers_of(view) for view in views]), np.zeros(len(means))
-    team(len(means)).share(add_areas, len(means), means, axes, cameras, float(near), float(variance), sums, of_rows=True)
+    sums = np.zeros(len(means))
+    team(len(means)).share(add_areas, len(means), means, axes, _rows(views), float(near), float(variance), sums, of_rows=True)
     return sums
+
+
+def finest(means: np.ndarray, views: Sequence[Camera], near: float) -> tuple[np.ndarray, np.ndarray]:
+    """The size of a pixel at each mean in the closest view that sees it, [N] float32, infinity if none does; and how many views see it, [N]."""
+    sizes, seeing = np.full(len(means), np.inf, np.float32), np.zeros(len(means), np.float32)
+    team(len(means)).share(find_finest, len(means), means, _rows(views), float(near), sizes, seeing, of_rows=True)
+    return sizes, seeing
+
+
+def _rows(views: Sequence[Camera]) -> np.ndarray:
+    return np.array([numbers_of(view) for view in views])
 
 
 @kernel
@@ -72,3 +83,16 @@ def along(first, second, axes, i, k):
     """Axis k of a splat on the image, px."""
     x, y, z = axes[i, 0, k], axes[i, 1, k], axes[i, 2, k]
     return first[0] * x + first[1] * y + first[2] * z, second[0] * x + second[1] * y + second[2] * z
+
+
+@kernel
+def find_finest(start, stop, means, views, near, sizes, seeing):
+    """Fill start..stop of `finest`."""
+    for view in views:
+        per_focal = 1 / math.sqrt(view[FOCAL] * view[FOCAL + 1])
+        for i in range(start, stop):
+            x, y, z = to_camera(view, means, i)
+            u, v = view[FOCAL] * x + view[MIDDLE] * z, view[FOCAL + 1] * y + view[MIDDLE + 1] * z  # px, times z
+            if z > near and 0 < u < view[SIZE] * z and 0 < v < view[SIZE + 1] * z:
+                sizes[i] = min(sizes[i], np.float32(z * per_focal))
+                seeing[i] += 1
