@@ -121,7 +121,7 @@ def summed_areas(means: Tensor, shapes: Iterable[tuple[Tensor, float]], views: S
 
 def finest_pixels(means: Tensor, views: Sequence[Camera], near: float) -> tuple[Tensor, Tensor] | None:
     """What `cpu_kernels.looking.finest` finds for float32 means; None on another device, or without numba."""
-    if not len(views) or not _has_kernels_for(means):
+    if not views or not _has_kernels_for(means):
         return None
     from mipmap_plugin.backends.cpu_kernels import looking
 
