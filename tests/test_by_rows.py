@@ -6,6 +6,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.renderers import SteppingRenderer
@@ -118,7 +119,8 @@ def test_views_of_a_step_may_be_differentiated_in_any_order_and_thread():
     assert all(torch.equal(one, other) for one, other in zip(*(model.parameters().values() for model in models), strict=True))
 
 
-def test_the_views_of_a_step_are_projected_together(monkeypatch):
+@pytest.mark.parametrize(("count", "calls"), [(1, [1, 1, 1]), (3, [3])])
+def test_threads_project_all_views_of_a_step_together(count, calls, monkeypatch):
     """By rows, whose thread moves them too."""
     from mipmap_plugin.backends.cpu_kernels import drawing
 
@@ -131,8 +133,10 @@ def test_the_views_of_a_step_are_projected_together(monkeypatch):
         return [(torch.zeros_like(x), torch.zeros(())) for x in xs]
 
     rows = of(student())
-    rows.differentiate(VIEWS, 0, compare)
-    assert counts == [3] and all(map(torch.equal, images, draw(rows)))
+    with threads.limited(count, shared=True):
+        rows.differentiate(VIEWS, 0, compare)
+    assert counts == calls
+    assert sorted(float(image.sum()) for image in images) == sorted(float(image.sum()) for image in draw(rows))
 
 
 def test_a_view_that_was_projected_before_a_step_is_projected_again():
