@@ -23,6 +23,11 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
+def leave_loaded() -> None:
+    """Pass over all objects that there are now in later collections. For commands, once libraries are imported: to look at torch's takes 0.1 s."""
+    gc.freeze()
+
+
 def leave_at_exit() -> None:
     """Leave all objects to the system when this process ends. For commands: looking for cycles among those of torch takes 0.2 s."""
     atexit.unregister(gc.freeze)

@@ -6,6 +6,7 @@ import pytest
 import tiny
 import torch
 
+from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.renderers import SteppingRenderer
@@ -116,6 +117,35 @@ def test_views_of_a_step_may_be_differentiated_in_any_order_and_thread():
         list(side_by_side(one, order, 3))
         rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
     assert all(torch.equal(one, other) for one, other in zip(*(model.parameters().values() for model in models), strict=True))
+
+
+@pytest.mark.parametrize(("count", "calls"), [(1, [1, 1, 1]), (3, [3])])
+def test_threads_project_all_views_of_a_step_together(count, calls, monkeypatch):
+    """By rows, whose thread moves them too."""
+    from mipmap_plugin.backends.cpu_kernels import drawing
+
+    counts, project = [], drawing.project
+    monkeypatch.setattr(drawing, "project", lambda splats, shots, **options: counts.append(len(shots)) or project(splats, shots, **options))
+    images = []
+
+    def compare(_, xs):
+        images.extend(xs)
+        return [(torch.zeros_like(x), torch.zeros(())) for x in xs]
+
+    rows = of(student())
+    with threads.limited(count, shared=True):
+        rows.differentiate(VIEWS, 0, compare)
+    assert counts == calls
+    assert sorted(float(image.sum()) for image in images) == sorted(float(image.sum()) for image in draw(rows))
+
+
+def test_a_view_that_was_projected_before_a_step_is_projected_again():
+    model = student()
+    rows = of(model)
+    rows.stepper.prepare(SHOTS)
+    rows.stepper.differentiate(0, torch.ones_like(rows.stepper.render(0, *SHOTS[0]).image))
+    rows.step(make_optimizer(model, recipe("default", 1 / 4), pixel=0.1))
+    assert all(map(torch.equal, draw(rows), draw(of(model))))
 
 
 @pytest.mark.parametrize("nesterov", [False, True])

@@ -1,5 +1,6 @@
 """The start without optimization: exact for one splat that faces the camera, sane for everything else."""
 
+import importlib.util
 import math
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from mipmap_plugin import threads
 from mipmap_plugin.adaptation.start.closed_form import CULL_MARGIN, MIN_AXIS, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.surfel_form import visible_area
 from mipmap_plugin.adaptation.target.resize import resize
+from mipmap_plugin.backends.cpu import summed_areas
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import DILATION, SURFEL, Effects
@@ -19,7 +21,10 @@ from mipmap_plugin.splatting.filters import compensates, footprint
 from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.viewers import find_viewer
 
+needs_numba = pytest.mark.skipif(not importlib.util.find_spec("numba"), reason="numba is not installed")
+
 BACKEND = ReferenceBackend()
+CLOSED_FORM_AREAS = "mipmap_plugin.adaptation.start.closed_form.summed_areas"
 DEPTH, FOCAL = 4.0, 40.0
 PIXEL = DEPTH / FOCAL  # world units
 BASE_WIDTH = {"classic": 0.3, "antialiased": 0.3, "mip": 0.1}  # px²
@@ -236,8 +241,9 @@ def test_a_splat_that_a_viewer_would_cull_is_seen():
     assert shown[0] == 0 and shown[1] > 0.01
 
 
-def test_parts_that_threads_share_make_the_same_whole(monkeypatch):
-    g, views = samples.gaussians(70), [samples.camera()]
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_parts_that_threads_share_make_the_same_whole(dtype, monkeypatch):
+    g, views = samples.gaussians(70, dtype=dtype), [samples.camera()]
     whole = closed_form(g, views, 1 / 4, Effects(1), Effects(1))
     monkeypatch.setattr("mipmap_plugin.adaptation.parallel.CHUNK", 16)
     with threads.limited(3, shared=True):
@@ -251,6 +257,19 @@ def test_opacities_follow_the_views_in_which_a_splat_is_large():
     away[2, 3] = 50 * DEPTH
     alone, among = (closed_form(disc(20, 20), views, 1 / 4, Effects(0), Effects(0))[1] for views in ([VIEW], [VIEW, VIEW.looking_from(away, "away")]))
     torch.testing.assert_close(among, alone, rtol=0.05, atol=0)
+
+
+@needs_numba
+@pytest.mark.parametrize("scale", [1 / 4, 2])
+def test_compiled_areas_are_those_of_torch(scale, monkeypatch):
+    """Of splats beside the pictures and behind them too."""
+    g, views = samples.gaussians(300, dtype=torch.float32), [samples.camera(), VIEW]
+    found = []
+    monkeypatch.setattr(CLOSED_FORM_AREAS, lambda *arguments: found.append(summed_areas(*arguments)) or found[-1])
+    compiled = closed_form(g, views, scale, Effects(1), Effects(1))
+    monkeypatch.setattr(CLOSED_FORM_AREAS, lambda *_: None)
+    torch.testing.assert_close(closed_form(g, views, scale, Effects(1), Effects(1)), compiled, rtol=1e-5, atol=0)
+    assert found[0].shape == (2, 300)
 
 
 def test_an_area_beyond_the_type_leaves_the_opacity_as_it_is():

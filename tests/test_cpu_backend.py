@@ -298,6 +298,14 @@ def test_chunks_of_several_jobs_shrink_and_few_rows_are_not_cut():
 
 
 @needs_numba
+def test_a_few_rows_more_are_no_chunk_of_their_own():
+    from mipmap_plugin.backends.cpu_kernels.threads import Team
+
+    assert list(Team(2)._ranges(1, [8300], least=4096)) == [(0, 4150, 8300)]
+    assert [stop - start for _, start, stop in Team(1)._ranges(0, [8300], least=4096)] == [4150, 4150]
+
+
+@needs_numba
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_forked_process_draws_with_threads_of_its_own(threads_for_any_work):
     torch.set_num_threads(2)

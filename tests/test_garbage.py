@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+import tiny
 
 from mipmap_plugin.garbage import uncollected
 
@@ -38,3 +39,19 @@ main(["backends", "--check", "no-such"])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split()[-1] == "True"
+
+
+def test_what_a_command_imports_is_imported_without_collections_and_passed_over_later(tmp_path):
+    code = f"""
+import gc
+collections = []
+gc.callbacks.append(lambda phase, info: collections.append(info["generation"]))
+from mipmap_plugin.commands.common import wrap
+from pathlib import Path
+gc.collect()
+collections.clear()
+wrap(Path({str(tiny.folder(tmp_path / 'base', tiny.cameras()))!r}), None, None, "auto", None, 1)
+print(len(collections), gc.get_freeze_count() > 100_000)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["0", "True"]

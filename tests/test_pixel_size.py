@@ -1,5 +1,6 @@
 """The size of a pixel at a splat: in the closest view of it, in the mean of its views, and how many of these are looked at."""
 
+import importlib.util
 import math
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import torch
 
 from mipmap_plugin.adaptation.start import pixel_size as module
 from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, MOST_VIEWS, SEEN, enough_views, mean_pixel_size, pixel_size, views_for
+from mipmap_plugin.backends.cpu import finest_pixels
 from mipmap_plugin.camera import Camera
 
 FOCAL = 40.0
@@ -27,6 +29,18 @@ def test_a_pixel_is_the_depth_over_the_focal_length():
 def test_a_pixel_is_that_of_the_closest_view_that_sees_the_splat():
     means = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 1.0], [30.0, 0.0, 4.0]])  # both see it; only the first does; none does
     torch.testing.assert_close(pixel_size(means, [VIEW, CLOSER]), torch.tensor([2.0, 1.0, math.hypot(30, 2)]) / FOCAL)
+
+
+@pytest.mark.skipif(not importlib.util.find_spec("numba"), reason="numba is not installed")
+@pytest.mark.parametrize("near", [0.0, 3.0])
+def test_compiled_code_finds_what_torch_finds(near, monkeypatch):
+    """Of means behind cameras and beside their pictures too."""
+    means = 6 * torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
+    views, found = [VIEW, CLOSER, AWAY], finest_pixels(means, [VIEW, CLOSER, AWAY], near)
+    monkeypatch.setattr(module, "finest_pixels", lambda *_: None)
+    sizes, seeing = module._finest(means, views, near)
+    assert torch.equal(seeing, found[1]) and 0 < seeing.count_nonzero() < 500
+    torch.testing.assert_close(sizes, found[0], rtol=1e-6, atol=0)
 
 
 def test_a_pixel_has_a_size_in_the_plane_of_the_camera_too():

@@ -14,8 +14,9 @@ from mipmap_plugin.splatting.camera_tensors import CameraTensors
 
 Result = TypeVar("Result")
 
-# Rows that a processor computes together, in bounded memory.
-CHUNK = 1 << 14
+# Rows of a thread's chunk on a processor, so few that all threads have some of a small scene's; and rows times views that one computes together,
+# in bounded memory: more operations on fewer take longer.
+CHUNK, ROWS_IN_CACHE = 1 << 12, 1 << 14
 
 # Rows times views that are computed together elsewhere, and pixels of views that are drawn together: each takes up to half a kilobyte.
 ROWS_OF_VIEWS = 1 << 21
@@ -68,7 +69,7 @@ def in_chunks(function: Callable[[slice], Result], rows: Tensor) -> list[Result]
 
 def in_batches(views: Sequence[Camera], rows: Tensor) -> Iterator[CameraTensors]:
     """All views, as many at a time as look at the `rows` together: a processor's caches hold few, and a GPU waits for each operation."""
-    most = CHUNK if rows.device.type == "cpu" else ROWS_OF_VIEWS
+    most = ROWS_IN_CACHE if rows.device.type == "cpu" else ROWS_OF_VIEWS
     count = max(1, most // max(1, len(rows)))
     for start in range(0, len(views), count):
         yield CameraTensors.of(views[start : start + count], rows)

@@ -92,6 +92,8 @@ class SteppingRenderer:
             stepper.differentiate_all([gradient for gradient, _ in compared])
             return [square_error for _, square_error in compared]
         at_once = math.gcd(len(shots), threads.for_views())
+        if at_once > 1 and hasattr(stepper, "prepare"):  # one thread would only lose from its cache what it needs next
+            stepper.prepare(shots)
         return list(side_by_side(lambda number: self.differentiate_one(stepper, number, shots[number], compare), range(len(shots)), at_once))
 
     def differentiate_one(self, stepper: Stepper, number: int, shot: tuple[Camera, Effects], compare: Comparison) -> Tensor:

@@ -201,7 +201,8 @@ class Stepper(Protocol):
     """Draws splats of 3DGS and moves them, by their raw parameters, which only it changes.
 
     Optional: `render_all(shots) -> list[Rendered]` and `differentiate_all(d_images)` draw and differentiate all views of a step, each with effects
-    of its own, in one call each.
+    of its own, in one call each. Or `prepare(shots)`, called before several threads may each render one of these views: what threads divide better
+    by splats than by views.
     """
 
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -63,7 +64,7 @@ class CpuBackend:
         _drawing()  # reports what numba lacks
         from mipmap_plugin.backends.cpu_kernels.stepping import CpuStepper
 
-        return CpuStepper(raw, self._prepared)
+        return CpuStepper(raw, self._refuse, _ranks)
 
     def _drawn(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         prepared = [self._prepared(gaussians, camera, effects) for camera, effects in shots]
@@ -84,24 +85,59 @@ class CpuBackend:
 
     def _prepared(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> tuple[tuple[Any, ...], Any]:
         """The tensors of the splats, packed as a viewer's file does, and their ranks, where they are sorted by buckets. Raises BackendUnavailable."""
-        if reasons := self.lacking(Needs.of(gaussians, effects, gradients=True)):
-            raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
+        self._refuse(gaussians, effects)
         packing = effects.settings.packing
         g = gaussians if packing is None else packed(gaussians, camera, packing)
         ranks = _ranks(gaussians, camera, effects.settings)
         return (g.means, g.quats, g.scales, g.opacities, g.sh, g.covariances), ranks
 
+    def _refuse(self, gaussians: Gaussians, effects: Effects) -> None:
+        """Raise BackendUnavailable for what it cannot draw."""
+        if reasons := self.lacking(Needs.of(gaussians, effects, gradients=True)):
+            raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
+
 
 def nearest_along(means: Tensor, *further: Tensor, reach: int, limits: tuple[float, float]) -> tuple[Tensor, Tensor] | None:
     """What `cpu_kernels.pairing.nearest_along` finds for float32 splats along a curve; None on another device, or without numba."""
-    if means.device.type != "cpu" or means.dtype != torch.float32 or not importlib.util.find_spec("numba"):
+    if not _has_kernels_for(means):
         return None
-    _drawing()  # reports what numba lacks
     from mipmap_plugin.backends.cpu_kernels import pairing
 
-    arrays = tuple(tensor.contiguous().numpy() for tensor in (means, *further))
-    nearest, least = pairing.nearest_along(arrays, reach, *limits)
+    nearest, least = pairing.nearest_along(tuple(map(_array, (means, *further))), reach, *limits)
     return torch.from_numpy(nearest), torch.from_numpy(least)
+
+
+def summed_areas(means: Tensor, shapes: Iterable[tuple[Tensor, float]], views: Sequence[Camera], near: float) -> Tensor | None:
+    """The area (px² / π) of each float32 splat, for each of the `shapes`, summed over the views that it lies in front of: [shapes, N] float64.
+
+    A shape is the `axes_of` all splats, and the variance (px²) that the image adds. None on another device, or without numba.
+    """
+    if not _has_kernels_for(means):
+        return None
+    from mipmap_plugin.backends.cpu_kernels import looking
+
+    return torch.from_numpy(np.stack([looking.areas(_array(means), _array(axes), views, near, variance) for axes, variance in shapes]))
+
+
+def finest_pixels(means: Tensor, views: Sequence[Camera], near: float) -> tuple[Tensor, Tensor] | None:
+    """What `cpu_kernels.looking.finest` finds for float32 means; None on another device, or without numba."""
+    if not views or not _has_kernels_for(means):
+        return None
+    from mipmap_plugin.backends.cpu_kernels import looking
+
+    sizes, seeing = looking.finest(_array(means), views, near)
+    return torch.from_numpy(sizes), torch.from_numpy(seeing)
+
+
+def _has_kernels_for(means: Tensor) -> bool:
+    if means.device.type != "cpu" or means.dtype != torch.float32 or not importlib.util.find_spec("numba"):
+        return False
+    _drawing()  # reports what numba lacks
+    return True
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
 
 
 def _ranks(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> Any:
@@ -112,8 +148,7 @@ def _ranks(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> An
     _drawing()  # reports what numba lacks
     from mipmap_plugin.backends.cpu_kernels import bucketing
 
-    means, scales = (tensor.detach().contiguous().numpy() for tensor in (gaussians.means, gaussians.scales))
-    return bucketing.ranks(means, scales, camera)
+    return bucketing.ranks(_array(gaussians.means), _array(gaussians.scales), camera)
 
 
 def _drawing() -> ModuleType:

@@ -102,8 +102,8 @@ class _GuardedStepper:
         self._title, self._theirs = title, theirs
 
     def __getattr__(self, name: str) -> Any:
-        """What it may have beside: `render_all` and `differentiate_all`."""
-        if name not in ("render_all", "differentiate_all"):
+        """What it may have beside: `prepare`, or `render_all` and `differentiate_all`."""
+        if name not in ("prepare", "render_all", "differentiate_all"):
             raise AttributeError(name)
         return partial(self._named, getattr(self._theirs, name))
 

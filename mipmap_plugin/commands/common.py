@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from mipmap_plugin.commands.types import Background, ScreenFilter
 from mipmap_plugin.commands.voice import put, say
 from mipmap_plugin.formats.atomic import json_text
+from mipmap_plugin.garbage import leave_loaded, uncollected
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -37,11 +38,13 @@ def wrap(
     threads: int | None = None,
 ) -> Wrapped:  # fmt: skip
     from mipmap_plugin.jobs.base import Base
-    from mipmap_plugin.threads import limit_torch
 
-    with announced(f"reading {checkpoint.name}"):
+    with announced(f"reading {checkpoint.name}"), uncollected():
         wrapped = Base(checkpoint, cameras, background, backend, screen_filter).load(threads)
+        leave_loaded()
         if threads is not None:
+            from mipmap_plugin.threads import limit_torch  # here, for it imports torch
+
             limit_torch(threads)  # also for what is measured: on a busy machine small images take many times as long on torch's threads
         return wrapped
 

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from mipmap_plugin.camera import Camera
 
+# Where each quantity begins among the numbers of a camera.
+ROTATION, CENTER, FOCAL, MIDDLE, SIZE, FIRST, HALF = 0, 9, 12, 14, 16, 18, 20
+
 
 @dataclass(frozen=True, eq=False)
 class CameraTensors:
@@ -26,7 +29,7 @@ class CameraTensors:
     @classmethod
     def of(cls, cameras: Camera | Sequence[Camera], like: Tensor) -> CameraTensors:
         """One camera or several, in a single copy to the device and the dtype of `like`."""
-        rows = _numbers(cameras) if isinstance(cameras, Camera) else [_numbers(camera) for camera in cameras]
+        rows = numbers_of(cameras) if isinstance(cameras, Camera) else [numbers_of(camera) for camera in cameras]
         numbers = torch.tensor(rows, dtype=like.dtype).to(like.device, non_blocking=True)
         rotation, *pairs = numbers.split([9, 3, 2, 2, 2, 2, 2], dim=-1)
         return cls(rotation.unflatten(-1, (3, 3)), *(pair.unsqueeze(-2) for pair in pairs))
@@ -49,7 +52,7 @@ class CameraTensors:
         return inside
 
 
-def _numbers(camera: Camera) -> list[float]:
+def numbers_of(camera: Camera) -> list[float]:
     """The numbers of `CameraTensors`, in the order of its fields."""
     half = camera.width / camera.fx / 2, camera.height / camera.fy / 2
     return [

@@ -22,5 +22,5 @@ def gradient_of(difference: Tensor, loss: str) -> tuple[Tensor, Tensor]:
         return difference.sign() / count, square_error
     if loss == "l2":
         return difference * (2 / count), square_error
-    weight = 2 / count / (square_error + INVISIBLE_ERROR)
-    return difference * weight[..., None, None, None], square_error
+    divisor = (square_error + INVISIBLE_ERROR) * (count / 2)
+    return difference / divisor.view(*divisor.shape, 1, 1, 1), square_error

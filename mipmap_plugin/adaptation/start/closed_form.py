@@ -41,6 +41,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.parallel import in_batches, in_chunks
 from mipmap_plugin.adaptation.start.pixel_size import enough_views, mean_pixel_size, pixel_size
 from mipmap_plugin.adaptation.start.surfel_form import visible_area, widened_for_slant, widened_to_filter
+from mipmap_plugin.backends.cpu import summed_areas
 from mipmap_plugin.camera import Camera, every_nth
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -188,15 +189,16 @@ def _area_ratio(old: Gaussians, new: Gaussians, views: Sequence[Camera], scale: 
     splat away from the close one.
     """
     base, target = effects
-    new_axes = axes_of(new.quats, new.scales)
+    zoomed, variances = [view.zoomed(scale) for view in views], (filter_variance(base) * scale**2, filter_variance(target))
+    axes = [axes_of(each.quats, each.scales) for each in (old, new)]
 
     def areas(_: CameraTensors, projected: Projected) -> Tensor:
-        new_projected = projected.with_axes(new_axes) if new.covariances is None else projected
-        dets = _det(projected, filter_variance(base) * scale**2), _det(new_projected, filter_variance(target))
-        return torch.stack(dets).sqrt()
+        new_projected = projected.with_axes(axes[1]) if new.covariances is None else projected
+        return torch.stack([_det(projected, variances[0]), _det(new_projected, variances[1])]).sqrt()
 
-    before, after = _mean_in_front(old, [view.zoomed(scale) for view in views], base.near_plane, areas)
-    ratio = before / after
+    known = summed_areas(old.means, zip(axes, variances, strict=True), zoomed, base.near_plane) if old.covariances is None else None
+    before, after = _mean_in_front(old, zoomed, base.near_plane, areas) if known is None else known
+    ratio = (before / after).to(old.opacities)
     return torch.where(ratio.isfinite(), ratio, 1.0).clamp_max(limit)  # areas beyond the type's range: the splat keeps its opacity
 
 

@@ -10,6 +10,7 @@ import torch
 
 from mipmap_plugin.adaptation.parallel import views_at_once
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.backends.base import AdamStep, Calls
 from mipmap_plugin.camera import Camera
@@ -21,7 +22,7 @@ CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 
 def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
-    """Let the backend compile what draws splats like these with all `effects` in such calls."""
+    """Let the backend compile what draws splats like these with all `effects` in such calls; merging calls the closed form too."""
     few = gaussians[torch.arange(min(2, len(gaussians)))].detach()
     if hasattr(backend, "compile_ahead"):
         backend.compile_ahead(few, effects, calls)
@@ -33,6 +34,7 @@ def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], call
         if calls.merging and setting in kinds:  # here, because another process may be compiling the backward pass by now
             weights = blend_weights(few, [CAMERA], backend, setting)
             merge(few, torch.ones_like(weights), weights, fraction=0.5)
+            closed_form(few, [CAMERA], 0.5, effects[0], setting)
         if calls.gradients and image.requires_grad and not steps:
             image.sum().backward()
     if steps and calls.gradients:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.parallel import in_batches, in_chunks
+from mipmap_plugin.backends.cpu import finest_pixels
 from mipmap_plugin.camera import Camera, every_nth
 
 # Number of views from which the area and the blend weight of a splat are computed: doubled, up to a limit, until a splat is in SEEN of them on
@@ -94,6 +95,8 @@ def _closest_of(means: Tensor, views: Sequence[Camera], count: int | None = None
 
 def _finest(means: Tensor, views: Sequence[Camera], near: float = 0.0) -> tuple[Tensor, Tensor]:
     """The size of a pixel at each mean in the closest view that sees it, [N], infinity if none does; and the number of views that see it, [N]."""
+    if (known := finest_pixels(means, views, near)) is not None:
+        return known
 
     def of_chunk(chunk: slice) -> tuple[Tensor, Tensor]:
         finest, seeing = torch.full_like(means[chunk, 0], torch.inf), torch.zeros_like(means[chunk, 0])

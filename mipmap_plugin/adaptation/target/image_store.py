@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from functools import cache
 from typing import Any
 
 import torch
@@ -26,7 +27,13 @@ def in_16_bits(image: Tensor) -> Tensor:
 
 def from_16_bits(stored: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
     """An image that was stored, of floats or whole numbers."""
-    return stored / torch.tensor(STEPS, dtype=dtype)  # on the processor: a number to a GPU, whose type the image gets in the same operation
+    return stored / _steps(dtype)
+
+
+@cache
+def _steps(dtype: torch.dtype) -> Tensor:
+    """STEPS on the processor: a number to a GPU, whose type the image gets in the same operation."""
+    return torch.tensor(STEPS, dtype=dtype)
 
 
 class ImageStore:

@@ -86,5 +86,6 @@ def _rates(step: AdamStep, bands: int) -> SplatArrays:
     """The rate of each number in 16 rows, for each parameter: kernels move 16 numbers at a time, wherever a row ends."""
     columns = {"means": 3, "quats": 4, "scales": 3, "opacities": 1}
     rates = {name: np.full(WIDTH * size, step.rates[name], np.float32) for name, size in columns.items()}
-    sh = [step.rates["sh0"]] * 3 + [step.rates["shN"]] * 3 * (bands - 1)
-    return SplatArrays(**rates, sh=np.tile(np.array(sh, np.float32), WIDTH), covariances=np.empty(0, np.float32))
+    sh = np.full((WIDTH, bands, 3), step.rates["shN"], np.float32)
+    sh[:, 0] = step.rates["sh0"]
+    return SplatArrays(**rates, sh=sh.ravel(), covariances=np.empty(0, np.float32))

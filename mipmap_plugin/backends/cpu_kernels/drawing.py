@@ -47,26 +47,47 @@ class Drawing(NamedTuple):
     alpha: np.ndarray  # [H, W]
 
 
+class Projection(NamedTuple):
+    """A view whose splats are projected."""
+
+    shot: Shot
+    view: View
+    flags: Flags
+    splats: sorting.Projected
+
+
 def draw(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = True) -> list[Drawing]:
     """Draw several views of the same splats. gradients: whether `draw_back` will be called."""
+    return draw_projected(project(splats, shots, gradients=gradients))
+
+
+def project(splats: SplatArrays, shots: Sequence[Shot], *, gradients: bool = True) -> list[Projection]:
+    """The first part of `draw`: what each view shows of each splat."""
     count = len(splats.means)
-    threads = team(sum(count + shot.camera.width * shot.camera.height for shot in shots))
     views = [view_of(shot.camera, shot.effects, splats, gradients) for shot in shots]
-    flags = [flags_of(view, splats) for view in views]
     projected = [sorting.Projected.of(count, shot.camera.size) for shot in shots]
-    jobs = [(count, (own, view, splats, *of.arrays)) for own, view, of in zip(flags, views, projected, strict=True)]
-    threads.share_all(projection.project, jobs, of_rows=True)
+    jobs = [(count, (flags, view, splats, *of.arrays)) for (view, flags), of in zip(views, projected, strict=True)]
+    _team_for(projected).share_all(projection.project, jobs, of_rows=True)
     projected = [of if shot.ranks is None else of._replace(order=shot.ranks) for shot, of in zip(shots, projected, strict=True)]
-    drawings = [
-        _blank(shot, view, own, of, lists)
-        for shot, view, own, of, lists in zip(shots, views, flags, projected, sorting.tile_lists(projected, threads), strict=True)
-    ]
+    return [Projection(shot, view, flags, of) for shot, (view, flags), of in zip(shots, views, projected, strict=True)]
+
+
+def draw_projected(projections: Sequence[Projection]) -> list[Drawing]:
+    """The rest of `draw`."""
+    projected = [each.splats for each in projections]
+    threads = _team_for(projected)
+    drawings = [_blank(each, lists) for each, lists in zip(projections, sorting.tile_lists(projected, threads), strict=True)]
     _composite(drawings, threads)
     return drawings
 
 
-def _blank(shot: Shot, view: View, flags: Flags, of: sorting.Projected, lists: Lists) -> Drawing:
+def _team_for(projected: Sequence[sorting.Projected]) -> Team:
+    return team(sum(len(of.table) + of.size[0] * of.size[1] for of in projected))
+
+
+def _blank(projected: Projection, lists: Lists) -> Drawing:
     """A view whose picture is not drawn yet."""
+    shot, view, flags, of = projected
     (height, width), settings = of.size, shot.effects.settings
     frame = Frame(np.array(shot.effects.background, np.float32), empty(height, width), empty(height, width))
     limits = Limits(settings.max_alpha, settings.min_transmittance, settings.picture_step or 0.0)
@@ -139,27 +160,27 @@ def add_views(start: int, stop: int, splats: SplatArrays, views: Sequence[tuple[
         projection_back.project_back(start, stop, drawn.flags, drawn.view, splats, drawn.table, drawn.lists.firsts, table, grads)
 
 
-def flags_of(view: View, splats: SplatArrays) -> Flags:
-    """What kernels are compiled with."""
+def view_of(camera: Camera, effects: Effects, splats: SplatArrays, gradients: bool) -> tuple[View, Flags]:
+    """The camera, effects and settings as kernels need them, and what these are compiled with."""
+    return _view_of(camera, effects, splats.sh.shape[1], len(splats.covariances) > 0, gradients)
+
+
+@lru_cache(maxsize=1024)
+def _view_of(camera: Camera, effects: Effects, bands: int, covariances: bool, gradients: bool) -> tuple[View, Flags]:
+    """`view_of` for such splats: an adaptation draws the same views again and again, and this takes as long as 1000 splats."""
+    view = _made(camera, effects, math.isqrt(bands) - 1, gradients)
     on = dict(
-        covariances=len(splats.covariances) > 0,
+        covariances=covariances,
         integrated=view.sampling != AT_CENTER,
         reshaped=view.culls or view.max_variance < math.inf,
         faded=view.w_end > 0,
         fourth=view.sh_degree > 3,
-        third=view.sh_degree == 3 and splats.sh.shape[1] == BANDS,
+        third=view.sh_degree == 3 and bands == BANDS,
     )
-    return Flags(**{name: True if is_on else None for name, is_on in on.items()})
+    return view, Flags(**{name: True if is_on else None for name, is_on in on.items()})
 
 
-def view_of(camera: Camera, effects: Effects, splats: SplatArrays, gradients: bool) -> View:
-    """The camera, effects and settings as kernels need them."""
-    return _view_of(camera, effects, math.isqrt(splats.sh.shape[1]) - 1, gradients)
-
-
-@lru_cache(maxsize=1024)
-def _view_of(camera: Camera, effects: Effects, sh_degree: int, gradients: bool) -> View:
-    """`view_of` for splats of this degree: an adaptation draws the same views again and again, and this takes as long as 1000 splats."""
+def _made(camera: Camera, effects: Effects, sh_degree: int, gradients: bool) -> View:
     settings = effects.settings
     left, right = camera.cx / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = camera.cy / camera.fy, (camera.height - camera.cy) / camera.fy

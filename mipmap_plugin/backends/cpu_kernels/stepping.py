@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,25 +15,42 @@ from mipmap_plugin.backends.cpu_kernels.records import SplatArrays
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.render_settings import RenderSettings
 
-# Splats, a camera and effects -> the splats' tensors as drawn, and their ranks; it raises BackendUnavailable.
-Prepare = Callable[[Gaussians, Camera, Effects], tuple[tuple[Any, ...], Any]]
+# Splats and effects -> BackendUnavailable, if they cannot be drawn.
+Refuse = Callable[[Gaussians, Effects], None]
+
+# Splats, a camera and settings -> the splats' ranks, by which they are sorted; None where that is by their depths.
+Ranks = Callable[[Gaussians, Camera, RenderSettings], Any]
 
 
 class CpuStepper:
     """See `base.Stepper`. It keeps the activated splats from step to step: the kernel that moves a row activates it anew."""
 
-    def __init__(self, raw: Mapping[str, Tensor], prepare: Prepare) -> None:
-        activated, self._prepare = descending.activated(raw), prepare
+    def __init__(self, raw: Mapping[str, Tensor], refuse: Refuse, ranks: Ranks) -> None:
+        activated, self._refuse, self._ranks = descending.activated(raw), refuse, ranks
         self._gaussians = Gaussians(**{name: torch.from_numpy(array) for name, array in activated.items()})
         self._splats = SplatArrays(**activated, covariances=np.empty((0, 3, 3), np.float32))
-        self._drawn: dict[int, drawing.Drawing] = {}  # the views of a step, by their numbers
+        self._known: set[Effects] = set()  # that were not refused
+        self._projected: dict[tuple[int, Camera], drawing.Projection] = {}  # the views of a step, by their numbers
+        self._drawn: dict[int, drawing.Drawing] = {}  # and what is drawn of them
         self._tables: dict[int, np.ndarray] = {}  # and their gradient tables
 
+    def prepare(self, shots: Sequence[tuple[Camera, Effects]]) -> None:
+        """Project the splats into all views: each thread those that it will move, for what another core writes takes long to read."""
+        projected = drawing.project(self._splats, [self._shot(*shot) for shot in shots])
+        self._projected = {(number, each.shot.camera): each for number, each in enumerate(projected)}
+
+    def _shot(self, camera: Camera, effects: Effects) -> drawing.Shot:
+        if effects not in self._known:
+            self._refuse(self._gaussians, effects)
+            ahead.start(False, effects)  # the backward pass is compiled while the forward pass is
+            self._known.add(effects)
+        return drawing.Shot(camera, effects, self._ranks(self._gaussians, camera, effects.settings))
+
     def render(self, number: int, camera: Camera, effects: Effects) -> Rendered:
-        _, ranks = self._prepare(self._gaussians, camera, effects)
-        ahead.start(False, effects)  # the backward pass is compiled while the forward pass is
-        [drawn] = drawing.draw(self._splats, [drawing.Shot(camera, effects, ranks)])
+        projected = self._projected.pop((number, camera), None)
+        [drawn] = drawing.draw(self._splats, [self._shot(camera, effects)]) if projected is None else drawing.draw_projected([projected])
         ahead.wait(False, effects)
         self._drawn[number] = drawn
         return Rendered(torch.from_numpy(drawn.image), torch.from_numpy(drawn.alpha))
@@ -47,6 +64,7 @@ class CpuStepper:
         if not self._tables:
             raise RuntimeError("a step needs the gradient of an image; call differentiate() first")
         views = [(self._drawn[number], self._tables[number]) for number in sorted(self._tables)]
+        self._projected.clear()
         self._drawn.clear()
         self._tables.clear()
         descending.descend(self._splats, views, step)

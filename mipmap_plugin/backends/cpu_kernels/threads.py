@@ -63,7 +63,8 @@ class Team:
         min_chunk = max(least, int(sum(counts) * MIN_CHUNK_SHARE))
         for job, (start, last) in enumerate(parts):
             while start < last:
-                stop = min(last, start + max(min_chunk, int(left * CHUNK_SHARE)))
+                stop = start + max(min_chunk, int(left * CHUNK_SHARE))
+                stop = stop if last - stop >= least // 2 else last  # a few rows more are not worth a call of their own
                 yield job, start, stop
                 left -= stop - start
                 start = stop

@@ -8,7 +8,7 @@ import numpy as np
 from mipmap_plugin.backends.cpu_kernels import inner, integrals, kernel, layout, projection, sorting
 from mipmap_plugin.backends.cpu_kernels.binning import LOG_MIN_ALPHA
 from mipmap_plugin.backends.cpu_kernels.compositing import init_tile, log_alpha, tile_box, unfinished_patches
-from mipmap_plugin.backends.cpu_kernels.drawing import flags_of, view_of
+from mipmap_plugin.backends.cpu_kernels.drawing import view_of
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, broadcast, fma, lowest_bit, minimum, select, total
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, row_of, store
 from mipmap_plugin.backends.cpu_kernels.patches import BATCH, find_patches, new_found
@@ -24,10 +24,10 @@ from mipmap_plugin.render_settings import MIN_ALPHA
 
 def weigh(splats: SplatArrays, camera: Camera, effects: Effects, ranks: np.ndarray | None = None) -> np.ndarray:
     """The sum of each splat's blend weights over the pixels of an image, [N] float32. Arguments: as of `drawing.draw`; not for windows."""
-    view = view_of(camera, effects, splats, False)
+    view, flags = view_of(camera, effects, splats, False)
     limits = Limits(effects.settings.max_alpha, effects.settings.min_transmittance, 0.0)
     count, (height, width) = len(splats.means), camera.size
-    projected, threads, flags = sorting.Projected.of(count, camera.size), team(count + width * height), flags_of(view, splats)
+    projected, threads = sorting.Projected.of(count, camera.size), team(count + width * height)
     threads.share(projection.project, count, flags, view, splats, *projected.arrays, of_rows=True)
     [lists] = sorting.tile_lists([projected if ranks is None else projected._replace(order=ranks)], threads)
     by_pair, by_splat = empty(len(lists.members)), empty(count)
