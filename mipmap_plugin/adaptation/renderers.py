@@ -20,7 +20,7 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.splatting.packing import in_two_steps, packed
 from mipmap_plugin.threads import side_by_side
 
-# For a rounding that does not depend on it.
+# A camera of one pixel, for what does not depend on it.
 NO_CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 # The numbers of views in a step and their images [h, w, 3] -> the gradient of each one's loss, [h, w, 3], and its mean square error, [].

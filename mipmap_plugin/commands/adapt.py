@@ -133,7 +133,7 @@ def _adapted(
     wrapped: Wrapped, requests: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any]
 ) -> Iterator[tuple[Adapted, Path]]:
     """Yield each model as soon as it is adapted, and the path to save it to."""
-    from mipmap_plugin.wrap import state_path
+    from mipmap_plugin.models.places import state_path
 
     wrapped.keeps_images = len(requests) > 1
     for (scale, viewer), target in zip(requests, targets, strict=True):

@@ -87,13 +87,11 @@ def render(
 
 def _check(wrapped: Wrapped, views: Sequence[Camera], exposure: bool) -> None:
     """Raise the error of a view without an `exposure`; warn of views that show nothing, or a speck, which are written all the same."""
-    from mipmap_plugin.wrap import refuse_undrawn
-
     if exposure:
         for camera in views:
             wrapped.model.traits.exposures.of(camera)
     try:
-        refuse_undrawn(wrapped, views)
+        wrapped.refuse_undrawn(views)
     except SettingsError as error:
         warnings.warn(str(error), stacklevel=1)
 

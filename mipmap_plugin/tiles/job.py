@@ -75,8 +75,8 @@ class TileJob(Job):
         return sweep_of(scene, folder, self.sweep)
 
     def _adapt(self, scene: Any, folder: Path) -> None:
+        from mipmap_plugin.models.places import state_path
         from mipmap_plugin.tiles.tile import Tile
-        from mipmap_plugin.wrapped import state_path
 
         saved, facts, keeper = Tile(scene, self.number, self._sweep(scene, folder), folder).adapt(state_path(self.target))
         with together(self.target):

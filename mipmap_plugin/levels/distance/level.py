@@ -33,6 +33,7 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, explain
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats, shaped
@@ -45,7 +46,6 @@ from mipmap_plugin.models.contract import rebuild
 from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.progress import announced
 from mipmap_plugin.recipes import recipe as make_config
-from mipmap_plugin.wrap import Wrapped
 
 # Samples of the truth per pixel along each side, to adapt to and to measure by. In walks over flowers, three agree with six to 67 dB.
 SAMPLES, MEASURED_SAMPLES = 2, 3
@@ -71,7 +71,7 @@ class WalkTask(Task):
 class Scene:
     """What all levels of a ladder by distance share."""
 
-    base: Wrapped
+    base: FrozenBase
     request: LadderRequest
     rule: DistanceRule
     chunks: Chunks

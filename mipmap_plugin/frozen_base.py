@@ -1,4 +1,4 @@
-"""A frozen base model with its cameras, which is rendered, adapted to other scales and made into levels. It never changes."""
+"""A frozen base model with its cameras, which is rendered and adapted to other scales. It never changes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict, cast
 
@@ -14,18 +13,16 @@ import torch
 
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation import notebook
-from mipmap_plugin.adaptation.adapted import Adapted as Adapted
-from mipmap_plugin.adaptation.adapted import render_model
+from mipmap_plugin.adaptation.adapted import Adapted, render_model
 from mipmap_plugin.adaptation.choosing import choose
 from mipmap_plugin.adaptation.conversion import Stages, conversion
-from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
+from mipmap_plugin.adaptation.renderers import NO_CAMERA
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
-from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.target.photographs import placed as placed
+from mipmap_plugin.adaptation.target.photographs import Photographs, placed
 from mipmap_plugin.adaptation.target.portable import settings_for_several
-from mipmap_plugin.adaptation.views import choose_views, orbit_of
+from mipmap_plugin.adaptation.views import choose_views, orbit_of, refuse_blind
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import Camera, checked, digest_of, of_base_scale
@@ -39,8 +36,7 @@ from mipmap_plugin.limits import check_image, check_kinds, check_scale
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
-from mipmap_plugin.models.places import REPORT
-from mipmap_plugin.models.places import state_path as state_path
+from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
@@ -53,7 +49,7 @@ if TYPE_CHECKING:
 
 
 class RenderOptions(TypedDict, total=False):
-    """Further options of `Wrapped.render`."""
+    """Further options of `FrozenBase.render`."""
 
     viewer: str | None  # render as this viewer does, instead of with a screen filter; without a filter_3D if it does not read it
     filter_3d: bool  # first smooth every splat to the finest detail that the cameras could resolve (Mip-Splatting's 3D filter)
@@ -62,8 +58,8 @@ class RenderOptions(TypedDict, total=False):
     exposure: bool  # apply the exposure of the photograph that the camera is named after, if exposure.json has it
 
 
-class Wrapped:
-    """A frozen base model with its cameras, ready to be adapted to any scale."""
+class FrozenBase:
+    """A frozen base model with its cameras: what levels build on. `wrap.Wrapped` can make them, too."""
 
     def __init__(
         self, model: SplatModel, cameras: Sequence[Camera], backend: str, trained: TrainedScale, threads: int | None = None
@@ -76,11 +72,11 @@ class Wrapped:
         self.keeps_images = True  # for further scales, up to 1 GiB; False saves that memory where `adapt` is called once
 
     def __repr__(self) -> str:
-        return notebook.line("Wrapped", notebook.base_facts(self.model, self.cameras, self.trained))
+        return notebook.line(type(self).__name__, notebook.base_facts(self.model, self.cameras, self.trained))
 
     def _repr_html_(self) -> str:
         facts = notebook.base_facts(self.model, self.cameras, self.trained)
-        return notebook.table("Wrapped", facts, lambda camera: self.render(camera).image, self.views()[0])
+        return notebook.table(type(self).__name__, facts, lambda camera: self.render(camera).image, self.views()[0])
 
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
         """How this model is rendered at `scale`, or by the viewer of that name (`splatting.viewers`).
@@ -231,12 +227,6 @@ class Wrapped:
             self.images = BaseImages(model, backend, self.effects(), LIMIT if keep else 0)
         return self.images
 
-    @usual_modes()
-    def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Any:
-        """Return a ladder of levels (`levels.ladder.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`."""
-        ladder = import_module("mipmap_plugin.levels.ladder")  # which builds on this class, so that it cannot be imported above
-        return ladder.make_levels(self, ladder.LadderRequest.of(viewer, **options), resume)
-
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
         """Raise now the error that saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be predicted."""
         report, source = named(path).with_name(named(path).name + REPORT), self.model.source
@@ -280,6 +270,11 @@ class Wrapped:
         """The checkpoint's cameras, or a generated orbit, for an adapted file that of its base, if it came without any."""
         return self.cameras or choose_views([], orbit_of(self.model), AdaptConfig())[0]
 
+    def refuse_undrawn(self, views: Sequence[Camera] | None = None) -> None:
+        """Raise SettingsError if none of the views, by default the base's own, shows anything of it (`refuse_blind`)."""
+        looked_from = self.views() if views is None else views
+        refuse_blind(looked_from, self.model, self.effects().near_plane, lambda view: self.render(view).image)
+
     def place(self, scene: Scene) -> Scene:
         """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""
         in_frame = placed(self.model, scene)
@@ -296,4 +291,4 @@ class Wrapped:
 
     def any_camera(self) -> Camera:
         """One of the cameras, or a camera of one pixel if there are none."""
-        return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
+        return self.cameras[0] if self.cameras else NO_CAMERA
