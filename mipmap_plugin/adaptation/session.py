@@ -21,6 +21,7 @@ from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_train
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import no_steps_notes, plan_note, within_budget
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
@@ -76,6 +77,7 @@ class Session:
     """One call of `adapt`: makes the parts, and runs them in order."""
 
     notes: Sequence[str] = ()  # on what the views show of the base
+    ended: End | None = None  # why the steps ended
     keeps_state = False  # whether the state of a run that has ended is kept too: because another one starts from what it returns
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
@@ -121,7 +123,7 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near, few = self.base_effects.near_plane, _rows(self.base) <= (self.config.most_splats or sys.maxsize)
+        near, few = self.base_effects.near_plane, len(self.base.parameters()["means"]) <= (self.config.most_splats or sys.maxsize)
         refuse_blind(self.base_views, self.base, near, self.truth)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
@@ -159,7 +161,7 @@ class Session:
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
         began, most = time.perf_counter(), self.config.most_splats or sys.maxsize
-        allowed = [name for name, model in states.items() if _rows(model) <= most]
+        allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= most]
         (base, start, *_), last = states, allowed[-1]
         with self.phase("validation"):
             best, psnrs = self.validation.choose(states, allowed)
@@ -179,7 +181,7 @@ class Session:
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
-        max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
+        max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * len(student.parameters()["means"]))
         max_splats = min(max_splats, self.config.most_splats or sys.maxsize)
         targets = [unrounded(target) for target in self.extremes.values()]
         first, *further = [Renderer(self.backend, target) for target in targets]
@@ -200,7 +202,7 @@ class Session:
             answer = observe and observe(run.step, run.watch.seconds, first.of_model(run.student))
             return is_true(answer)
 
-        if not run.ended_by:
+        if run.ended_by is None:
             task, config = within_budget(run, task, self.config)
             run.ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
             release(run.student)
@@ -214,7 +216,9 @@ class Session:
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
         self.notes = [*self.notes, *([] if self.keeps_state else no_steps_notes(run, self.config, self.budget_share))]
-        return run, run.ended_by + (plan_note(run, self.config) or fewer_note(self.asked_steps, self.config)) + growth_note(run)
+        self.ended = run.ended_by
+        told = run.ended_by.told(self.config, run.step, self.budget_share)
+        return run, told + (plan_note(run, self.config) or fewer_note(self.asked_steps, self.config)) + growth_note(run)
 
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
@@ -294,7 +298,3 @@ class Session:
             orbit=orbit_of(self.base),
             notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
         )
-
-
-def _rows(model: SplatModel) -> int:
-    return len(model.parameters()["means"])

@@ -194,7 +194,7 @@ class LevelRun:
             task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, size=self.size)
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
-            ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due)
+            ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due).told(self.config, run.step)
             states |= run.states(initial)
             curve, kept, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
             self.seconds["optimization"] = run.watch.seconds - run.costs.seconds()
