@@ -9,7 +9,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.types import Background, ScreenFilter
 from mipmap_plugin.commands.voice import put, say
 from mipmap_plugin.formats.atomic import json_text
 from mipmap_plugin.progress import announced
@@ -33,7 +32,7 @@ def this_command() -> str:
 
 
 def wrap(
-    checkpoint: Path, cameras: Path | None, background: Background | None, backend: str, screen_filter: ScreenFilter | None = None,
+    checkpoint: Path, cameras: Path | None, background: str | None, backend: str, screen_filter: str | None = None,
     threads: int | None = None,
 ) -> Wrapped:  # fmt: skip
     from mipmap_plugin.jobs.base import Base
