@@ -27,7 +27,7 @@ from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import Camera, checked, digest_of, of_base_scale
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import DILATION, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.splat_transform import refuse_unread
@@ -40,7 +40,8 @@ from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.splatting.filters import INTEGRALS, USUAL_EPS2D
+from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D
+from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
 from mipmap_plugin.torch_modes import usual_modes
 

@@ -24,7 +24,7 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.scenes import Scene, model_cameras
-from mipmap_plugin.splatting.filters import USUAL_EPS2D
+from mipmap_plugin.screen_filters import USUAL_EPS2D
 from mipmap_plugin.torch_modes import usual_modes
 
 if TYPE_CHECKING:

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effect
+from mipmap_plugin.effects import NEAR_PLANE, Effect
 from mipmap_plugin.errors import PluginError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.plugin_errors import is_third_party
+from mipmap_plugin.screen_filters import DILATION
 
 # Name, among a model's parameters, of values that are never optimized but removed with their rows, such as an anchor's level.
 CARRIED = "carried"

@@ -10,7 +10,6 @@ import torch
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.start.pixel_size import seen_pixel_size
-from mipmap_plugin.effects import INTEGRATED
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.distance.chunks import Chunks
@@ -23,6 +22,7 @@ from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.progress import announced
+from mipmap_plugin.screen_filters import INTEGRATED
 from mipmap_plugin.splatting.viewers import own_name
 
 # A chunk measures at most this part of the distance of the nearest parts of a scene, so that its rear is at the scale of its front, but at least
