@@ -14,7 +14,7 @@ import torch
 from mipmap_plugin import threads
 from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, render_model
-from mipmap_plugin.adaptation.choosing import choose
+from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
 from mipmap_plugin.adaptation.conversion import Stages, conversion
 from mipmap_plugin.adaptation.renderers import NO_CAMERA
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
@@ -186,10 +186,7 @@ class FrozenBase:
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
         check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
-        whole = not (model.traits.same_for_all_views or model.traits.thins) and settings.setdefault("merge_to", 1.0) < 1
-        if whole or (settings.get("most_splats") and not model.traits.same_for_all_views):
-            reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
-            raise SettingsError(f"{model.family}: {reason}; leave {'' if model.traits.thins else 'merge_to and '}most_splats (--splats, --bytes) out")
+        settings = mergeable_settings(model, settings)
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         config, targets = self._planned(recipe, scale, viewer, settings)
@@ -202,8 +199,7 @@ class FrozenBase:
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)
         if config.steps:
-            largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
-            check_image(largest.width, largest.height, self.model.parameters()["means"].device)
+            self._refuse_large(cameras or self.views(), scale)
         if start is not None and start.scale <= scale:
             raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
         base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
@@ -221,6 +217,11 @@ class FrozenBase:
         """The settings of an adaptation, and `targets`."""
         config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
         return config if len(targets) == 1 else make_config(recipe, scale, **(settings_for_several(config) | settings)), targets
+
+    def _refuse_large(self, views: Sequence[Camera], scale: float) -> None:
+        """Raise SettingsError if the memory cannot hold the largest image that is adapted to."""
+        largest = max(views, key=lambda camera: camera.width * camera.height).zoomed(scale)
+        check_image(largest.width, largest.height, self.model.parameters()["means"].device)
 
     def _base_images(self, model: SplatModel, backend: Backend, keep: bool) -> BaseImages:
         """Those that are drawn already, or none yet: of another base. `keep`: for further scales and stages."""

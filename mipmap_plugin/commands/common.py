@@ -35,6 +35,7 @@ def wrap(
     checkpoint: Path, cameras: Path | None, background: str | None, backend: str, screen_filter: str | None = None,
     threads: int | None = None,
 ) -> Wrapped:  # fmt: skip
+    """Load and wrap a checkpoint, for whatever is done in this process. `threads`: for torch too. Raises what `Base.load` raises."""
     from mipmap_plugin.jobs.base import Base
     from mipmap_plugin.threads import limit_torch
 

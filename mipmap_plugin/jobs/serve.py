@@ -25,6 +25,7 @@ Request = tuple[Job, "int | None"]
 
 
 def main() -> None:
+    """Do the jobs that come on standard input, and write their outcomes to standard output, until the owner closes it."""
     signal.signal(signal.SIGINT, _leave)
     keep_freed_memory()  # also in workers of dask, whose environment asks for the opposite
     answers = os.fdopen(os.dup(1), "wb")

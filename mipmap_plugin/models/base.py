@@ -35,7 +35,7 @@ class TrainedScale:
     """The screen filter and the sampling rate that a checkpoint was trained with.
 
     Attributes:
-        screen_filter: "classic", "antialiased", "mip", or another name of `splatting.filters`.
+        screen_filter: "classic", "antialiased", "mip", or another name of `screen_filters`.
         eps2d: The variance that the filter adds, px² of a training pixel.
         resolution: INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px.
         background: RGB, 0..1; None: the checkpoint does not say.

@@ -137,7 +137,10 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
 
 
 def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) -> Run:
-    """Return the run of a state that `save_run` wrote; its parameters replace those of `student`."""
+    """Return the run of a state that `save_run` wrote; its parameters replace those of `student`.
+
+    Raises what an incomplete state makes Python and torch raise: KeyError, TypeError, ValueError, ...
+    """
     kinds = {"step": int, "planned": int, "seconds": float, "reserved": float, "square_error": float, "rows_changed": bool, "ended_by": str}
     for name, kind in kinds.items():
         if not isinstance(state[name], kind):
