@@ -95,4 +95,3 @@ def _first(base: FrozenBase, request: LadderRequest, band: Band, state: Path | N
     as_it_is = base.target(request.viewer) == base.effects()
     converted = {} if as_it_is else band.settings()
     return base.adapt(1.0, resume=state, **{"recipe": request.recipe, "viewer": request.viewer, **converted, **request.settings})
-
