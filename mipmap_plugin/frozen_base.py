@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict, cast
 
 import torch
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, render_model
 from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
@@ -38,12 +37,13 @@ from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
 from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.plugin_errors import naming_any, unchanged
+from mipmap_plugin.process import threads
+from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D
 from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
-from mipmap_plugin.torch_modes import usual_modes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -23,9 +23,9 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
+from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.scenes import Scene, model_cameras
 from mipmap_plugin.screen_filters import USUAL_EPS2D
-from mipmap_plugin.torch_modes import usual_modes
 
 if TYPE_CHECKING:
     from mipmap_plugin.levels.finished import Ladder

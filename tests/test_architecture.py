@@ -14,9 +14,9 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # From the ground up; a module imports only what lies below its own storey, or in its own package.
 STOREYS = [
-    {"errors", "freed_memory", "garbage"},
-    {"limits", "pool"},
-    {"registry", "config", "torchvision_absent", "torch_modes", "threads", "progress", "screen_filters", "allowed", "plugin_errors"},
+    {"errors"},
+    {"limits", "process"},
+    {"registry", "config", "progress", "screen_filters", "allowed", "plugin_errors"},
     {"render_settings"},
     {"gaussians", "camera"},
     {"formats"},
@@ -46,7 +46,7 @@ CONFINED = {
     "lpips": ["evaluation/perceptual.py"],
     "matplotlib": ["adaptation/plot.py", "evaluation/tradeoff/plot.py"],
     "numba": ["backends/cpu_kernels/"],
-    "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/", "pool.py"],
+    "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/", "process/pool.py"],
     "plyfile": ["formats/ply.py"],
     "pycolmap": ["scenes/"],
     "pydantic": ["config.py", "recipes.py", "adaptation/curve.py", "adaptation/report.py", "jobs/finished.py"],

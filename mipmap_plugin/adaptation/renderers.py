@@ -11,14 +11,14 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from mipmap_plugin import threads
 from mipmap_plugin.backends.base import Backend, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.process import threads
+from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.splatting.packing import in_two_steps, packed
-from mipmap_plugin.threads import side_by_side
 
 # A camera of one pixel, for what does not depend on it.
 NO_CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from torch import Tensor
 
-from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, is_true
 from mipmap_plugin.adaptation.following import Following, release
@@ -47,6 +46,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
 from mipmap_plugin.models.base import SplatModel, count_of, digest_of_parameters, effects_of
 from mipmap_plugin.models.health import doubts_in
+from mipmap_plugin.process import pool, threads
 from mipmap_plugin.progress import announced
 
 # (step, seconds of adapting so far, function that renders a camera of the new scale with the current model, without gradients)

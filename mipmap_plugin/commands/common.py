@@ -37,7 +37,7 @@ def wrap(
 ) -> Wrapped:  # fmt: skip
     """Load and wrap a checkpoint, for whatever is done in this process. `threads`: for torch too. Raises what `Base.load` raises."""
     from mipmap_plugin.jobs.base import Base
-    from mipmap_plugin.threads import limit_torch
+    from mipmap_plugin.process.threads import limit_torch
 
     with announced(f"reading {checkpoint.name}"):
         wrapped = Base(checkpoint, cameras, background, backend, screen_filter).load(threads)

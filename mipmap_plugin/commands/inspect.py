@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts, summary
 from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
-from mipmap_plugin.garbage import uncollected
+from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:

@@ -53,7 +53,7 @@ def view(
         port: Port of the page; where it is taken, the next free one.
         browser: Also open the page, where there is a display.
     """
-    from mipmap_plugin import threads as all_threads
+    from mipmap_plugin.process import threads as all_threads
     from mipmap_plugin.viewing.page import PageSettings
 
     if not 0 <= port <= 65535:

@@ -18,8 +18,8 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import replace
 from typing import IO
 
-from mipmap_plugin.freed_memory import keep_freed_memory
 from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.process.freed_memory import keep_freed_memory
 
 Request = tuple[Job, "int | None"]
 

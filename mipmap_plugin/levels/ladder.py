@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.problem import FinerLevel
@@ -26,6 +25,7 @@ from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.levels.switching import switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.models.base import why_no_viewer
+from mipmap_plugin.process import threads
 from mipmap_plugin.progress import announced
 
 # Two neighboring zooms of the curve of dB are at most this factor apart.

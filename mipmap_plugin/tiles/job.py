@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from mipmap_plugin import pool
-from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.formats.atomic import together, write_json
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.process import pool
+from mipmap_plugin.process import threads as thread_pool
 from mipmap_plugin.tiles.folder import work_folder
 
 Work = Literal["truth", "start", "layer", "halo", "tile", "steering"]

@@ -15,11 +15,11 @@ from typing import Any, TypeVar
 from torch import Tensor
 from tqdm import tqdm
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.process import threads
 
 Result = TypeVar("Result")
 

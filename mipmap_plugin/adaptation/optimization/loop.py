@@ -26,8 +26,8 @@ from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import count_of
+from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.progress import ticking
-from mipmap_plugin.threads import side_by_side
 
 # Number of checks during the warm-up, while the rates rise, and of a short run, with so many steps between two: each takes as long as a step.
 CHECKS_IN_WARM_UP, CHECKS, STEPS_BETWEEN = 10, 6, 5

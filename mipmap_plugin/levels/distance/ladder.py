@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.start.pixel_size import seen_pixel_size
 from mipmap_plugin.errors import SettingsError
@@ -21,6 +20,7 @@ from mipmap_plugin.levels.distance.yardstick import measured
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
+from mipmap_plugin.process import threads
 from mipmap_plugin.progress import announced
 from mipmap_plugin.screen_filters import INTEGRATED
 from mipmap_plugin.splatting.viewers import own_name
