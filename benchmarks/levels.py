@@ -39,8 +39,9 @@ from mipmap_plugin.formats.atomic import write_json
 from mipmap_plugin.formats.splat_transform import TOOL, find_tool
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.models.places import state_path
 from mipmap_plugin.scenes.trajectories import jittered
-from mipmap_plugin.wrap import Wrapped, state_path
+from mipmap_plugin.wrap import Wrapped
 
 BASES = ("bases/lego_200", "bases/chair_400", "flowers_r8")
 VIEWERS = ("spark", "playcanvas")

@@ -41,9 +41,9 @@ from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.manifest import MANIFEST
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.levels.streamed import CANVAS, distances, progression
-from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.scenes.trajectories import jittered
-from mipmap_plugin.wrap import Wrapped, state_path
+from mipmap_plugin.wrap import Wrapped
 
 BASES = ("flowers_r8", "bases/lego_200")
 VIEWER = "playcanvas"

@@ -10,9 +10,9 @@ from scenes import Name, make
 from torch import Tensor
 
 from mipmap_plugin import Camera, Effects, Gaussians, wrap_model
-from mipmap_plugin.effects import DILATION
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.render_settings import MIN_ALPHA
+from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.rotations import rotations
 

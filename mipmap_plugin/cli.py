@@ -23,9 +23,9 @@ from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
 from mipmap_plugin.errors import MipmapPluginError
-from mipmap_plugin.freed_memory import keep_freed_memory
-from mipmap_plugin.garbage import leave_at_exit
 from mipmap_plugin.limits import is_out_of_memory
+from mipmap_plugin.process.freed_memory import keep_freed_memory
+from mipmap_plugin.process.garbage import leave_at_exit
 
 DESCRIPTION = (
     "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors, warnings and JSON only, "

@@ -10,9 +10,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, RenderSettings
-from mipmap_plugin.screen_filters import COMPENSATED as COMPENSATED
-from mipmap_plugin.screen_filters import DILATION as DILATION
-from mipmap_plugin.screen_filters import INTEGRATED as INTEGRATED
+from mipmap_plugin.screen_filters import COMPENSATED, DILATION, INTEGRATED
 
 # The screen filter of 2D Gaussian Splatting (`splatting.surfels`), and the variance of its low-pass, px²: a deviation of half the root of
 # two (diff-surfel-rasterization, auxiliary.h).

@@ -8,26 +8,39 @@ from collections.abc import Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
-from mipmap_plugin.adaptation.views import refuse_blind
+from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.backends import device_for
 from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.frozen_base import FrozenBase
+from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
 from mipmap_plugin.limits import check_background
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
+from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.scenes import Scene, model_cameras
-from mipmap_plugin.splatting.filters import USUAL_EPS2D
-from mipmap_plugin.torch_modes import usual_modes
-from mipmap_plugin.wrapped import RenderOptions as RenderOptions
-from mipmap_plugin.wrapped import Wrapped as Wrapped
-from mipmap_plugin.wrapped import placed as placed
-from mipmap_plugin.wrapped import state_path as state_path
+from mipmap_plugin.screen_filters import USUAL_EPS2D
+
+if TYPE_CHECKING:
+    from mipmap_plugin.levels.finished import Ladder
+
+
+class Wrapped(FrozenBase):
+    """A frozen base model with its cameras, ready to be adapted to any scale and made into levels. It never changes."""
+
+    @usual_modes()
+    def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Ladder:
+        """Return a ladder of levels (`levels.finished.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`."""
+        from mipmap_plugin.levels.ladder import make_levels
+        from mipmap_plugin.levels.request import LadderRequest
+
+        return make_levels(self, LadderRequest.of(viewer, **options), resume)
 
 
 @usual_modes()
@@ -76,12 +89,6 @@ def asked_for(
     options = {name: value for name, value in read_options(folder)[0].items() if not isinstance(value, str)}  # but paths
     digest = sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest() if options else ""
     return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or "", "options": digest}
-
-
-def refuse_undrawn(base: Wrapped, views: Sequence[Camera] | None = None) -> None:
-    """Raise SettingsError if none of the views, by default the base's own, shows anything of it (`refuse_blind`)."""
-    looked_from = base.views() if views is None else views
-    refuse_blind(looked_from, base.model, base.effects().near_plane, lambda view: base.render(view).image)
 
 
 def _loaded(path: str | Path, backend: str) -> SplatModel:

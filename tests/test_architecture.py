@@ -14,9 +14,9 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # From the ground up; a module imports only what lies below its own storey, or in its own package.
 STOREYS = [
-    {"errors", "freed_memory", "garbage"},
-    {"limits", "pool", "clock"},
-    {"registry", "config", "torchvision_absent", "torch_modes", "threads", "progress", "screen_filters", "allowed", "plugin_errors"},
+    {"errors"},
+    {"limits", "process"},
+    {"registry", "config", "progress", "screen_filters", "allowed", "plugin_errors"},
     {"render_settings"},
     {"gaussians", "camera"},
     {"formats"},
@@ -25,9 +25,9 @@ STOREYS = [
     {"backends", "models", "scenes"},
     {"recipes"},
     {"adaptation"},
-    {"wrapped"},
-    {"wrap"},
+    {"frozen_base"},
     {"levels"},
+    {"wrap"},
     {"evaluation", "models.conformance"},
     {"pages", "jobs"},
     {"tiles", "viewing"},
@@ -46,7 +46,7 @@ CONFINED = {
     "lpips": ["evaluation/perceptual.py"],
     "matplotlib": ["adaptation/plot.py", "evaluation/tradeoff/plot.py"],
     "numba": ["backends/cpu_kernels/"],
-    "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/", "pool.py"],
+    "numpy": ["backends/", "evaluation/metrics.py", "formats/", "models/", "process/pool.py"],
     "plyfile": ["formats/ply.py"],
     "pycolmap": ["scenes/"],
     "pydantic": ["config.py", "recipes.py", "adaptation/curve.py", "adaptation/report.py", "jobs/finished.py"],
@@ -57,7 +57,7 @@ CONFINED = {
     "tqdm": ["adaptation/", "evaluation/", "progress.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
-    "typing_extensions": ["wrapped.py"],
+    "typing_extensions": ["frozen_base.py"],
     "viser": ["viewing/server.py"],
 }
 
@@ -65,7 +65,7 @@ MAX_FILE, MAX_FUNCTION = 300, 60  # lines
 MAX_ARGUMENTS = 6
 
 # Where functions may have more: kernels, which numba and Triton give no records, the commands, whose arguments are options, and the door.
-MANY_ARGUMENTS = ("backends/cpu_kernels/", "backends/triton_kernels/", "commands/", "wrapped.py: adapt")
+MANY_ARGUMENTS = ("backends/cpu_kernels/", "backends/triton_kernels/", "commands/", "frozen_base.py: adapt")
 
 
 def name_of(path: Path) -> str:
@@ -73,7 +73,7 @@ def name_of(path: Path) -> str:
 
 
 def imports(path: Path) -> set[str]:
-    """The full names of the modules that a file imports, at its top or inside its functions."""
+    """The full names of the modules that a file imports, at its top or inside its functions, with `import_module` too."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -81,6 +81,8 @@ def imports(path: Path) -> set[str]:
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute"
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
+        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == "import_module":
+            found |= {each.value for each in node.args if isinstance(each, ast.Constant) and each.value.startswith(PACKAGE.name)}
     return found
 
 

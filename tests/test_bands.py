@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from mipmap_plugin.pool import LARGE
+from mipmap_plugin.process.pool import LARGE
 from mipmap_plugin.splatting.bands import joined, neighbors
 
 

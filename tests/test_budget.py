@@ -6,10 +6,11 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, reason_to_stop
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization import budget
 from mipmap_plugin.adaptation.optimization.budget import SPARE, USES, Pace, plan_note, within_budget
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task
@@ -64,7 +65,7 @@ def test_what_was_planned_and_taken_is_told():
     assert plan_note(run, config) == ""
     run.planned = 8
     assert plan_note(run, config) == ""
-    run.ended_by = "time budget of 3 s"
+    run.ended_by = End.TIME
     assert plan_note(run, config) == " (after 5 of 8 steps, planned for the time budget in place of 360)"
     run.step = 8
     assert plan_note(run, config) == " (planned for the time budget in place of 360)"
@@ -96,7 +97,13 @@ def test_time_is_kept_for_choosing_after_the_steps():
     assert run.reserved == PACE.a_choice and planned.steps == PACE.steps(config, 3.0 - 1.0 - PACE.a_choice, STILL)
     assert run.progress(planned) == pytest.approx(0, abs=0.01)
     run.watch.seconds = 3.0 - PACE.a_choice
-    assert run.progress(planned) == 1 and reason_to_stop(run.curve, run.seconds, planned)
+    assert run.progress(planned) == 1 and run.reason_to_stop(planned) is End.CHOICE
+
+
+def test_steps_that_were_taken_before_the_first_check_are_not_told_as_the_start():
+    run, config = a_run(4.0, step=2), recipe("default", 1 / 4, time_budget_s=3.0)
+    run.curve = [CurvePoint(step=0, seconds=1.0, validation_db=20.0, gaussians=5)]
+    assert run.reason_to_stop(config) is End.TIME
 
 
 NO_CHANGE = [(dict(), 0.0), (dict(time_budget_s=1e6, steps=360), 0.0), (dict(time_budget_s=3.0), 4.0), (dict(time_budget_s=3.0, gathering=0.0), 0.0)]

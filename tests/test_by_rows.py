@@ -6,7 +6,6 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.renderers import SteppingRenderer
@@ -16,10 +15,11 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models.surfels import SurfelModel
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.process import threads
+from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.splatting.bands import neighbors
 from mipmap_plugin.splatting.viewers import BUILT_IN
-from mipmap_plugin.threads import side_by_side
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="numba, the extra `cpu`, is not installed")
 BACKEND, VIEWS = CpuBackend(), tiny.cameras(3)

@@ -8,7 +8,7 @@ import torch
 
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.start.candidates import _Clock
-from mipmap_plugin.clock import now
+from mipmap_plugin.process.clock import now
 
 GPU = torch.device("cuda")
 

@@ -8,15 +8,16 @@ import pytest
 import samples
 import torch
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.start.closed_form import CULL_MARGIN, MIN_AXIS, FormSettings, closed_form, draws_alike, filter_suffices
 from mipmap_plugin.adaptation.start.surfel_form import visible_area
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.cpu import summed_areas
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, SURFEL, Effects
+from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.process import threads
+from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.filters import compensates, footprint
 from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.viewers import find_viewer

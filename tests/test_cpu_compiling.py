@@ -101,7 +101,7 @@ def test_the_sources_are_all_that_kernels_are_made_of():
     texts = [text for text in map(Path.read_text, folder.glob("*.py")) if "@inner" in text or "@kernel" in text]
     used = {name for text in texts for name in re.findall(r"^from mipmap_plugin\.(\S+) import", text, re.M)}
     read = {path.relative_to(compiling.ROOT) for pattern in compiling.SOURCES for path in compiling.ROOT.glob(pattern)}
-    for_python = {"backends.cpu_kernels", "camera", "pool"}
+    for_python = {"backends.cpu_kernels", "camera", "process.pool"}
     assert {name for name in used if Path(*name.split(".")).with_suffix(".py") not in read} == for_python
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mipmap_plugin.pool import CACHE_LINE, LARGE, Pool
+from mipmap_plugin.process.pool import CACHE_LINE, LARGE, Pool
 
 
 def address(array: np.ndarray) -> int:

@@ -8,7 +8,6 @@ import moving
 import pytest
 import tiny
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization import loop
 from mipmap_plugin.adaptation.optimization.estimate import Costs, Forecast
@@ -21,6 +20,7 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.moving import memory
+from mipmap_plugin.process import threads
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.wrap import wrap_model
 

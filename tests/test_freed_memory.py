@@ -8,12 +8,12 @@ import sys
 
 import pytest
 
-from mipmap_plugin.freed_memory import keep_freed_memory, return_freed_memory
+from mipmap_plugin.process.freed_memory import keep_freed_memory, return_freed_memory
 
 # Fills and frees 120 MiB again and again, in blocks of 24 MiB as tensors have them, and prints the page faults of that.
 FAULTS_OF_BLOCKS = """
 import ctypes, resource, sys
-from mipmap_plugin.freed_memory import keep_freed_memory, return_freed_memory
+from mipmap_plugin.process.freed_memory import keep_freed_memory, return_freed_memory
 if sys.argv[1:]:
     assert keep_freed_memory()
 libc, size = ctypes.CDLL(None), 24 << 20
@@ -49,7 +49,7 @@ def test_without_glibc_nothing_is_set(monkeypatch):
 # Frees 90 MiB below a block that stays, as the arrays of a phase, and prints what the process holds before and after giving it back, in MiB.
 RETURNED = """
 import ctypes, re
-from mipmap_plugin.freed_memory import keep_freed_memory, return_freed_memory
+from mipmap_plugin.process.freed_memory import keep_freed_memory, return_freed_memory
 assert keep_freed_memory()
 libc, size = ctypes.CDLL(None), 30 << 20
 libc.malloc.restype, libc.malloc.argtypes, libc.free.argtypes = ctypes.c_void_p, [ctypes.c_size_t], [ctypes.c_void_p]

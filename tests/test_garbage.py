@@ -9,7 +9,7 @@ import sys
 import pytest
 import tiny
 
-from mipmap_plugin.garbage import uncollected
+from mipmap_plugin.process.garbage import uncollected
 
 
 def test_it_is_off_in_the_block_and_on_afterwards():

@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
+from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.scenes import load_scene, read_cameras, write_cameras
-from mipmap_plugin.wrap import placed
 
 EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
 

@@ -37,9 +37,10 @@ from mipmap_plugin.levels.request import FINEST_RATIO, NARROW, STEPS_KEPT, WIDE,
 from mipmap_plugin.levels.switching import most_even, switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.models.base import Traits
+from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.recipes import recipe
-from mipmap_plugin.wrap import Interrupted, state_path
+from mipmap_plugin.wrap import Interrupted
 
 BRIEF = dict(steps=1, extra_views=1, validation_views=2, warm_up=0, views_per_step=1)
 
@@ -432,7 +433,7 @@ def test_an_interrupted_command_says_that_finished_levels_are_kept(tmp_path, mon
         first.setattr("mipmap_plugin.levels.ladder._curve", ends)
         assert cli.main(words) == 130
         assert f"go on with the levels that {tmp_path / 'ladder.resume'} keeps" in capsys.readouterr().err
-    monkeypatch.setattr("mipmap_plugin.wrapped.Wrapped.adapt", None)
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", None)
     assert cli.main(words) == 0
 
 

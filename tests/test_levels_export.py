@@ -256,7 +256,7 @@ def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not
     words += ["--by", "zoom", "--recipe", "instant", "--views", "given", "--backend", "reference"]
     assert cli.main([*words, "--streamed-sog"]) == 2
     assert "leave --streamed-sog out, which goes on from what is made" in capsys.readouterr().err and not (tmp_path / "ladder").exists()
-    monkeypatch.setattr("mipmap_plugin.wrapped.Wrapped.adapt", None)
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", None)
     assert cli.main(words) == 0 and (tmp_path / "ladder" / "level_0.ply").is_file()
 
 
@@ -289,7 +289,7 @@ def test_an_export_that_ends_early_loses_no_level(tmp_path, tool, capsys, monkey
         assert cli.main(words) == code
     assert "the same command with --overwrite" in capsys.readouterr().err
     levels = (tmp_path / "ladder" / "level_1.ply").read_bytes()
-    monkeypatch.setattr("mipmap_plugin.wrapped.Wrapped.adapt", None)
+    monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", None)
     assert cli.main([*words, "--overwrite"]) == 0
     assert (tmp_path / "ladder" / "level_1.ply").read_bytes() == levels and (tmp_path / "ladder" / "streamed").is_dir()
     assert not (tmp_path / "ladder.resume").exists()

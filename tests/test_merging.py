@@ -9,10 +9,10 @@ import torch
 from tiny import cameras
 from tiny import model as tiny_model
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.start.merging import MAX_DISTANCE, merge
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.process import threads
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.wrap import wrap_model

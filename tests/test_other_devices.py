@@ -31,7 +31,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.evaluation.evaluate import evaluate
 from mipmap_plugin.formats.images import write_image
-from mipmap_plugin.splatting.filters import USUAL_EPS2D
+from mipmap_plugin.screen_filters import USUAL_EPS2D
 
 # Few views and small ones: each operation there is many times as slow.
 VIEWS = tiny.cameras(2, width=16, height=12)

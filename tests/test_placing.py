@@ -10,6 +10,7 @@ import tiny
 import torch
 from torch_checkpoints import gsplat_folder, normalized_by_numpy, splatfacto_folder, splats
 
+from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
@@ -20,7 +21,7 @@ from mipmap_plugin.formats.images import read_image, write_image
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import placed, wrap_model
+from mipmap_plugin.wrap import wrap_model
 
 # COLMAP's world to that of a nerfstudio transforms.json, and that to the checkpoint's; the file of the run holds their product.
 APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])

@@ -2,10 +2,10 @@
 
 import pytest
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization import quickest
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.quickest import FIRST_INTERVAL, TRIED, QuickestThreads
+from mipmap_plugin.process import threads
 
 
 def chosen(steps: int, seconds) -> list[int]:

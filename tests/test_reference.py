@@ -14,8 +14,9 @@ from mipmap_plugin.backends.supersample import render
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.splatting import compositing
-from mipmap_plugin.splatting.filters import SCREEN_FILTERS, footprint
+from mipmap_plugin.splatting.filters import footprint
 from mipmap_plugin.splatting.harmonics import basis
 from mipmap_plugin.splatting.projection import project
 

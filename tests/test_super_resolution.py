@@ -14,7 +14,7 @@ from mipmap_plugin.adaptation.target.super_resolution import Network
 from mipmap_plugin.adaptation.target.upsamplers import UPSAMPLERS, find_upsampler
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
-from mipmap_plugin.torchvision_absent import torchvision_optional
+from mipmap_plugin.process.torchvision_absent import torchvision_optional
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,7 @@ import torch
 from mipmap_plugin import cli
 from mipmap_plugin.adaptation.target import super_resolution
 from mipmap_plugin.adaptation.target.super_resolution import Network
-from mipmap_plugin.torchvision_absent import torchvision_optional
+from mipmap_plugin.process.torchvision_absent import torchvision_optional
 from mipmap_plugin.wrap import wrap_model
 
 # main_test_swinir.py, define_model: classical (001), lightweight (002) and real-world (003) super-resolution.

@@ -12,11 +12,12 @@ from anchor_checkpoints import write
 from running import wait_until
 from tqdm import tqdm
 
-from mipmap_plugin import progress, threads
+from mipmap_plugin import progress
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models import load_model
+from mipmap_plugin.process import threads
 from mipmap_plugin.wrap import wrap_model
 
 

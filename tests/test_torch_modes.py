@@ -9,7 +9,7 @@ import pytest
 import tiny
 import torch
 
-from mipmap_plugin.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.wrap import wrap_model
 
 

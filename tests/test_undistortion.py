@@ -11,13 +11,14 @@ import torch
 from test_colmap import names, write_text_model
 from torch_checkpoints import gsplat_folder, splats
 
+from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, SettingsError
 from mipmap_plugin.evaluation import protocols
 from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.models import load_model
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import placed, wrap_model
+from mipmap_plugin.wrap import wrap_model
 
 pycolmap = pytest.importorskip("pycolmap")
 

@@ -11,6 +11,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization import loop
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.losses import INVISIBLE_ERROR
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer, restore_snapshot
 from mipmap_plugin.adaptation.optimization.run import Run
@@ -409,10 +410,10 @@ def test_a_curve_has_its_first_and_its_last_point(settings, steps):
 
 
 def test_a_run_that_ends_between_two_checks_is_looked_at_all_the_same(monkeypatch):
-    reasons = iter([None, None, "enough"])
+    reasons = iter([None, None, End.OBSERVER])
     monkeypatch.setattr(Run, "reason_to_stop", lambda run, config: next(reasons))
     report = wrapped().adapt(SCALE, steps=9, check_every=50, extra_views=0, warm_up=0).report
-    assert (report.ended_by, [point.step for point in report.curve]) == ("enough", [0, 2])
+    assert (report.ended_by, [point.step for point in report.curve]) == ("its observer", [0, 2])
 
 
 def with_extras() -> VanillaModel:

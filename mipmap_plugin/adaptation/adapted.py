@@ -28,7 +28,7 @@ from mipmap_plugin.models.mip import for_loader_of
 from mipmap_plugin.models.outputs import drawn_otherwise, parts_of, without_place
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
-from mipmap_plugin.torch_modes import usual_modes
+from mipmap_plugin.process.torch_modes import usual_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)

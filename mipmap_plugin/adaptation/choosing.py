@@ -1,14 +1,16 @@
-"""The choice of the backend that a model is adapted with."""
+"""Choices before a run: the backend that a model is adapted with, and whether its splats are merged."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.errors import BackendUnavailable
+from mipmap_plugin.errors import BackendUnavailable, SettingsError
+from mipmap_plugin.models.base import SplatModel
 
 
 def choose(name: str, config: AdaptConfig, targets: Sequence[Needs], base: Needs) -> tuple[Backend, str, bool]:
@@ -33,3 +35,15 @@ def choose(name: str, config: AdaptConfig, targets: Sequence[Needs], base: Needs
 
 def _choice(name: str, targets: Sequence[Needs], base: Needs, *, gradients: bool) -> tuple[Backend, str]:
     return choose_backend(name, *(replace(need, gradients=gradients) for need in targets), base)
+
+
+def mergeable_settings(model: SplatModel, settings: dict[str, Any]) -> dict[str, Any]:
+    """The settings (names of AdaptConfig), without merging where none of the splats can be merged. Raises SettingsError where it is asked for."""
+    traits = model.traits
+    if traits.same_for_all_views:
+        return settings
+    settings = settings if traits.thins else {"merge_to": 1.0, **settings}
+    if settings.get("most_splats") or (not traits.thins and settings["merge_to"] < 1):
+        reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
+        raise SettingsError(f"{model.family}: {reason}; leave {'' if traits.thins else 'merge_to and '}most_splats (--splats, --bytes) out")
+    return settings

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.optimization.loop import STOPPED
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import count_of_views
 from mipmap_plugin.adaptation.renderers import NO_CAMERA
@@ -73,16 +73,14 @@ class Stages:
         session = Session(self.request, 1.0, first, self.cameras, None)
         session.keeps_state = True
         converted = session.run(self.resume and conversion_state(self.resume), self.observe)
-        half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if _stopped(converted.report) else {}))
+        stopped = session.ended is End.OBSERVER
+        half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if stopped else {}))
         request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, told=True), budget_share=SHARE)
         with _kept_if_interrupted(converted.states):
             adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self._further(converted.report))
-        settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if _stopped(converted.report) else {})
-        its_own, given = (f"budget of {each.time_budget_s or 0:g} s" for each in (half, config))
-        ended_by = adapted.report.ended_by.replace(its_own, given)
-        ended_by = ended_by.replace("the start took", "the conversion and the start took").replace("the start and", "the conversion, the start and")
-        report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings), "ended_by": ended_by})
-        return replace(adapted, report=_joined(converted.report, report), states=[*converted.states, *adapted.states])
+        settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if stopped else {})
+        report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings)})
+        return replace(adapted, report=_joined(converted.report, report, stopped), states=[*converted.states, *adapted.states])
 
     def _further(self, first: Report) -> Observer | None:
         """The observer of the second stage, whose steps and seconds are counted on from those of the first."""
@@ -111,21 +109,17 @@ def _steps(report: Report) -> int:
     return report.curve[-1].step
 
 
-def _stopped(report: Report) -> bool:
-    return report.ended_by.startswith(STOPPED)
-
-
 def _half(config: AdaptConfig) -> float | None:
     """The seconds that each stage may take."""
     return config.time_budget_s and SHARE * config.time_budget_s
 
 
-def _joined(first: Report, second: Report) -> Report:
-    """The second stage's report, which tells of the first one too."""
+def _joined(first: Report, second: Report, stopped: bool) -> Report:
+    """The second stage's report, which tells of the first one too. `stopped`: the observer ended that."""
     spent = first.seconds["total"]
     seconds = {"conversion": spent, **second.seconds, "total": second.seconds["total"] + spent}
     curve = [point.model_copy(update={"seconds": point.seconds + spent}) for point in second.curve]
-    told = f"converted at x1 before, {first.gain()}, in {_steps(first)} steps{f', ended by {STOPPED}' if _stopped(first) else ''}"
+    told = f"converted at x1 before, {first.gain()}, in {_steps(first)} steps{f', ended by {End.OBSERVER.value}' if stopped else ''}"
     peaks = [peak for peak in (first.peak_memory_mib, second.peak_memory_mib) if peak is not None]
     notes = [*dict.fromkeys([*first.notes, *second.notes]), told]
     changes = {"seconds": seconds, "curve": curve, "notes": notes, "peak_memory_mib": max(peaks, default=None)}

@@ -1,4 +1,4 @@
-"""Accuracy against time during a run: the clock, the points of the curve, and the reasons to stop."""
+"""Accuracy against time during a run: the clock, and the points of the curve."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 import torch
 from pydantic import BaseModel, ConfigDict
 
-from mipmap_plugin.clock import now
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.process.clock import now
 
 
 class CurvePoint(BaseModel):
@@ -72,23 +72,6 @@ def decibel(mean_square: float) -> float:
 def psnr_as_shown(image: torch.Tensor, truth: torch.Tensor) -> float:
     """PSNR (dB) of two images, clamped to 0..1 as a display does. On their own device, and quicker than the metric of evaluations."""
     return decibel(float((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean()))
-
-
-def reason_to_stop(curve: list[CurvePoint], seconds: float, config: AdaptConfig, reserved: float = 0.0) -> str | None:
-    """Why a run ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue.
-
-    `reserved`: those of the seconds that are kept for what comes after the steps.
-    """
-    if config.time_budget_s is not None and seconds >= config.time_budget_s:
-        took = "the start took" if seconds - reserved >= config.time_budget_s else "the start and the choice of a state take"
-        return f"time budget of {config.time_budget_s:g} s" + (f", all of which {took}" if not curve[-1].step else "")
-    psnrs = [point.psnr_db for point in curve if point.psnr_db is not None]
-    if config.target_db is not None and psnrs and psnrs[-1] >= config.target_db:
-        return f"target of {config.target_db:g} dB against the pseudo truth"
-    patience = config.patience
-    if patience is not None and len(psnrs) > patience and max(psnrs[-patience:]) < max(psnrs[:-patience]) + config.min_gain_db:
-        return f"knee: {patience} checks in a row gained less than {config.min_gain_db:g} dB"
-    return None
 
 
 def is_true(answer: object) -> bool:

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 from torch import Tensor
 
-from mipmap_plugin import threads
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.process import threads
 from mipmap_plugin.splatting.camera_tensors import CameraTensors
 
 Result = TypeVar("Result")

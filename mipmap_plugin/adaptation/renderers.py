@@ -11,16 +11,16 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from mipmap_plugin import threads
 from mipmap_plugin.backends.base import Backend, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.process import threads
+from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.splatting.packing import in_two_steps, packed
-from mipmap_plugin.threads import side_by_side
 
-# For a rounding that does not depend on it.
+# A camera of one pixel, for what does not depend on it.
 NO_CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 # The numbers of views in a step and their images [h, w, 3] -> the gradient of each one's loss, [h, w, 3], and its mean square error, [].

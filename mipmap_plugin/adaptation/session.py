@@ -12,7 +12,6 @@ from pathlib import Path
 
 from torch import Tensor
 
-from mipmap_plugin import pool, threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, is_true
 from mipmap_plugin.adaptation.following import Following, release
@@ -20,6 +19,7 @@ from mipmap_plugin.adaptation.in_viewers import better_as_trained, psnr_as_train
 from mipmap_plugin.adaptation.moments import at_their_moments, evaluate_moments
 from mipmap_plugin.adaptation.optimization.amount import affordable_for_model, affordable_moments, fewer_note, takes_steps
 from mipmap_plugin.adaptation.optimization.budget import no_steps_notes, plan_note, within_budget
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.growing import growth_note
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
@@ -40,11 +40,12 @@ from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views, orbit_of, over_band, refuse_blind, remarks, showing, too_unlike
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera, digest_of, evenly
-from mipmap_plugin.clock import now
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effect, Effects, explain
 from mipmap_plugin.models.base import SplatModel, count_of, digest_of_parameters, effects_of
 from mipmap_plugin.models.health import doubts_in
+from mipmap_plugin.process import pool, threads
+from mipmap_plugin.process.clock import now
 from mipmap_plugin.progress import announced
 
 # (step, seconds of adapting so far, function that renders a camera of the new scale with the current model, without gradients)
@@ -75,6 +76,7 @@ class Session:
     """One call of `adapt`: makes the parts, and runs them in order."""
 
     notes: Sequence[str] = ()  # on what the views show of the base
+    ended: End | None = None  # why the steps ended
     keeps_state = False  # whether the state of a run that has ended is kept too: because another one starts from what it returns
 
     def __init__(self, request: AdaptationRequest, scale: float, config: AdaptConfig, cameras: list[Camera], real: Photographs | None) -> None:
@@ -120,7 +122,7 @@ class Session:
 
     def run(self, resume: Path | None, observe: Observer | None) -> Adapted:
         """Adapt the base, or continue the run that `resume` holds, and return the best state."""
-        near, few = self.base_effects.near_plane, _rows(self.base) <= (self.config.most_splats or sys.maxsize)
+        near, few = self.base_effects.near_plane, len(self.base.parameters()["means"]) <= (self.config.most_splats or sys.maxsize)
         refuse_blind(self.base_views, self.base, near, self.truth)
         if self.scale == 1 and self.config.band == (1, 1) and few and all(target == self.base_effects for target in self.targets.values()):
             copy, reason = self._for_target(self.base), "scale 1, at which the base is right as it is"
@@ -160,7 +162,7 @@ class Session:
     def _select(self, states: dict[str, SplatModel], curve: list[CurvePoint], ended_by: str) -> Adapted:
         """Return the best of the states on views that did not steer the run, or the last where the settings say so."""
         began, most = now(self.device), self.config.most_splats or sys.maxsize
-        allowed = [name for name, model in states.items() if _rows(model) <= most]
+        allowed = [name for name, model in states.items() if len(model.parameters()["means"]) <= most]
         (base, start, *_), last = states, allowed[-1]
         with self.phase("validation"):
             best, psnrs = self.validation.choose(states, allowed)
@@ -180,7 +182,7 @@ class Session:
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""
-        max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * _rows(student))
+        max_splats = sys.maxsize if self.config.most_growth is None else int(self.config.most_growth * len(student.parameters()["means"]))
         max_splats = min(max_splats, self.config.most_splats or sys.maxsize)
         targets = [unrounded(target) for target in self.extremes.values()]
         first, *further = [Renderer(self.backend, target) for target in targets]
@@ -200,7 +202,7 @@ class Session:
             keeper.save_if_due(run)
             return is_true(observe and observe(run.step, run.watch.seconds, first.of_model(run.student)))
 
-        if not run.ended_by:
+        if run.ended_by is None:
             task, config = within_budget(run, task, self.config)
             run.ended_by = adapt(run, task, config, keeper.save_and_stop, after_step)
             release(run.student)
@@ -214,7 +216,9 @@ class Session:
         self.seconds["optimization"] = run.watch.seconds - self.seconds["total"] - run.costs.seconds()
         self.seconds["total"] = run.watch.seconds
         self.notes = [*self.notes, *([] if self.keeps_state else no_steps_notes(run, self.config, self.budget_share))]
-        return run, run.ended_by + (plan_note(run, self.config) or fewer_note(self.asked_steps, self.config)) + growth_note(run)
+        self.ended = run.ended_by
+        told = run.ended_by.told(self.config, run.step, self.budget_share)
+        return run, told + (plan_note(run, self.config) or fewer_note(self.asked_steps, self.config)) + growth_note(run)
 
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
@@ -294,7 +298,3 @@ class Session:
             orbit=orbit_of(self.base),
             notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
         )
-
-
-def _rows(model: SplatModel) -> int:
-    return len(model.parameters()["means"])

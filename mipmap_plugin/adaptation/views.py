@@ -30,7 +30,6 @@ from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, Orbit, jittered
 ORBIT_PIXELS = 800
 ORBIT_VIEWS = 50
 
-
 # Views that are looked at to see whether they show anything; and the fraction of a view's splats before the near plane, mean over them, that is worth
 # a word. Floaters lie before a camera, but captures in common units have none of their splats there; in a tenth of these they have 2 %, in a
 # twentieth half.

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import INTEGRATED, Effect, Effects
+from mipmap_plugin.effects import Effect, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, RenderSettings
+from mipmap_plugin.screen_filters import INTEGRATED
 
 # Render settings other than the default that a backend may support: field of RenderSettings -> its name in messages.
 SETTINGS = {

@@ -14,10 +14,11 @@ from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import INTEGRATED, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, install
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
+from mipmap_plugin.screen_filters import INTEGRATED
 from mipmap_plugin.splatting.buckets import ranks_for
 from mipmap_plugin.splatting.packing import packed
 

@@ -30,8 +30,9 @@ from mipmap_plugin.backends.base import API_VERSION, Capabilities, Needs, Render
 from mipmap_plugin.backends.external import NO_CUDA, CachedCheck, finite_splats, normalized
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.splatting.filters import footprint
 from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.rotations import rotations

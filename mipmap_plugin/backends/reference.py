@@ -12,9 +12,10 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
+from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.splatting import buckets
 from mipmap_plugin.splatting.compositing import SortedSplats, composite, independent
-from mipmap_plugin.splatting.filters import SCREEN_FILTERS, Footprint, footprint
+from mipmap_plugin.splatting.filters import Footprint, footprint
 from mipmap_plugin.splatting.harmonics import colors
 from mipmap_plugin.splatting.packing import packed, round_to
 from mipmap_plugin.splatting.pixel_integral import PixelIntegral
@@ -29,7 +30,7 @@ class ReferenceBackend:
     name = "reference"
     api_version = API_VERSION
     speed = 0
-    capabilities = Capabilities(None, frozenset({torch.float32, torch.float64}), SCREEN_FILTERS | {SURFEL}, settings=frozenset(SETTINGS))
+    capabilities = Capabilities(None, frozenset({torch.float32, torch.float64}), frozenset({*SCREEN_FILTERS, SURFEL}), settings=frozenset(SETTINGS))
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""

@@ -15,7 +15,7 @@ from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
 from mipmap_plugin.commands.tiled import adapt_tiled
-from mipmap_plugin.commands.types import Background, Checkpoints, Scale, ScreenFilter, unique_scales
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoints, Scale, ScreenFilter, Seed, Threads, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.errors import SettingsError
@@ -53,15 +53,15 @@ def adapt(
     output: Path | None = None,
     recipe: str = "default",
     viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
-    cameras: Path | None = None,
+    cameras: Cameras = None,
     splats: int | None = None,
     bytes: str | None = None,
     images: Path | None = None,
-    background: Background | None = None,
-    screen_filter: ScreenFilter | None = None,
-    backend: str = "auto",
-    threads: int | None = None,
-    seed: int = 0,
+    background: Background = None,
+    screen_filter: ScreenFilter = None,
+    backend: BackendName = "auto",
+    threads: Threads = None,
+    seed: Seed = 0,
     report: bool = False,
     overwrite: bool = False,
     json: bool = False,
@@ -76,15 +76,9 @@ def adapt(
         output: Where to write; by default beside the checkpoint, as NAME_x0.25. With several scales or viewers: a folder for all files.
         recipe: default; thorough (more steps and views); instant (closed form only, seconds); paper (the published method); or a registered one.
         viewer: Viewer to make the file for: classic, spark, ...; portable: all; several: a file each. By default what draws as the training did.
-        cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
         splats: Maximum number of splats. Without a scale, the file is made for the zoom that so many splats suit.
         bytes: Maximum size of the file, such as 20MB, in place of a number of splats.
         images: Folder of the scene. A zoom-in is then adapted to its training images, at the resolution of the base, instead of the base's own.
-        background: Of the scene; by default that of the checkpoint, or else black.
-        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
-        backend: Name of a backend; auto chooses the fastest one that can serve the request.
-        threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
-        seed: Seed of everything random.
         report: Also write a page that shows what came out: NAME.report.html beside the file, or in the folder of several files.
         overwrite: Replace outputs that exist.
         json: Print the reports as JSON.
@@ -133,7 +127,7 @@ def _adapted(
     wrapped: Wrapped, requests: Sequence[tuple[float, str | None]], targets: Sequence[Path], settings: dict[str, Any]
 ) -> Iterator[tuple[Adapted, Path]]:
     """Yield each model as soon as it is adapted, and the path to save it to."""
-    from mipmap_plugin.wrap import state_path
+    from mipmap_plugin.models.places import state_path
 
     wrapped.keeps_images = len(requests) > 1
     for (scale, viewer), target in zip(requests, targets, strict=True):

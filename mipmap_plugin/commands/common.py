@@ -9,10 +9,9 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.types import Background, ScreenFilter
 from mipmap_plugin.commands.voice import put, say
 from mipmap_plugin.formats.atomic import json_text
-from mipmap_plugin.garbage import leave_loaded, uncollected
+from mipmap_plugin.process.garbage import leave_loaded, uncollected
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -34,16 +33,17 @@ def this_command() -> str:
 
 
 def wrap(
-    checkpoint: Path, cameras: Path | None, background: Background | None, backend: str, screen_filter: ScreenFilter | None = None,
+    checkpoint: Path, cameras: Path | None, background: str | None, backend: str, screen_filter: str | None = None,
     threads: int | None = None,
 ) -> Wrapped:  # fmt: skip
+    """Load and wrap a checkpoint, for whatever is done in this process. `threads`: for torch too. Raises what `Base.load` raises."""
     from mipmap_plugin.jobs.base import Base
 
     with announced(f"reading {checkpoint.name}"), uncollected():
         wrapped = Base(checkpoint, cameras, background, backend, screen_filter).load(threads)
         leave_loaded()
         if threads is not None:
-            from mipmap_plugin.threads import limit_torch  # here, for it imports torch
+            from mipmap_plugin.process.threads import limit_torch  # here, for it imports torch
 
             limit_torch(threads)  # also for what is measured: on a busy machine small images take many times as long on torch's threads
         return wrapped

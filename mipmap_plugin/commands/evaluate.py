@@ -14,7 +14,7 @@ import tyro
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.resuming import resumable, resume_path
-from mipmap_plugin.commands.types import Background, Scales, ScreenFilter, unique_scales
+from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
@@ -38,11 +38,11 @@ def evaluate(
     steps: int | None = None,
     upsampler: str | None = None,
     appearance: Literal["mean", "upstream"] = "mean",
-    background: Background | None = None,
-    screen_filter: ScreenFilter | None = None,
-    backend: str = "auto",
-    threads: int | None = None,
-    seed: int = 0,
+    background: Background = None,
+    screen_filter: ScreenFilter = None,
+    backend: BackendName = "auto",
+    threads: Threads = None,
+    seed: Seed = 0,
     output: Path | None = None,
     report: bool = True,
     overwrite: bool = False,
@@ -63,11 +63,6 @@ def evaluate(
         steps: Maximum number of optimizer steps, instead of the recipe's; a recipe without steps takes none.
         upsampler: What makes base images larger: a registered name, or the file of a network.
         appearance: Appearance of test views, if training views have their own: mean of these, or upstream (of the view with the same number).
-        background: Of the scene; by default that of the checkpoint, or else black.
-        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
-        backend: Name of a backend; auto chooses the fastest one that can serve the request.
-        threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
-        seed: Seed of everything random.
         output: Also write the rows, and notes on missing ones, as JSON to this file.
         report: Write a page that shows it all: beside `output`, or else NAME.evaluation.html in this folder, numbered if there is one already.
         overwrite: Replace files that exist.

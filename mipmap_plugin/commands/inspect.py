@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import print_facts, summary
 from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
-from mipmap_plugin.garbage import uncollected
+from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def inspect(
     checkpoint: Checkpoint,
     iteration: int | None = None,
-    screen_filter: ScreenFilter | None = None,
+    screen_filter: ScreenFilter = None,
     viewers: bool = True,
     all: bool = False,
     json: bool = False,
@@ -30,7 +30,6 @@ def inspect(
     Args:
         checkpoint: A PLY or a model folder.
         iteration: Which iteration of a model folder; by default the newest.
-        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
         viewers: Render a few views as web viewers do, and report their PSNR against the renders of the training.
         all: Also list the effects that are off, with reasons. The JSON always has them.
         json: Print JSON instead of sentences.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
     from mipmap_plugin.levels.finished import Ladder
     from mipmap_plugin.levels.request import LadderRequest
-    from mipmap_plugin.wrapped import Wrapped
+    from mipmap_plugin.wrap import Wrapped
 
 
 # An orbit has pixels of its own size, so that a viewer would change levels at other distances: of lego_100 at an eleventh of them.
@@ -63,11 +63,11 @@ class Exports:
 def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Exports, overwrite: bool) -> tuple[dict[str, Any], list[Path]]:
     """Make and save a ladder; return its manifest and what was written besides the levels. Raises OutputExists and SettingsError at once, but for
     Streamed SOG of a ladder that comes out as a single level, because that has few enough splats or no other is of use."""
-    from mipmap_plugin import threads
     from mipmap_plugin.levels.manifest import read_manifest, refuse_ladder
     from mipmap_plugin.levels.room import room_for
     from mipmap_plugin.levels.streamed import SINGLE_LEVEL
-    from mipmap_plugin.wrap import state_path
+    from mipmap_plugin.models.places import state_path
+    from mipmap_plugin.process import threads
 
     unfinished = state_path(output)
     refuse_ladder(output, wrapped, overwrite=overwrite)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mipmap_plugin.commands.common import without_none, wrap
 from mipmap_plugin.commands.ladders import Exports, print_summary, saved
-from mipmap_plugin.commands.types import Background, Checkpoint, Scale, ScreenFilter, Way
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Way
 from mipmap_plugin.config import ViewPolicy
 
 
@@ -24,13 +24,13 @@ def levels(
     canvas: int = 1080,
     recipe: str = "default",
     views: ViewPolicy | None = None,
-    cameras: Path | None = None,
+    cameras: Cameras = None,
     steps: int | None = None,
-    background: Background | None = None,
-    screen_filter: ScreenFilter | None = None,
-    backend: str = "auto",
-    threads: int | None = None,
-    seed: int = 0,
+    background: Background = None,
+    screen_filter: ScreenFilter = None,
+    backend: BackendName = "auto",
+    threads: Threads = None,
+    seed: Seed = 0,
     report: bool = False,
     overwrite: bool = False,
     json: bool = False,
@@ -52,13 +52,7 @@ def levels(
         canvas: Shorter side in px of the canvas that the distances of Streamed SOG are computed for.
         recipe: default, thorough (more steps and views), instant (no optimization), or a registered one.
         views: Which views to adapt to; by default those of the recipe.
-        cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
         steps: Maximum number of optimizer steps for each level.
-        background: Of the scene; by default that of the checkpoint, or else black.
-        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
-        backend: Name of a backend; auto chooses the fastest one that can serve the request.
-        threads: Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it.
-        seed: Seed of everything random.
         report: Also write report.html into the folder: dB over zoom with the switches and pictures at each, or by distance dB and pictures of walks.
         overwrite: Replace a ladder that exists.
         json: Print levels.json.

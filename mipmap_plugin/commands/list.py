@@ -9,7 +9,7 @@ import tyro
 
 from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.errors import MipmapPluginError
-from mipmap_plugin.garbage import uncollected
+from mipmap_plugin.process.garbage import uncollected
 
 if TYPE_CHECKING:
     from mipmap_plugin.registry import Registry

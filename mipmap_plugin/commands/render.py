@@ -12,7 +12,7 @@ import tyro
 
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.commands.outputs import picture_names
-from mipmap_plugin.commands.types import Background, Checkpoint, OwnScale
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
@@ -38,9 +38,9 @@ def render(
     depth: bool = False,
     normals: bool = False,
     exposure: bool = False,
-    cameras: Path | None = None,
-    background: Background | None = None,
-    backend: str = "auto",
+    cameras: Cameras = None,
+    background: Background = None,
+    backend: BackendName = "auto",
     overwrite: bool = False,
 ) -> None:
     """Render views of a checkpoint as PNG files, optionally with depth and normals.
@@ -59,9 +59,6 @@ def render(
         depth: Also write NAME_depth.npy, [height, width] float32: world units along the optical axis, 0 where there is nothing.
         normals: Also write NAME_normals.npy, [height, width, 3] float32: unit vectors in world axes, 0 where there is nothing.
         exposure: Apply the exposure of each view's photograph, if the training learned one (exposure.json of 3DGS).
-        cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
-        background: Of the scene; by default that of the checkpoint, or else black.
-        backend: Name of a backend; auto chooses the fastest one that can serve the request.
         overwrite: Replace pictures that exist.
     """
     wrapped = wrap(checkpoint, cameras, background, backend)
@@ -87,13 +84,11 @@ def render(
 
 def _check(wrapped: Wrapped, views: Sequence[Camera], exposure: bool) -> None:
     """Raise the error of a view without an `exposure`; warn of views that show nothing, or a speck, which are written all the same."""
-    from mipmap_plugin.wrap import refuse_undrawn
-
     if exposure:
         for camera in views:
             wrapped.model.traits.exposures.of(camera)
     try:
-        refuse_undrawn(wrapped, views)
+        wrapped.refuse_undrawn(views)
     except SettingsError as error:
         warnings.warn(str(error), stacklevel=1)
 

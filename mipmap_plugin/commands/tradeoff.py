@@ -35,8 +35,8 @@ def tradeoff(
     renderers: bool = True,
     repeats: int = 3,
     views: int | None = None,
-    background: Background | None = None,
-    screen_filter: ScreenFilter | None = None,
+    background: Background = None,
+    screen_filter: ScreenFilter = None,
     threads: int | None = None,
     seed: int = 0,
     picture: bool = True,
@@ -61,8 +61,6 @@ def tradeoff(
         renderers: Also render the first adapted model with other thresholds, tiles and float types, by the reference backend.
         repeats: Number of runs, each with its own seed; the median and the whole range are reported.
         views: Maximum number of views to evaluate on.
-        background: Of the scene; by default that of the checkpoint, or else black.
-        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
         threads: Maximum number of processor threads; by default as many as torch finds.
         seed: Seed of the first repeat.
         picture: Draw tradeoff.png, which needs the extra `plot`.

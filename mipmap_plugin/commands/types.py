@@ -43,8 +43,28 @@ _SCALE = tyro.constructors.PrimitiveConstructorSpec[Any](
 Scale = Annotated[float, _SCALE]
 OwnScale = Annotated[float | None, _SCALE]  # None: that of the file
 Scales = tyro.conf.UseAppendAction[list[Scale]]
-Background = Literal["white", "black"]
-ScreenFilter = TrainedName
 Way = Literal["auto", "zoom", "distance"]  # of levels (`levels.request.WAYS`)
 Checkpoint = tyro.conf.Positional[Path]
 Checkpoints = tyro.conf.Positional[tuple[Path, ...]]
+
+# Options that several commands have, with what their help says.
+Cameras = Annotated[
+    Path | None, tyro.conf.arg(help="A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.")
+]
+Background = Annotated[
+    Literal["white", "black"] | None, tyro.conf.arg(help="Of the scene; by default that of the checkpoint, or else black.")
+]
+ScreenFilter = Annotated[
+    TrainedName | None,
+    tyro.conf.arg(
+        help="The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example."
+    ),
+]
+BackendName = Annotated[str, tyro.conf.arg(help="Name of a backend; auto chooses the fastest one that can serve the request.")]
+Threads = Annotated[
+    int | None,
+    tyro.conf.arg(
+        help="Maximum number of processor threads; by default as many as torch finds. With the backend cpu the result does not depend on it."
+    ),
+]
+Seed = Annotated[int, tyro.conf.arg(help="Seed of everything random.")]

@@ -14,7 +14,7 @@ import tyro
 
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.types import Background, Checkpoint, ScreenFilter
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.progress import announced
@@ -32,10 +32,10 @@ def view(
     adapted: tyro.conf.Positional[tuple[Path, ...]] = (),
     viewer: str | None = None,
     output: Path | None = None,
-    cameras: Path | None = None,
-    background: Background | None = None,
-    screen_filter: ScreenFilter | None = None,
-    backend: str = "auto",
+    cameras: Cameras = None,
+    background: Background = None,
+    screen_filter: ScreenFilter = None,
+    backend: BackendName = "auto",
     threads: int | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -48,16 +48,12 @@ def view(
         adapted: Files adapted from it, and folders of levels, to switch to.
         viewer: Viewer whose drawing is shown first: classic, spark, playcanvas (or supersplat), ... An unknown name lists all viewers.
         output: Folder for what the page's button saves; by default beside the checkpoint. Nothing is overwritten.
-        cameras: A cameras.json, a transforms file or a COLMAP scene, if there are no cameras beside the checkpoint.
-        background: Of the scene; by default that of the checkpoint, or else black.
-        screen_filter: The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example.
-        backend: Name of a backend; auto chooses the fastest one that can serve the request.
         threads: Maximum number of processor threads; by default as many as torch finds.
         host: Address that the page is served at. Whoever reaches it can use the page; the default is this machine alone.
         port: Port of the page; where it is taken, the next free one.
         browser: Also open the page, where there is a display.
     """
-    from mipmap_plugin import threads as all_threads
+    from mipmap_plugin.process import threads as all_threads
     from mipmap_plugin.viewing.page import PageSettings
 
     if not 0 <= port <= 65535:

@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.demo.story import story
@@ -25,9 +24,10 @@ from mipmap_plugin.formats.images import write_image
 from mipmap_plugin.pages.gallery import Gallery
 from mipmap_plugin.pages.html import write_page
 from mipmap_plugin.pages.reports import evaluation_page
+from mipmap_plugin.process import threads
+from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.progress import announced
 from mipmap_plugin.scenes import read_cameras
-from mipmap_plugin.threads import side_by_side
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
 PROTOCOL = Protocol("demo", "box", truncate=False)

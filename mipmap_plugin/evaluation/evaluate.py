@@ -39,7 +39,7 @@ from mipmap_plugin.recipes import most_steps
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
 from mipmap_plugin.splatting.viewers import viewers_for
-from mipmap_plugin.wrap import Wrapped, refuse_undrawn
+from mipmap_plugin.wrap import Wrapped
 
 # In the name of a row that is the worst of several viewers'.
 WORST = ", worst of "
@@ -209,7 +209,7 @@ def all_rows(model: Wrapped, judge: Evaluator, scales: Sequence[float], recipes:
     model.targets(viewer)  # raise errors of the viewer, the recipes and the settings before any work
     for name, scale in product(recipes, scales):
         make_config(name, scale, **{key: value for key, value in settings.items() if key in AdaptConfig.model_fields})
-    refuse_undrawn(model, [view.camera for view in judge.views])
+    model.refuse_undrawn([view.camera for view in judge.views])
     if doubt := of_another_scene(model, judge.views, scales[0], judge.protocol):
         warnings.warn(doubt, stacklevel=2)
     for scale in scales:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, install
 from mipmap_plugin.formats.torch_file import load_torch
-from mipmap_plugin.torchvision_absent import torchvision_optional
+from mipmap_plugin.process.torchvision_absent import torchvision_optional
 
 # A backbone and its input: images in -1..1, as LPIPS is defined, or (01) in 0..1, as papers of this field use VGG.
 Kind = Literal["alex", "vgg", "vgg-01"]

@@ -137,7 +137,10 @@ def ready_made(photograph: Path, size: tuple[int, int]) -> Path:
 
 
 def test_views(scene: Scene, base: Sequence[Camera], background: tuple[float, float, float]) -> list[TestView]:
-    """The scene's test photographs (all, if none is marked as test), with their cameras at the pixel density of the cameras of the base."""
+    """The scene's test photographs (all, if none is marked as test), with their cameras at the pixel density of the cameras of the base.
+
+    Raises SettingsError without photographs, SceneError for a damaged one.
+    """
     cameras = [c for c in scene.cameras if c in scene.images]
     cameras = [c for c in cameras if c.split == "test"] or cameras
     if not cameras:

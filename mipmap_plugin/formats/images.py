@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from mipmap_plugin.errors import SceneError, SettingsError, ShapeError
+from mipmap_plugin.errors import SceneError, SettingsError, ShapeError, brief
 from mipmap_plugin.formats.atomic import new_file, no_file
 from mipmap_plugin.limits import check_image
 
@@ -186,7 +186,7 @@ def read_array(path: str | Path) -> Tensor:
     try:
         return torch.from_numpy(np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=np.float64))
     except (OSError, ValueError, TypeError, SyntaxError, OverflowError, RecursionError) as error:  # what NumPy raises for other files
-        raise SceneError(f"{path}: is not an array that NumPy reads ({(str(error).splitlines() or [''])[0][:120]}); copy it again") from error
+        raise SceneError(f"{path}: is not an array that NumPy reads ({brief(error)}); copy it again") from error
 
 
 def _refuse_bomb(path: Path, width: int, height: int) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import CheckpointError, brief
 from mipmap_plugin.formats.atomic import no_file
 
 # Beginning of a placeholder for a file that Git LFS has not fetched.
@@ -111,8 +111,7 @@ def archive(path: Path) -> Iterator[zipfile.ZipFile]:
     except CheckpointError:
         raise
     except Exception as error:  # bad offsets, names, versions, checksums and streams raise different exceptions
-        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
-        raise CheckpointError(f"{path} is a damaged zip archive ({reason}); download or copy it again") from error
+        raise CheckpointError(f"{path} is a damaged zip archive ({brief(error)}); download or copy it again") from error
 
 
 def _kind_of_zip(path: Path) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.garbage import uncollected
+from mipmap_plugin.process.garbage import uncollected
 
 if TYPE_CHECKING:
     from mipmap_plugin.wrap import Wrapped

@@ -10,9 +10,9 @@ from mipmap_plugin.errors import MipmapPluginError, OutputExists
 from mipmap_plugin.jobs.finished import finished
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.limits import is_out_of_memory
+from mipmap_plugin.models.places import state_path
 from mipmap_plugin.models.zipped_folder import told
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.wrap import state_path
 
 
 def run(job: Job, threads: int | None = None) -> Outcome:

@@ -18,13 +18,14 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import replace
 from typing import IO
 
-from mipmap_plugin.freed_memory import keep_freed_memory
 from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.process.freed_memory import keep_freed_memory
 
 Request = tuple[Job, "int | None"]
 
 
 def main() -> None:
+    """Do the jobs that come on standard input, and write their outcomes to standard output, until the owner closes it."""
     signal.signal(signal.SIGINT, _leave)
     keep_freed_memory()  # also in workers of dask, whose environment asks for the opposite
     answers = os.fdopen(os.dup(1), "wb")

@@ -87,7 +87,10 @@ class Worker:
 
 
 def do(job: Job, worker: Worker, watch: Callable[[], None] = lambda: None, attempts: int = ATTEMPTS) -> Outcome:
-    """Do a job in a worker; if that dies, in a new one, up to `attempts` times. `watch` is called while the job runs."""
+    """Do a job in a worker; if that dies, in a new one, up to `attempts` times. `watch` is called while the job runs.
+
+    Raises ValueError without attempts.
+    """
     sent = replace(job, base=job.base.unpacked())
     for attempt in range(1, attempts + 1):
         try:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mipmap_plugin.adaptation.adapted import Adapted
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import Band, LadderRequest
-from mipmap_plugin.wrap import Wrapped
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Contents:
     """Levels from the finest to the coarsest, and how good they are."""
 
     request: LadderRequest
-    base: Wrapped
+    base: FrozenBase
     levels: list[Level]
     switches: list[Switch]  # between a level and the next: falling zooms
     curve: list[CurvePoint]  # by falling zoom

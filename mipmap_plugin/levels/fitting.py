@@ -15,11 +15,11 @@ from mipmap_plugin.adaptation.views import orbit_of
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.models import contract
 from mipmap_plugin.models.base import SplatModel, digest_of_parameters
 from mipmap_plugin.models.mip import for_loader_of, wants_filter
 from mipmap_plugin.recipes import recipe, scale_of_fraction
-from mipmap_plugin.wrap import Wrapped
 
 UNITS = {"": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
 SIZE = re.compile(r"([0-9.]+)\s*([a-z]*)", re.IGNORECASE)
@@ -52,10 +52,10 @@ def read_size(text: str) -> int:
     return size
 
 
-def recorded(base: Wrapped, requests: Sequence[tuple[float, str | None]], settings: Mapping[str, Any]) -> dict[str, Any]:
+def recorded(base: FrozenBase, requests: Sequence[tuple[float, str | None]], settings: Mapping[str, Any]) -> dict[str, Any]:
     """What the header of an adapted file will record, as far as it is known before the run; of several files, that of the largest.
 
-    `requests`: scales and viewers, at least one. `settings`: those of `Wrapped.adapt`, with the recipe's name. Raises SettingsError for one that is
+    `requests`: scales and viewers, at least one. `settings`: those of `adapt`, with the recipe's name. Raises SettingsError for one that is
     unknown or out of range.
     """
     further = {**settings, "most_splats": len(base.model.parameters()["means"])}

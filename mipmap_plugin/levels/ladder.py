@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import Contents, CurvePoint, LeftOut, Level, Switch
 from mipmap_plugin.levels.distance.ladder import by_distance, make_levels_by_distance
 from mipmap_plugin.levels.finished import Ladder
@@ -25,8 +25,8 @@ from mipmap_plugin.levels.store import LevelStore
 from mipmap_plugin.levels.switching import switching_zoom, zooms_between
 from mipmap_plugin.levels.yardstick import Yardstick
 from mipmap_plugin.models.base import why_no_viewer
+from mipmap_plugin.process import threads
 from mipmap_plugin.progress import announced
-from mipmap_plugin.wrap import Wrapped, refuse_undrawn
 
 # Two neighboring zooms of the curve of dB are at most this factor apart.
 CURVE_STEP = 2**0.25
@@ -37,21 +37,21 @@ MORE_SPLATS = "more splats than the finer level has"
 UNSHOWN = "at every zoom a neighbor is as good"
 
 
-def make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
+def make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
     """Make the levels. `resume`: a folder for finished levels, to go on from after an interruption; saving the ladder removes it.
 
     Raises SettingsError for a model that no viewer draws, for views that show nothing and for a group of viewers, BackendUnavailable, Interrupted.
     """
     if reason := why_no_viewer(base.model):
         raise SettingsError(f"{base.model.family}: {reason}; levels are files for viewers, so adapt it to one scale at a time")
-    refuse_undrawn(base)
+    base.refuse_undrawn()
     if by_distance(base, request):
         return make_levels_by_distance(base, request, resume)
     with threads.limited(base.threads, shared=False):
         return _make_levels(base, request, resume)
 
 
-def _make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | None) -> Ladder:
+def _make_levels(base: FrozenBase, request: LadderRequest, resume: str | Path | None) -> Ladder:
     """`make_levels` by zoom."""
     band = request.first_band(base.target(request.viewer), base.effects())
     store = LevelStore(None if resume is None else Path(resume), base, request)
@@ -71,7 +71,7 @@ def _make_levels(base: Wrapped, request: LadderRequest, resume: str | Path | Non
 class _Work:
     """What levels are made from, kept in and judged by."""
 
-    base: Wrapped
+    base: FrozenBase
     request: LadderRequest
     store: LevelStore
     yardstick: Yardstick

@@ -10,10 +10,10 @@ from typing import Any
 from mipmap_plugin.adaptation.start.pixel_size import pixel_size, seen_pixel_size
 from mipmap_plugin.formats.atomic import new_folder, refuse_output, refuse_to_lose, refuse_unwritable, sha256, write_json
 from mipmap_plugin.formats.json_file import read_json
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.contents import Contents
 from mipmap_plugin.levels.yardstick import TRUTH
 from mipmap_plugin.models.places import LADDER, REPORT
-from mipmap_plugin.wrap import Wrapped
 
 MANIFEST = LADDER
 FORMAT = "mipmap_plugin levels 1"
@@ -27,7 +27,7 @@ def level_name(number: int) -> str:
     return f"level_{number}.ply"
 
 
-def refuse_ladder(folder: Path, base: Wrapped, *, overwrite: bool, room: int = 0) -> None:
+def refuse_ladder(folder: Path, base: FrozenBase, *, overwrite: bool, room: int = 0) -> None:
     """Raise what writing a ladder to `folder` would raise. A folder with other things in it is never replaced. Raises OutputExists, OutputError.
 
     `room`: bytes that its disk needs (`room.room_for`).
@@ -73,7 +73,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
     }
 
 
-def base_pixel(base: Wrapped) -> float:
+def base_pixel(base: FrozenBase) -> float:
     """The size in world units of a pixel of the base at its median splat of those in a picture, in the closest view; of all, if none is."""
     means, views = base.model.parameters()["means"].detach(), base.views()
     seen = seen_pixel_size(means, views, base.effects().near_plane)

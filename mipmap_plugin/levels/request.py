@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from mipmap_plugin.effects import COMPENSATED, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import check_scale
 from mipmap_plugin.recipes import recipe
+from mipmap_plugin.screen_filters import COMPENSATED
 
 # The ratio of neighboring scales: WIDE or NARROW down to DENSE_BELOW, then NARROW, because small levels cost little. A level that was adapted to its
 # band loses 3 to 4 dB at the ends of an octave where the viewer compensates or hardly dilates, and 8 dB where it dilates by 0.3 px² (lego at x1/4);

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipmap_plugin.adaptation.start.pixel_size import seen_pixel_size
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.distance.coarsening import kept_splats
 from mipmap_plugin.levels.distance.ladder import by_distance
 from mipmap_plugin.levels.distance.rule import DistanceRule
 from mipmap_plugin.levels.request import Band, LadderRequest
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.wrap import Wrapped
 
 # Columns of a PLY that are no parameters: the normals.
 NORMALS = 3
@@ -19,14 +19,14 @@ NORMALS = 3
 SAMPLE = 100_000
 
 
-def room_for(base: Wrapped, request: LadderRequest, unfinished: Path) -> int:
+def room_for(base: FrozenBase, request: LadderRequest, unfinished: Path) -> int:
     """About how many bytes a ladder still writes: each level is kept in the folder `unfinished`, and copied to the output when all are ready."""
     levels = round(sum(shares(base, request)) * _bytes(base.model))
     kept = sum(file.stat().st_size for file in unfinished.glob("level_*.ply"))
     return max(0, levels - kept) + max(levels, kept)
 
 
-def shares(base: Wrapped, request: LadderRequest) -> list[float]:
+def shares(base: FrozenBase, request: LadderRequest) -> list[float]:
     """How many splats each level is planned to have, in those of the base. Merging may keep more, where it would cost too much."""
     if base.model.traits.no_viewer:
         return [1.0]  # no ladder is made
@@ -41,7 +41,7 @@ def shares(base: Wrapped, request: LadderRequest) -> list[float]:
     return found
 
 
-def _by_distance(base: Wrapped, request: LadderRequest, band: Band) -> list[float]:
+def _by_distance(base: FrozenBase, request: LadderRequest, band: Band) -> list[float]:
     means = base.model.parameters()["means"].detach()
     pixels = seen_pixel_size(means[:: 1 + len(means) // SAMPLE], base.views(), base.effects().near_plane)
     if not len(pixels):

@@ -17,11 +17,11 @@ from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError, SettingsError
 from mipmap_plugin.formats.atomic import json_text, write_json
 from mipmap_plugin.formats.json_file import read_json
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_parameters
-from mipmap_plugin.models.places import REPORT
-from mipmap_plugin.wrap import Wrapped, state_path
+from mipmap_plugin.models.places import REPORT, state_path
 
 REQUEST = "request.json"
 
@@ -29,7 +29,7 @@ REQUEST = "request.json"
 class LevelStore:
     """Finished levels of one ladder in a folder; without a folder nothing is kept."""
 
-    def __init__(self, folder: Path | None, base: Wrapped, request: LadderRequest) -> None:
+    def __init__(self, folder: Path | None, base: FrozenBase, request: LadderRequest) -> None:
         """Raises SettingsError for a folder with levels of another ladder, SceneError for a damaged one, OutputError if it cannot be written."""
         self._folder, self._base, self._target = folder, base, base.target(request.viewer)
         if folder is None:
@@ -72,11 +72,11 @@ class LevelStore:
         return Adapted(model, report, backend, self._target, {str(report.viewer): self._target}, cameras=self._base.views())
 
 
-def _trained(base: Wrapped, target: Effects) -> Any:
+def _trained(base: FrozenBase, target: Effects) -> Any:
     return replace(base.trained, screen_filter=target.screen_filter, eps2d=target.eps2d)
 
 
-def _facts(base: Wrapped, request: LadderRequest) -> dict[str, Any]:
+def _facts(base: FrozenBase, request: LadderRequest) -> dict[str, Any]:
     """Everything that the levels depend on."""
     of_base = {"base": base.model.digest or digest_of_parameters(base.model), "trained": str(base.trained), "background": base.background}
     made_with = {"backend": base.backend(viewer=request.viewer)[0].name, "versions": versions()}

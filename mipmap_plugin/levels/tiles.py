@@ -22,13 +22,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from mipmap_plugin.adaptation.renderers import NO_CAMERA
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.splat_transform import write_exchange
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import read_manifest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import SplatModel
-from mipmap_plugin.wrap import wrap_model
 
 TILES, TILESET = "tiles", "tileset.json"
 
@@ -81,7 +81,7 @@ def bounding_box(model: SplatModel) -> list[float]:
 
 def _bounds(model: SplatModel, reach: float) -> tuple[Tensor, Tensor]:
     """The least and the greatest coordinates of all splats, [3] each, `reach` standard deviations beyond their centers."""
-    splats = model.gaussians(wrap_model(model).any_camera()).detach()
+    splats = model.gaussians(NO_CAMERA).detach()
     beyond: Tensor = reach * splats.scales.max(dim=1).values[:, None]
     return (splats.means - beyond).amin(dim=0), (splats.means + beyond).amax(dim=0)
 

@@ -14,9 +14,9 @@ from mipmap_plugin.adaptation.optimization.validation import WINDOW
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.views import showing
 from mipmap_plugin.camera import Camera
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.limits import derived_seed
 from mipmap_plugin.scenes.trajectories import jittered
-from mipmap_plugin.wrap import Wrapped
 
 # Random views, of so many times as many the first that show something; of large images only the middle is used, as for validation.
 VIEWS, TRIED = 4, 4
@@ -33,7 +33,7 @@ TRUTH = f"mean PSNR over at most {VIEWS} random views that no level was adapted 
 class Yardstick:
     """Compares levels with the base's own images, shrunk to any zoom."""
 
-    def __init__(self, base: Wrapped, seed: int) -> None:
+    def __init__(self, base: FrozenBase, seed: int) -> None:
         generator = torch.Generator().manual_seed(derived_seed(seed, DRAW))
         views = jittered(base.views(), TRIED * VIEWS, generator, spread=False)
         shown = showing(views, base.model.parameters()["means"], base.effects().near_plane)  # between objects far apart there is nothing
@@ -49,7 +49,7 @@ class Yardstick:
         """Mean PSNR (dB) of a level at a zoom."""
         return self._mean(lambda camera, truth: psnr_as_shown(level.render(camera).image, truth), zoom)
 
-    def psnr_of_base(self, base: Wrapped, viewer: str, zoom: float) -> float:
+    def psnr_of_base(self, base: FrozenBase, viewer: str, zoom: float) -> float:
         """Mean PSNR (dB) of the base itself, as a viewer draws it at a zoom."""
         return self._mean(lambda camera, truth: psnr_as_shown(base.render(camera, viewer=viewer).image, truth), zoom)
 

@@ -14,13 +14,13 @@ from mipmap_plugin.models.places import REPORT
 
 
 def adapted_scale(source: Path | None) -> float | None:
-    """The scale that the file `source` was adapted to; None if it is a base. Raises CheckpointError for a damaged report beside it."""
+    """The scale that the file `source` was adapted to; None if it is a base. Raises CheckpointError, SceneError (`_record`)."""
     scale = _record(source).get("scale")
     return float(scale) if isinstance(scale, (int, float)) else None
 
 
 def adapted_viewer(source: Path | None) -> str | None:
-    """The viewer that the file `source` was adapted for; None if for none by name. Raises CheckpointError for a damaged report beside it."""
+    """The viewer that the file `source` was adapted for; None if for none by name. Raises as `adapted_scale`."""
     viewer = _record(source).get("viewer")
     return viewer if isinstance(viewer, str) else None
 
@@ -28,7 +28,7 @@ def adapted_viewer(source: Path | None) -> str | None:
 def adapted_orbit(source: Path | None) -> tuple[list[float], list[float], float] | None:
     """Center, up and distance of the orbit around the base of the file `source`; None if it is a base, or of an older version.
 
-    Raises CheckpointError for a damaged report beside it.
+    Raises as `adapted_scale`.
     """
     match _record(source).get("orbit"):
         case {"center": [float(), float(), float()] as center, "up": [float(), float(), float()] as up, "distance": float() as distance}:
@@ -37,6 +37,7 @@ def adapted_orbit(source: Path | None) -> tuple[list[float], list[float], float]
 
 
 def _record(source: Path | None) -> dict[str, Any]:
+    """What this package wrote into a file, or beside it. Raises CheckpointError for a damaged file, SceneError for a damaged report."""
     if source is None or not source.is_file():  # made in memory, gone since, or a folder of another family
         return {}
     report = source.with_name(source.name + REPORT)

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effect
+from mipmap_plugin.effects import NEAR_PLANE, Effect
 from mipmap_plugin.errors import PluginError, ShapeError
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures
 from mipmap_plugin.models.hosts import Capture
 from mipmap_plugin.plugin_errors import is_third_party
+from mipmap_plugin.screen_filters import DILATION
 
 # Name, among a model's parameters, of values that are never optimized but removed with their rows, such as an anchor's level.
 CARRIED = "carried"
@@ -34,7 +35,7 @@ class TrainedScale:
     """The screen filter and the sampling rate that a checkpoint was trained with.
 
     Attributes:
-        screen_filter: "classic", "antialiased", "mip", or another name of `splatting.filters`.
+        screen_filter: "classic", "antialiased", "mip", or another name of `screen_filters`.
         eps2d: The variance that the filter adds, px² of a training pixel.
         resolution: INRIA's `-r`: 1, 2, 4, 8 divide the size, -1 caps the width at 1600 px, else a width in px.
         background: RGB, 0..1; None: the checkpoint does not say.

@@ -123,7 +123,7 @@ def _refuse_gradients(family: str, copied: SplatModel, camera: Camera) -> None:
 
 
 def row_opacities(model: SplatModel, views: Sequence[Camera]) -> Tensor:
-    """The model's `row_opacities`, [N]."""
+    """The model's `row_opacities`, [N]. Raises PluginError for anything else."""
     opacities: Any = model.row_opacities(views)
     rows = len(model.parameters()["means"])
     if not isinstance(opacities, Tensor) or tuple(opacities.shape) != (rows,) or not opacities.isfinite().all():
@@ -135,7 +135,7 @@ def row_opacities(model: SplatModel, views: Sequence[Camera]) -> Tensor:
 
 
 def rebuild(model: SplatModel, form: Callable[[Gaussians], Gaussians]) -> None:
-    """Have the model rebuilt, and look whether it holds the splats of `form`."""
+    """Have the model rebuilt. Raises PluginError if it does not hold the splats of `form` then, or NaN."""
     made: list[int] = []
 
     def counted(gaussians: Gaussians) -> Gaussians:
@@ -152,7 +152,7 @@ def rebuild(model: SplatModel, form: Callable[[Gaussians], Gaussians]) -> None:
 
 
 def reshape(model: SplatModel, form: Callable[[Gaussians], tuple[Tensor, Tensor]], views: Sequence[Camera]) -> None:
-    """Have the splats reshaped, and look whether their parameters are numbers."""
+    """Have the splats reshaped. Raises PluginError if their parameters hold NaN then."""
     model.reshape(form, views)
     _refuse_not_finite(model, "reshape(form, views)")
 
@@ -164,7 +164,7 @@ def _refuse_not_finite(model: SplatModel, call: str) -> None:
 
 
 def save(model: SplatModel, path: Path, provenance: dict[str, Any], *, overwrite: bool = False) -> Path:
-    """The file that the model is saved to."""
+    """Save the model; return the file. Raises PluginError if there is none, or one that is not what its ending says, and what the model raises."""
     saved: Any = model.save(path, provenance=provenance, overwrite=overwrite)
     if not isinstance(saved, (str, Path)):
         wrong = f"save() has to return the path of the file that it wrote; it returned a {type(saved).__name__}"

@@ -30,7 +30,7 @@ from mipmap_plugin.models.vanilla import VanillaModel, read_vanilla
 from mipmap_plugin.splatting.viewers import find_viewer, viewers_for
 
 # Screen filter of each family, and its dilation in px² if no cfg_args gives the kernel_size.
-SCREEN_FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
+FAMILY_FILTERS = {"mip": ("mip", 0.1), "gof": ("mip", 0.0), "analytic": ("analytic", 0.0)}
 
 NOTES = {
     "mip": [],
@@ -153,7 +153,7 @@ def load_mip(path: str | Path, *, iteration: int | None = None) -> MipModel:
 
     Raises CheckpointError for a path that is damaged, of another family, or not a checkpoint.
     """
-    checkpoint = detect_as(path, tuple(SCREEN_FILTERS), iteration=iteration)
+    checkpoint = detect_as(path, tuple(FAMILY_FILTERS), iteration=iteration)
     splats = read_vanilla(checkpoint)
     invalid = torch.from_numpy(~((splats.extras[COLUMN] >= 0) & (splats.extras[COLUMN] <= LARGEST)))
     if invalid.all():
@@ -221,6 +221,6 @@ def filter_3d_of(means: Tensor, cameras: Sequence[Camera]) -> Tensor:
 
 def _trained(family: str, trained: TrainedScale) -> TrainedScale:
     """`trained` with the family's screen filter, which a file with the column keeps: only its own project renders it right."""
-    screen_filter, eps2d = SCREEN_FILTERS[family]
+    screen_filter, eps2d = FAMILY_FILTERS[family]
     eps2d = trained.eps2d if trained.screen_filter == screen_filter else eps2d
     return replace(trained, screen_filter=screen_filter, eps2d=eps2d, keeps_filter=True)

@@ -38,7 +38,7 @@ def opened(path: Path) -> Path:
 
 @contextmanager
 def told_of_archives() -> Iterator[None]:
-    """Tell errors and warnings of this block about unpacked folders as of the archives."""
+    """Tell errors (CheckpointError) and warnings of this block about unpacked folders as of the archives."""
     with warnings.catch_warnings(record=True) as doubts:
         warnings.simplefilter("always")
         try:

@@ -11,6 +11,7 @@ from mipmap_plugin.effects import explain
 from mipmap_plugin.evaluation.evaluate import Row, shown_as
 from mipmap_plugin.evaluation.measure import BASE
 from mipmap_plugin.evaluation.shots import Shot
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.models.base import effects_of
 from mipmap_plugin.pages.in_viewers import viewer_pictures, why_not
 from mipmap_plugin.pages.record import Picture, Quality, Role, ViewerPictures, Zoom, zoom_name
@@ -92,7 +93,7 @@ def _quality(of: Row | Shot) -> Quality:
     return {"psnr_db": of.psnr_db, "ssim": of.ssim, "lpips": of.lpips}
 
 
-def effects_of_base(base: Wrapped) -> list[dict[str, Any]]:
+def effects_of_base(base: FrozenBase) -> list[dict[str, Any]]:
     """What drawing the base simulates, and what it does not, with reasons."""
     gaussians = base.model.gaussians(base.any_camera())
     return [asdict(effect) for effect in explain(base.effects(), gaussians, effects_of(base.model))]

@@ -113,7 +113,7 @@ def trained_size(width: int, height: int, cfg: dict[str, Any]) -> tuple[int, int
 
     For COLMAP scenes the file states the full resolution, whatever the size of the training photographs. The folders
     images_2, images_4 and images_8 contain photographs shrunk by that factor. Rounding is that of `loadCam`: divisors
-    round, the cap and the target width truncate.
+    round, the cap and the target width truncate. Raises SceneError for another `resolution`.
     """
     shrunk = re.fullmatch(r"images_(\d{1,9})", photographs_folder(cfg))
     if shrunk and int(shrunk[1]) > 0:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import SceneError
+from mipmap_plugin.errors import SceneError, brief
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
 from mipmap_plugin.scenes.base import ABSENT, Scene
@@ -97,8 +97,7 @@ def _read(path: Path) -> pycolmap.Reconstruction:
     try:
         return pycolmap.Reconstruction(folder)
     except Exception as error:  # pycolmap passes on any C++ exception for a damaged file
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise SceneError(f"{folder}: is not a COLMAP model that pycolmap reads ({reason}); copy or export it again") from error
+        raise SceneError(f"{folder}: is not a COLMAP model that pycolmap reads ({brief(error)}); copy or export it again") from error
 
 
 def _lens(camera: pycolmap.Camera) -> Lens | None:

@@ -26,10 +26,12 @@ HALF, EVERY = "2x", 4
 
 
 def is_dynerf(path: Path) -> bool:
+    """Whether a folder is a capture of DyNeRF."""
     return (path / "poses_bounds.npy").is_file() and (any(path.glob("cam*")) or not (path / "images").is_dir())
 
 
 def is_hypernerf(path: Path) -> bool:
+    """Whether a folder is a capture of HyperNeRF."""
     return (path / "dataset.json").is_file() and (path / "camera").is_dir()
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mipmap_plugin.pool import LARGE, empty
+from mipmap_plugin.process.pool import LARGE, empty
 
 
 def joined(sh0: Tensor, shN: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Screen filters: how a projected splat is widened, so that a grid of pixels can sample it."""
+"""The mathematics of screen filters (`screen_filters`): how a projected splat is widened, so that a grid of pixels can sample it."""
 
 from __future__ import annotations
 
@@ -9,19 +9,16 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.render_settings import USUAL, RenderSettings
-from mipmap_plugin.screen_filters import SCREEN_FILTERS as RECORDS
-from mipmap_plugin.screen_filters import USUAL_EPS2D as USUAL_EPS2D
+from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.splatting import culls
 from mipmap_plugin.splatting.pixel_integral import PixelIntegral, integral_of
 from mipmap_plugin.splatting.projection import Projected
 from mipmap_plugin.splatting.window import WindowIntegral
 
-LEAST_COMPENSATION = {name: screen_filter.min_compensation for name, screen_filter in RECORDS.items()}
+LEAST_COMPENSATION = {name: screen_filter.min_compensation for name, screen_filter in SCREEN_FILTERS.items()}
 
 # Filters that integrate over the pixel instead of sampling its center.
 INTEGRALS = {"analytic": PixelIntegral, "window": WindowIntegral}
-
-SCREEN_FILTERS = frozenset(RECORDS)
 
 # px², the variance of a square of one pixel.
 SQUARE_VARIANCE = 1 / 12

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mipmap_plugin.allowed import OF_VIEWER, check
-from mipmap_plugin.effects import DILATION, NEAR_PLANE, Effects
+from mipmap_plugin.effects import NEAR_PLANE, Effects
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.registry import Registry
 from mipmap_plugin.render_settings import FRUSTUM_MARGIN, USUAL, EvenBuckets, Packing, RenderSettings
-from mipmap_plugin.screen_filters import SCREEN_FILTERS
+from mipmap_plugin.screen_filters import DILATION, SCREEN_FILTERS
 
 
 @dataclass(frozen=True)

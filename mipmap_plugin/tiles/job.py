@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from mipmap_plugin import pool
-from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.formats.atomic import together, write_json
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.jobs.job import Job, Outcome
+from mipmap_plugin.process import pool
+from mipmap_plugin.process import threads as thread_pool
 from mipmap_plugin.tiles.folder import work_folder
 
 Work = Literal["truth", "start", "layer", "halo", "tile", "steering"]
@@ -75,8 +75,8 @@ class TileJob(Job):
         return sweep_of(scene, folder, self.sweep)
 
     def _adapt(self, scene: Any, folder: Path) -> None:
+        from mipmap_plugin.models.places import state_path
         from mipmap_plugin.tiles.tile import Tile
-        from mipmap_plugin.wrapped import state_path
 
         saved, facts, keeper = Tile(scene, self.number, self._sweep(scene, folder), folder).adapt(state_path(self.target))
         with together(self.target):

@@ -11,18 +11,18 @@ from typing import Any
 
 import torch
 
-from mipmap_plugin import threads as thread_pool
 from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.errors import JobsFailed
 from mipmap_plugin.formats.atomic import new_file, together, write_json
 from mipmap_plugin.formats.ply_rows import concatenate
 from mipmap_plugin.formats.tags import with_tags
-from mipmap_plugin.freed_memory import return_freed_memory
 from mipmap_plugin.jobs.engines import in_this_process
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.models.inria_folder import cfg_args_for, write_folder
 from mipmap_plugin.models.mip import for_loader_of
 from mipmap_plugin.models.places import REPORT
+from mipmap_plugin.process import threads as thread_pool
+from mipmap_plugin.process.freed_memory import return_freed_memory
 from mipmap_plugin.progress import announced, counted
 from mipmap_plugin.tiles.folder import START, halo_file, layer_file, part_file, run_file, steered_file, truth_file, work_folder
 from mipmap_plugin.tiles.job import TileJob, Work

@@ -41,8 +41,7 @@ from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import CHUNK, Splats
 from mipmap_plugin.tiles.store import Store, write_pieces
 from mipmap_plugin.tiles.sweeps import Sweep, sweeps, views_of
-from mipmap_plugin.wrap import wrap_model
-from mipmap_plugin.wrapped import Wrapped
+from mipmap_plugin.wrap import Wrapped, wrap_model
 
 # The families whose splats lie in a PLY row by row, each the same for all views.
 KINDS: dict[str, type[VanillaModel]] = {"3dgs": VanillaModel, "2dgs": SurfelModel}

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin import pool
 from mipmap_plugin.adaptation.optimization.validation import mean_db
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.blend_weights import may_show, whole_weights
@@ -21,6 +20,7 @@ from mipmap_plugin.camera import evenly
 from mipmap_plugin.formats.torch_file import save_torch
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.process import pool
 from mipmap_plugin.tiles.folder import START, start_file
 from mipmap_plugin.tiles.scene import TiledScene
 from mipmap_plugin.tiles.splats import Splats

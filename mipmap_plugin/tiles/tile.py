@@ -61,7 +61,7 @@ class Tile:
             keeper.save_if_due(run)
             return run.step >= self.sweep.end
 
-        ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step)
+        ended_by = adapt(run, task, self.config, keeper.save_and_stop, after_step).told(self.config, run.step)
         self._write(run.student.parameters(), [step for step in self.sweep.checks if step > run.step])
         facts |= {"splats_after": len(run.student.parameters()["means"]), "ended_by": ended_by, "seconds": time.perf_counter() - began}
         return {"optimizer": run.optimizer.state_dict(), "step": run.step, "seconds": run.watch.seconds}, facts, keeper

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.target.base_images import facts
 from mipmap_plugin.adaptation.target.image_store import from_16_bits, in_16_bits
+from mipmap_plugin.adaptation.target.pseudo_truth import quantized, resolution
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.tiles.folder import truth_file
@@ -49,26 +50,25 @@ def draw_truths(scene: TiledScene, part: int, folder: Path, others: Sequence[tup
 def _shares(scene: TiledScene, other: TiledScene, part: int) -> bool:
     """Whether the truths of a part follow from the same pictures of the base."""
     names_and_facts = [[(view.name, facts(view)) for view in part_of(each.used_views, part)] for each in (scene, other)]
-    return fraction(scene) == fraction(other) and names_and_facts[0] == names_and_facts[1]
-
-
-def fraction(scene: TiledScene) -> float:
-    """The fraction of the base scale at which the base is drawn (as `target.pseudo_truth`)."""
-    oversampling = scene.config.truth_oversampling
-    return 1.0 if oversampling is None else min(1.0, oversampling * scene.scale)
+    return _fraction(scene) == _fraction(other) and names_and_facts[0] == names_and_facts[1]
 
 
 def draw_base(scene: TiledScene, view: Camera) -> Tensor:
     """The base's picture of a view, from splats on the disk, with the pixels that its truth is made from."""
-    size = (max(1, round(pixels * fraction(scene))) for pixels in (view.width, view.height))
-    effects = replace(scene.base_effects, eps2d=scene.base_effects.eps2d * fraction(scene) ** 2)
+    fraction = _fraction(scene)
+    size = (max(1, round(pixels * fraction)) for pixels in (view.width, view.height))
+    effects = replace(scene.base_effects, eps2d=scene.base_effects.eps2d * fraction**2)
     return scene.painter(effects).image(scene.base, view.resized(*size)).clamp(0, 1)
 
 
 def resized(scene: TiledScene, view: Camera, image: Tensor) -> Tensor:
     """The pseudo ground truth [h, w, 3] of a view at the new scale, from the base's picture of it."""
-    target = resize(image, view.zoomed(scene.scale).size, scene.config.resize)
-    return target.clamp(0, 1).mul(255).round().div(255) if scene.config.quantize_truth else target
+    return quantized(resize(image, view.zoomed(scene.scale).size, scene.config.resize), scene.config)
+
+
+def _fraction(scene: TiledScene) -> float:
+    """The fraction of the base scale at which the base is drawn."""
+    return resolution(scene.config, scene.scale)
 
 
 class Truths:

@@ -79,7 +79,7 @@ FAMILIES = {
 }
 PREFIXES = ["x", "z", "scale", "scale_0", "rot", "rot_0", "opacity", "f_dc", "f_rest", "filter_3D", "f_offset", "f_anchor_feat", "level", "extra"]
 
-# The part of the renderers' catalogue that a file can hold.
+# The part of the renderers' catalog that a file can hold.
 ROWS = {
     "scale 0": [("scale", 3, -np.inf)],
     "scale 1e-9": [("scale", 3, float(np.log(1e-9)))],

@@ -21,7 +21,7 @@ from mipmap_plugin.evaluation.tradeoff.points import OBSERVED_STEPS, RENDERERS, 
 from mipmap_plugin.evaluation.tradeoff.run import run
 from mipmap_plugin.evaluation.tradeoff.truth import base_itself, photographs
 from mipmap_plugin.scenes import load_scene
-from mipmap_plugin.splatting.filters import SCREEN_FILTERS
+from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Interrupted, wrap_model
 
 PLAN = Plan(recipes=("default",), steps=(6,), backends=("reference",), supersampling=(2,), renderers=False, repeats=2)
@@ -97,7 +97,7 @@ def points():
 def test_everything_that_needs_no_adapting_stands_beside_the_adapted(points):
     assert [point.name for point in points if point.kind == "base"] == ["base"]
     filters = {point.name for point in points if point.kind == "filter"}
-    assert filters == {"scaled", *(SCREEN_FILTERS - {"classic"})}
+    assert filters == {"scaled", *(SCREEN_FILTERS.keys() - {"classic"})}
     sampled = [point.name for point in points if point.kind == "supersampling"]
     assert sampled == ["supersampling, 2 x 2", "window, 2 x 2 samples"]  # the base, resized, is the truth
     assert all(point.adapt_seconds.high == 0 for point in points if point.kind in ("base", "filter", "supersampling"))

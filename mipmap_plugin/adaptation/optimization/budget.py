@@ -14,6 +14,7 @@ import torch
 
 from mipmap_plugin.adaptation.curve import Stopwatch
 from mipmap_plugin.adaptation.following import Following
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.run import Run, Task
 from mipmap_plugin.camera import Camera, evenly
@@ -100,7 +101,7 @@ def within_budget(run: Run, task: Task, config: AdaptConfig) -> tuple[Task, Adap
 
 def plan_note(run: Run, config: AdaptConfig) -> str:
     """Which steps were planned for a time budget, in brackets; empty if they are those of the settings, or if something else ended the run."""
-    planned = run.step >= run.planned or run.ended_by.startswith("time budget")
+    planned = run.step >= run.planned or run.ended_by is End.TIME
     if not run.step or not planned or run.planned in (0, config.steps):
         return ""
     taken = "" if run.step >= run.planned else f"after {run.step} of {run.planned} steps, "

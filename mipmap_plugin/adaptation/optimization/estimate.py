@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.clock import now
 from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.process import threads
+from mipmap_plugin.process.clock import now
 
 Result = TypeVar("Result")
 

@@ -12,6 +12,7 @@ from mipmap_plugin.adaptation.curve import CurvePoint, decibel
 from mipmap_plugin.adaptation.optimization import density
 from mipmap_plugin.adaptation.optimization.activation import Activation
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.estimate import BAR, Bar, Forecast
 from mipmap_plugin.adaptation.optimization.evaluations import Evaluations
 from mipmap_plugin.adaptation.optimization.growing import control_density, frozen_parameters, undo_harmful_growth
@@ -25,8 +26,8 @@ from mipmap_plugin.adaptation.views import ViewSchedule
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import count_of
+from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.progress import ticking
-from mipmap_plugin.threads import side_by_side
 
 # Number of checks during the warm-up, while the rates rise, and of a short run, with so many steps between two: each takes as long as a step.
 CHECKS_IN_WARM_UP, CHECKS, STEPS_BETWEEN = 10, 6, 5
@@ -35,11 +36,8 @@ CHECKS_IN_WARM_UP, CHECKS, STEPS_BETWEEN = 10, 6, 5
 # are new, most steps have one.
 TRUTHS_AT_ONCE, STEPS_AHEAD = 4, 2
 
-# What ends a run whose observer returns True.
-STOPPED = "its observer"
 
-
-def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], object] = lambda run: None) -> str:
+def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run], None], observe: Callable[[Run], object] = lambda run: None) -> End:
     """Optimize `run.student` in place until its steps, budget, target or patience end the run; return which of them did.
 
     `on_interrupt` is called between two steps when Ctrl-C was pressed, and should raise. `observe` is called before the first
@@ -52,7 +50,7 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
     began = run.watch.seconds - run.costs.seconds()
     bar = Bar(total=config.steps, initial=run.step, disable=None, desc=f"adapting x{task.scale:g}", unit="step", bar_format=BAR)
     with bar, ticking(bar), interruptible() as interrupted:
-        reason = STOPPED if observe(run) else run.reason_to_stop(config)
+        reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)
         while reason is None and run.step < config.steps:
             with run.watch:
                 views = order(run.step, run.progress(config))
@@ -66,14 +64,14 @@ def adapt(run: Run, task: Task, config: AdaptConfig, on_interrupt: Callable[[Run
             bar.update()
             if run.curve[-1].step == run.step:
                 bar.set_postfix_str(f"{run.curve[-1].validation_db:.2f} dB, {run.curve[-1].gaussians} splats")
-            reason = STOPPED if observe(run) else run.reason_to_stop(config)
+            reason = End.OBSERVER if observe(run) else run.reason_to_stop(config)
             if interrupted():
                 on_interrupt(run)
         with run.watch:
             undo_harmful_growth(run, task, config)
             if run.curve[-1].step < run.step:
                 _check(run, task, config)
-    return reason or f"{config.steps} steps"
+    return reason or End.STEPS
 
 
 def _budget_left(run: Run, config: AdaptConfig) -> float:

@@ -8,11 +8,11 @@ from collections.abc import Callable, Collection, Mapping
 import torch
 from torch import Tensor
 
-from mipmap_plugin import pool
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.models.base import CARRIED, SplatModel
+from mipmap_plugin.process import pool
 from mipmap_plugin.splatting.bands import lie_in_one_tensor, neighbors
 
 # INRIA's value: gradients of single splats are so small that Adam's usual 1e-8 would damp them.

@@ -12,6 +12,7 @@ import torch
 
 from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
@@ -120,7 +121,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
         "costs": run.costs.sums(),
         "square_error": float(run.square_error),
         "rows_changed": run.rows_changed,
-        "ended_by": run.ended_by,
+        "ended_by": "" if run.ended_by is None else run.ended_by.value,
         "planned": run.planned,
         "reserved": run.reserved,
         "curve": [point.model_dump() for point in run.curve],
@@ -136,7 +137,10 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
 
 
 def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) -> Run:
-    """Return the run of a state that `save_run` wrote; its parameters replace those of `student`."""
+    """Return the run of a state that `save_run` wrote; its parameters replace those of `student`.
+
+    Raises what an incomplete state makes Python and torch raise: KeyError, TypeError, ValueError, ...
+    """
     kinds = {"step": int, "planned": int, "seconds": float, "reserved": float, "square_error": float, "rows_changed": bool, "ended_by": str}
     for name, kind in kinds.items():
         if not isinstance(state[name], kind):
@@ -164,7 +168,8 @@ def load_run(state: dict[str, Any], student: SplatModel, config: AdaptConfig) ->
     return Run(
         student, optimizer, Stopwatch(seconds=state["seconds"]), gradients, steering, _trial(state["trial"], device), state["step"],
         [CurvePoint(**point) for point in state["curve"]], state["square_error"], state["rows_changed"],
-        Costs(earlier=tuple(state["costs"]), device=device), state["ended_by"], reserved=state["reserved"], planned=state["planned"],
+        Costs(earlier=tuple(state["costs"]), device=device), End(state["ended_by"]) if state["ended_by"] else None,
+        reserved=state["reserved"], planned=state["planned"],
     )  # fmt: skip
 
 

@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress, reason_to_stop
+from mipmap_plugin.adaptation.curve import CurvePoint, Stopwatch, decibel, progress
 from mipmap_plugin.adaptation.following import Following
 from mipmap_plugin.adaptation.optimization.adam import Adam
 from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.adaptation.optimization.density import ScreenGradients
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.estimate import Costs
 from mipmap_plugin.adaptation.optimization.optimizer import make_optimizer
 from mipmap_plugin.adaptation.optimization.quickest import QuickestThreads
@@ -104,7 +105,7 @@ class Run:
     square_error: Tensor | float = 0.0  # summed since the last point of the curve, on the device of the images, so that no step waits for it
     rows_changed: bool = False  # splats were added or removed
     costs: Costs = field(default_factory=Costs)
-    ended_by: str = ""  # why it takes no further step; "" while it does
+    ended_by: End | None = None  # None while it takes steps
     by_rows: ByRows | None = None  # the student, while the backend moves it
     threads: QuickestThreads = field(default_factory=QuickestThreads)
     reserved: float = 0.0  # seconds of a time budget for what comes after the steps
@@ -131,9 +132,19 @@ class Run:
         """What is gone of a time budget."""
         return self.watch.seconds + self.reserved
 
-    def reason_to_stop(self, config: AdaptConfig) -> str | None:
-        """Why it ends before its last step; None to continue."""
-        return reason_to_stop(self.curve, self.seconds, config, self.reserved)
+    def reason_to_stop(self, config: AdaptConfig) -> End | None:
+        """Why it ends before its last step: the budget is spent, the target reached, or the knee passed; None to continue."""
+        if config.time_budget_s is not None and self.seconds >= config.time_budget_s:
+            if self.step:
+                return End.TIME
+            return End.START if self.watch.seconds >= config.time_budget_s else End.CHOICE
+        psnrs = [point.psnr_db for point in self.curve if point.psnr_db is not None]
+        if config.target_db is not None and psnrs and psnrs[-1] >= config.target_db:
+            return End.TARGET
+        patience = config.patience
+        if patience is not None and len(psnrs) > patience and max(psnrs[-patience:]) < max(psnrs[:-patience]) + config.min_gain_db:
+            return End.KNEE
+        return None
 
     def states(self, initial: SplatModel) -> dict[str, SplatModel]:
         """The best and the last state, where they differ from the start (the `initial` model) and from each other, by what reports call them."""

@@ -26,8 +26,8 @@ from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
+from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.scenes.trajectories import jittered
-from mipmap_plugin.threads import side_by_side
 
 # At most one in this many of the given cameras is kept for validation, where the policy leaves the choice of views to us.
 VALIDATION_EVERY = 16

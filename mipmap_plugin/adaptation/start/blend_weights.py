@@ -15,8 +15,8 @@ from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.splatting.harmonics import C0
-from mipmap_plugin.threads import side_by_side
 
 # Pixels: the blend weight from which on a view shows a splat.
 SHOWN = 0.1

@@ -20,12 +20,13 @@ from mipmap_plugin.adaptation.start.pixel_size import LEAST_VIEWS, mean_pixel_si
 from mipmap_plugin.adaptation.start.problem import StartProblem
 from mipmap_plugin.adaptation.start.thinning import evenly_in_space, least_fraction
 from mipmap_plugin.camera import evenly
-from mipmap_plugin.clock import now
-from mipmap_plugin.effects import INTEGRATED, SURFEL
+from mipmap_plugin.effects import SURFEL
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel, Thinned
 from mipmap_plugin.models.contract import rebuild, reshape
+from mipmap_plugin.process.clock import now
 from mipmap_plugin.render_settings import MIN_ALPHA
+from mipmap_plugin.screen_filters import INTEGRATED
 
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)

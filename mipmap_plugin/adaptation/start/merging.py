@@ -16,10 +16,10 @@ from itertools import count as count_from
 import torch
 from torch import Tensor
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.parallel import CHUNK, in_chunks
 from mipmap_plugin.backends.cpu import nearest_along
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.process import threads
 from mipmap_plugin.splatting.eigen import eigh3
 from mipmap_plugin.splatting.harmonics import C0
 from mipmap_plugin.splatting.rotations import quaternions, rotations

@@ -13,7 +13,8 @@ from statistics import median_low
 from typing import Any
 
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import COMPENSATED, Effects
+from mipmap_plugin.effects import Effects
+from mipmap_plugin.screen_filters import COMPENSATED
 
 # Factor of a recipe's `merge_to`: fewer, larger splats depend less on the filter. At x1/4, half of them make the worst viewer 0.3 dB better
 # on lego, and a quarter no better than that.

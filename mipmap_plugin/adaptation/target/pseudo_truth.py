@@ -71,20 +71,26 @@ class PseudoTruth:
             photograph = self._photographs(view) if self._photographs else None
             target = self._base(view) if photograph is None else photograph
         else:
-            target = resize(self._base(view, self._resolution(view)), size, self._config.resize)
-        return self._quantized(target)
+            target = resize(self._base(view, resolution(self._config, self._scale, view.zoom)), size, self._config.resize)
+        return quantized(target, self._config)
 
     @torch.no_grad()
     def _make_together(self, same: Sequence[Camera], numbers: Sequence[int]) -> Tensor:
         """The truths [V, h, w, 3] of some of the views of one size, by their numbers."""
         views = [same[number] for number in numbers]
-        images = self._base.of_one_size(views, 1.0 if self._scale > 1 else self._resolution(views[0]))
-        return self._quantized(images if self._scale > 1 else resize_all(images, views[0].zoomed(self._scale).size, self._config.resize))
+        images = self._base.of_one_size(views, 1.0 if self._scale > 1 else resolution(self._config, self._scale, views[0].zoom))
+        truths = images if self._scale > 1 else resize_all(images, views[0].zoomed(self._scale).size, self._config.resize)
+        return quantized(truths, self._config)
 
-    def _quantized(self, target: Tensor) -> Tensor:
-        return target.clamp(0, 1).mul(255).round().div(255) if self._config.quantize_truth else target
 
-    def _resolution(self, view: Camera) -> float:
-        """The fraction of the base scale at which the base is rendered: more than `truth_oversampling` samples a pixel gain nothing."""
-        oversampling = self._config.truth_oversampling
-        return 1.0 if oversampling is None else min(1.0, oversampling * self._scale * view.zoom)
+def resolution(config: AdaptConfig, scale: float, zoom: float = 1.0) -> float:
+    """The fraction of the base scale at which the base is rendered: more than `truth_oversampling` samples a pixel gain nothing.
+
+    `zoom`: of the view, in a band.
+    """
+    return 1.0 if config.truth_oversampling is None else min(1.0, config.truth_oversampling * scale * zoom)
+
+
+def quantized(target: Tensor, config: AdaptConfig) -> Tensor:
+    """A truth [..., h, w, 3] as the settings have it: rounded to 8 bits, or as it is."""
+    return target.clamp(0, 1).mul(255).round().div(255) if config.quantize_truth else target

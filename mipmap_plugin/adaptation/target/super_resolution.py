@@ -19,7 +19,7 @@ from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError, br
 from mipmap_plugin.formats.atomic import sha256
 from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.formats.torchscript import read_torchscript
-from mipmap_plugin.torchvision_absent import torchvision_optional
+from mipmap_plugin.process.torchvision_absent import torchvision_optional
 
 SUFFIXES = (".pth", ".pt", ".ckpt", ".safetensors")
 INSTALL = install("sr")

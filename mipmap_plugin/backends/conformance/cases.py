@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL, EvenBuckets, RenderSettings
-from mipmap_plugin.splatting.filters import USUAL_EPS2D
+from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D
 from mipmap_plugin.splatting.rotations import rotations
 from mipmap_plugin.splatting.viewers import BUILT_IN, Viewer
 

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from mipmap_plugin import threads
 from mipmap_plugin.backends.cpu_kernels import compositing_back, descending, drawing, layout, projection_back
 from mipmap_plugin.backends.cpu_kernels.records import Frame, Limits, Lists
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.process import threads
 
 COMMAND = "import pickle, sys; from mipmap_plugin.backends.cpu_kernels import ahead; ahead.compile_back(*pickle.load(sys.stdin.buffer))"
 

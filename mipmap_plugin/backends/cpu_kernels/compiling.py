@@ -14,7 +14,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime import rtsys
 
-from mipmap_plugin.garbage import uncollected
+from mipmap_plugin.process.garbage import uncollected
 
 KERNEL = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 INNER = {"error_model": "numpy", "forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}

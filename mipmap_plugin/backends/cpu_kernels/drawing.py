@@ -16,7 +16,7 @@ from mipmap_plugin.backends.cpu_kernels.records import AT_CENTER, OVER_PIXEL, OV
 from mipmap_plugin.backends.cpu_kernels.threads import Team, team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.pool import empty
+from mipmap_plugin.process.pool import empty
 from mipmap_plugin.splatting.filters import LEAST_COMPENSATION, w_end
 
 SAMPLING = {"analytic": OVER_PIXEL, "window": OVER_WINDOW}

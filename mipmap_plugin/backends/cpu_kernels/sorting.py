@@ -22,7 +22,7 @@ from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH
 from mipmap_plugin.backends.cpu_kernels.memory import pointer, scratch
 from mipmap_plugin.backends.cpu_kernels.records import Lists
 from mipmap_plugin.backends.cpu_kernels.threads import Team
-from mipmap_plugin.pool import empty
+from mipmap_plugin.process.pool import empty
 
 # Of many splats several runs per thread, so that no thread waits long for the last one; but each run needs a counter for every tile.
 RUNS_PER_THREAD = 8

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from mipmap_plugin import threads
+from mipmap_plugin.process import threads
 
 # Crowded tiles take longer than others, so idle threads take chunks from the end of other threads' queues. Each chunk is CHUNK_SHARE of
 # what is left of a queue, but at least MIN_CHUNK_SHARE of all work: a call takes up to 30 us, in which no other thread can begin one.

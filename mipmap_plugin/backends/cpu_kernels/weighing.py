@@ -18,7 +18,7 @@ from mipmap_plugin.backends.cpu_kernels.records import Limits, SplatArrays
 from mipmap_plugin.backends.cpu_kernels.threads import team
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.pool import empty
+from mipmap_plugin.process.pool import empty
 from mipmap_plugin.render_settings import MIN_ALPHA
 
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import torch
 
-from mipmap_plugin import threads
 from mipmap_plugin.backends.base import Calls
 from mipmap_plugin.backends.triton_kernels import BACK_BATCH, BATCH, NUMBERS_MOVED, PAIRS, WARPS, tile_for
 from mipmap_plugin.backends.triton_kernels.adam import adam_kernel
@@ -22,6 +21,7 @@ from mipmap_plugin.backends.triton_kernels.projection_back import project_back_k
 from mipmap_plugin.backends.triton_kernels.rounding import round_kernel
 from mipmap_plugin.backends.triton_kernels.views import Shot
 from mipmap_plugin.backends.triton_kernels.weighing import weigh_kernel
+from mipmap_plugin.process import threads
 
 # What the arguments of kernels are, by name, where they are no arrays of float32. Integers are of 32 bits, whatever they are.
 TYPES: dict[str, Any] = dict.fromkeys(("splat_ids", "owners", "boxes", "counts"), torch.int32)

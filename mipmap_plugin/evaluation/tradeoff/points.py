@@ -38,7 +38,7 @@ from mipmap_plugin.evaluation.tradeoff.truth import GroundTruth
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.progress import ticking
 from mipmap_plugin.recipes import most_steps
-from mipmap_plugin.splatting.filters import SCREEN_FILTERS
+from mipmap_plugin.screen_filters import SCREEN_FILTERS
 from mipmap_plugin.wrap import Wrapped
 
 # Steps after which the quality of a run is measured: evenly spaced on the logarithmic axis of time.
@@ -179,7 +179,7 @@ def _baselines(model: Wrapped, truth: GroundTruth, scale: float, plan: Plan) -> 
 
 def _filters(model: Wrapped) -> list[str]:
     """All screen filters except that of the model's training; those of the other tables come first."""
-    return [name for name in (*FILTERS, *sorted(SCREEN_FILTERS - set(FILTERS))) if name != model.trained.screen_filter]
+    return [name for name in (*FILTERS, *sorted(SCREEN_FILTERS.keys() - set(FILTERS))) if name != model.trained.screen_filter]
 
 
 def left_out(model: Wrapped, plan: Plan) -> list[str]:

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.start.closed_form import AREA_POWER, MIN_AXIS, min_variance
 from mipmap_plugin.adaptation.start.merging import merge
-from mipmap_plugin.effects import COMPENSATED, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.mixture import together
 from mipmap_plugin.levels.request import KEPT, POWER
+from mipmap_plugin.screen_filters import COMPENSATED
 
 
 def kept_splats(pixels: Tensor, size: float, ratio: float) -> int:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import torch
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.start.pixel_size import seen_pixel_size
-from mipmap_plugin.effects import INTEGRATED
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.level import LevelRun, Scene
 from mipmap_plugin.levels.distance.manifest import Contents, write
@@ -21,16 +20,17 @@ from mipmap_plugin.levels.distance.yardstick import measured
 from mipmap_plugin.levels.finished import Ladder
 from mipmap_plugin.levels.request import STREAMING, Band, LadderRequest
 from mipmap_plugin.levels.store import LevelStore
+from mipmap_plugin.process import threads
 from mipmap_plugin.progress import announced
+from mipmap_plugin.screen_filters import INTEGRATED
 from mipmap_plugin.splatting.viewers import own_name
-from mipmap_plugin.wrap import Wrapped
 
 # A chunk measures at most this part of the distance of the nearest parts of a scene, so that its rear is at the scale of its front, but at least
 # one world unit: splat-transform takes whole numbers.
 CHUNK = 0.5
 
 
-def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
+def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
     """Make the levels. `resume`: as for `levels.ladder.make_levels`. Raises what that raises, and SettingsError for a model whose splats cannot be
     merged, or for settings that levels by distance do not have."""
     refuse(base, request)
@@ -48,7 +48,7 @@ def make_levels_by_distance(base: Wrapped, request: LadderRequest, resume: str |
     return Ladder(Contents(scene, levels, curve), store, write)
 
 
-def by_distance(base: Wrapped, request: LadderRequest) -> bool:
+def by_distance(base: FrozenBase, request: LadderRequest) -> bool:
     """Whether the levels of a request are made by distance."""
     if request.by != "auto":
         return request.by == "distance"
@@ -59,7 +59,7 @@ def by_distance(base: Wrapped, request: LadderRequest) -> bool:
     return mergeable and own_name(request.viewer) in STREAMING and is_unbounded(means, base.views(), effects.near_plane)
 
 
-def refuse(base: Wrapped, request: LadderRequest) -> None:
+def refuse(base: FrozenBase, request: LadderRequest) -> None:
     """Raise SettingsError for what levels by distance do not support."""
     if not base.model.traits.same_for_all_views:
         raise SettingsError(f"{base.model.family}: its splats have a 3D filter, so that levels by distance cannot mix them; give by zoom")
@@ -74,7 +74,7 @@ def refuse(base: Wrapped, request: LadderRequest) -> None:
         raise SettingsError(f"{', '.join(sorted(taken))}: levels by distance have as many splats as their distances need; leave out")
 
 
-def scene_of(base: Wrapped, request: LadderRequest, band: Band) -> Scene:
+def scene_of(base: FrozenBase, request: LadderRequest, band: Band) -> Scene:
     """The rule and the chunks that suit a base. Raises BackendUnavailable."""
     backend, note = base.backend(gradients=True, viewer=request.viewer)
     with torch.no_grad():
@@ -90,9 +90,8 @@ def chunk_extent(distance: float) -> int:
     return max(1, round(CHUNK * distance))
 
 
-def _first(base: Wrapped, request: LadderRequest, band: Band, state: Path | None) -> Adapted:
+def _first(base: FrozenBase, request: LadderRequest, band: Band, state: Path | None) -> Adapted:
     """x1: the base, converted to the viewer unless that draws it as its training did."""
     as_it_is = base.target(request.viewer) == base.effects()
     converted = {} if as_it_is else band.settings()
     return base.adapt(1.0, resume=state, **{"recipe": request.recipe, "viewer": request.viewer, **converted, **request.settings})
-

@@ -30,9 +30,9 @@ from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import GOLDEN, choose_views, orbit_of
 from mipmap_plugin.backends.base import Backend, Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
-from mipmap_plugin.clock import now
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects, explain
+from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance.chunks import Chunks
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats, shaped
@@ -43,9 +43,9 @@ from mipmap_plugin.levels.request import MERGING_COSTS, LadderRequest
 from mipmap_plugin.models.base import SplatModel, digest_of_parameters, effects_of
 from mipmap_plugin.models.contract import rebuild
 from mipmap_plugin.models.health import doubts_in
+from mipmap_plugin.process.clock import now
 from mipmap_plugin.progress import announced
 from mipmap_plugin.recipes import recipe as make_config
-from mipmap_plugin.wrap import Wrapped
 
 # Samples of the truth per pixel along each side, to adapt to and to measure by. In walks over flowers, three agree with six to 67 dB.
 SAMPLES, MEASURED_SAMPLES = 2, 3
@@ -71,7 +71,7 @@ class WalkTask(Task):
 class Scene:
     """What all levels of a ladder by distance share."""
 
-    base: Wrapped
+    base: FrozenBase
     request: LadderRequest
     rule: DistanceRule
     chunks: Chunks
@@ -195,7 +195,7 @@ class LevelRun:
             task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, size=self.size)
             keeper = StateKeeper(resume, self._fingerprint())
             run = keeper.start_or_resume(student, task, self.config, self.seconds["total"])
-            ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due)
+            ended_by = adapt(run, task, self.config, keeper.save_and_stop, keeper.save_if_due).told(self.config, run.step)
             states |= run.states(initial)
             curve, kept, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
             self.seconds["optimization"] = run.watch.seconds - run.costs.seconds()

@@ -20,8 +20,9 @@ from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.backends.base import Backend
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import COMPENSATED, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.screen_filters import COMPENSATED
 from mipmap_plugin.splatting.filters import SQUARE_VARIANCE
 from mipmap_plugin.splatting.projection import project
 from mipmap_plugin.splatting.rotations import rotations

@@ -61,6 +61,26 @@ def surplus(weights: Weights, name: str, features: int) -> int:
     return weights[name]["0.weight"].shape[1] - known - 3 - (appearance_size(weights) if name == "color_mlp" else 0)
 
 
+def inputs_of(weights: Weights, features: int, bank: tuple[str, ...], where: Path | str | None, *, level: bool = False) -> dict[str, tuple[str, ...]]:
+    """The inputs of each network, in order: features, direction and, depending on the widths, distance, level and appearance.
+
+    `bank`: the inputs of a feature bank; `level`: whether the networks take the level; `where`: what the CheckpointError names.
+    """
+    inputs: dict[str, tuple[str, ...]] = {}
+    for name in NEEDED:
+        extra = surplus(weights, name, features)
+        distance = extra - level
+        if distance not in (0, 1):
+            reason = "embedding_appearance.pt is missing" if name == "color_mlp" and distance > 1 else "the files do not match"
+            raise CheckpointError(f"{where}: {name} takes {extra} numbers more than features and direction; {reason}")
+        inputs[name] = ("features", "direction", *("distance",) * distance, *("level",) * level)
+    if "feature_bank_mlp" in weights:
+        inputs["feature_bank_mlp"] = bank
+    if "appearance" in weights:
+        inputs["color_mlp"] += ("appearance",)
+    return inputs
+
+
 def appearance_size(weights: Weights) -> int:
     """The length of an appearance embedding; 0 if the model has none."""
     return weights["appearance"][EMBEDDING].shape[1] if "appearance" in weights else 0

@@ -19,7 +19,7 @@ from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.decoding import Anchors
 from mipmap_plugin.models.anchors.files import AnchorFile, read_anchors
 from mipmap_plugin.models.anchors.model import AnchorModel
-from mipmap_plugin.models.anchors.networks import surplus
+from mipmap_plugin.models.anchors.networks import inputs_of, surplus
 
 # Rounding of a distance to a level, by `dist2level` of cfg_args. Progressive levels fade in.
 TO_LEVEL = {"floor": torch.floor, "round": torch.round, "ceil": torch.ceil}
@@ -121,30 +121,22 @@ def load_octree(path: str | Path, *, iteration: int | None = None) -> OctreeMode
 
 
 def _inputs(read: AnchorFile) -> dict[str, tuple[str, ...]]:
-    """The inputs of each network: features, direction and, depending on widths and options, distance, level and appearance."""
+    """The inputs of each network. Raises CheckpointError for widths that fit none, or that may mean two things."""
     features = read.parameters["features"].shape[1]
-    extras = {name: surplus(read.weights, name, features) for name in NEEDED}
-    level = _takes_level(read, extras)
-    inputs: dict[str, tuple[str, ...]] = {}
-    for name, extra in extras.items():
-        if extra - level not in (0, 1):
-            reason = "embedding_appearance.pt is missing" if name == "color_mlp" and extra > 2 else "the files or cfg_args do not match"
-            raise CheckpointError(f"{read.origin.source}: {name} takes {extra} numbers more than features and direction; {reason}")
-        inputs[name] = ("features", "direction", *("distance",) * (extra - level), *("level",) * level)
-    if "feature_bank_mlp" in read.weights:
-        inputs["feature_bank_mlp"] = ("direction", *("level",) * level)
-    if "appearance" in read.weights:
-        inputs["color_mlp"] += ("appearance",)
-    return inputs
+    level = _takes_level(read, [surplus(read.weights, name, features) for name in NEEDED])
+    return inputs_of(read.weights, features, ("direction", *("level",) * level), read.origin.source, level=level)
 
 
-def _takes_level(read: AnchorFile, extras: dict[str, int]) -> bool:
-    """Whether all networks take the level, or none. One additional input may be a distance or a level; other facts may decide."""
+def _takes_level(read: AnchorFile, extras: Sequence[int]) -> bool:
+    """Whether all networks take the level, or none. `extras`: the number of their inputs besides features, direction and appearance.
+
+    One additional input may be a distance or a level; other facts may decide.
+    """
     if "feature_bank_mlp" in read.weights:
         return surplus(read.weights, "feature_bank_mlp", 0) == 1
-    if 0 in extras.values():
+    if 0 in extras:
         return False
-    if max(extras.values()) > 1:
+    if max(extras) > 1:
         return True
     if "add_level" in read.options:
         return bool(read.options["add_level"])

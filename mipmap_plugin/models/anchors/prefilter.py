@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.effects import DILATION, NEAR_PLANE
+from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.render_settings import FRUSTUM_MARGIN
+from mipmap_plugin.screen_filters import DILATION
 
 TILE = 16  # px: the original renders in tiles of this size, and an anchor that touches the outermost tile is in view
 

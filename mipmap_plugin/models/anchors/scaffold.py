@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from mipmap_plugin.errors import CheckpointError
-from mipmap_plugin.models.anchors.companions import NEEDED
 from mipmap_plugin.models.anchors.files import AnchorFile, anchors_in_memory, read_anchors
 from mipmap_plugin.models.anchors.model import AnchorModel
-from mipmap_plugin.models.anchors.networks import Weights, surplus
+from mipmap_plugin.models.anchors.networks import Weights, inputs_of
 from mipmap_plugin.models.columns import NORMAL, QUATERNION
 
 
@@ -35,7 +33,7 @@ def load_scaffold(path: str | Path, *, iteration: int | None = None) -> Scaffold
     Which networks take the distance of the camera follows from their shapes. Raises CheckpointError.
     """
     read = read_anchors(path, "scaffold", iteration)
-    model = ScaffoldModel(read, _inputs(read, read.origin.source))
+    model = _model(read, read.origin.source)
     if read.options.get("lod"):
         model.notes.append(f"cfg_args says lod={read.options['lod']}: the original's test views are not every eighth, so name the views you want")
     return model
@@ -44,21 +42,8 @@ def load_scaffold(path: str | Path, *, iteration: int | None = None) -> Scaffold
 def scaffold_in_memory(parameters: dict[str, Tensor], weights: Weights, name: str) -> ScaffoldModel:
     """The model of raw tensors of the live object `name`, with opacity and quaternion in `carried`. Raises CheckpointError."""
     read = anchors_in_memory(parameters, ("opacity", *QUATERNION), weights, name)
-    return ScaffoldModel(read, _inputs(read, name))
+    return _model(read, name)
 
 
-def _inputs(read: AnchorFile, where: Path | str | None) -> dict[str, tuple[str, ...]]:
-    """The inputs of each network: features, direction and, depending on the widths, distance and appearance."""
-    features = read.parameters["features"].shape[1]
-    inputs: dict[str, tuple[str, ...]] = {}
-    for name in NEEDED:
-        extra = surplus(read.weights, name, features)
-        if extra not in (0, 1):
-            reason = "embedding_appearance.pt is missing" if name == "color_mlp" and extra > 1 else "the files do not match"
-            raise CheckpointError(f"{where}: {name} takes {extra} numbers more than features and direction; {reason}")
-        inputs[name] = ("features", "direction", *("distance",) * extra)
-    if "feature_bank_mlp" in read.weights:
-        inputs["feature_bank_mlp"] = ("direction", "distance")
-    if "appearance" in read.weights:
-        inputs["color_mlp"] += ("appearance",)
-    return inputs
+def _model(read: AnchorFile, where: Path | str | None) -> ScaffoldModel:
+    return ScaffoldModel(read, inputs_of(read.weights, read.parameters["features"].shape[1], ("direction", "distance"), where))

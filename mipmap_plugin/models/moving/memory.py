@@ -8,9 +8,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from mipmap_plugin.clock import now
 from mipmap_plugin.limits import memory
-from mipmap_plugin.threads import for_views, side_by_side, side_by_side_now
+from mipmap_plugin.process.clock import now
+from mipmap_plugin.process.threads import for_views, side_by_side, side_by_side_now
 
 # What a field adds to each parameter, or multiplies it by, at one moment, by name: [N, ...] each.
 Changes = dict[str, Tensor]

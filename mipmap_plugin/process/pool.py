@@ -9,7 +9,7 @@ from collections import deque
 
 import numpy as np
 
-from mipmap_plugin.freed_memory import return_freed_memory
+from mipmap_plugin.process.freed_memory import return_freed_memory
 
 # Bytes of a cache line. Arrays whose rows are cache lines begin at one, unlike numpy's own, and so do large ones.
 CACHE_LINE = 64

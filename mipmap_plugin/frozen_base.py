@@ -1,4 +1,4 @@
-"""A frozen base model with its cameras, which is rendered, adapted to other scales and made into levels. It never changes."""
+"""A frozen base model with its cameras, which is rendered and adapted to other scales. It never changes."""
 
 from __future__ import annotations
 
@@ -6,31 +6,27 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, TypedDict, cast
 
 import torch
 
-from mipmap_plugin import threads
 from mipmap_plugin.adaptation import notebook
-from mipmap_plugin.adaptation.adapted import Adapted as Adapted
-from mipmap_plugin.adaptation.adapted import render_model
-from mipmap_plugin.adaptation.choosing import choose
+from mipmap_plugin.adaptation.adapted import Adapted, render_model
+from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
 from mipmap_plugin.adaptation.conversion import Stages, conversion
-from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
+from mipmap_plugin.adaptation.renderers import NO_CAMERA
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
-from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.target.photographs import placed as placed
+from mipmap_plugin.adaptation.target.photographs import Photographs, placed
 from mipmap_plugin.adaptation.target.portable import settings_for_several
-from mipmap_plugin.adaptation.views import choose_views, orbit_of
+from mipmap_plugin.adaptation.views import choose_views, orbit_of, refuse_blind
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import Camera, checked, digest_of, of_base_scale
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import DILATION, Effects
+from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.splat_transform import refuse_unread
@@ -39,21 +35,22 @@ from mipmap_plugin.limits import check_image, check_kinds, check_scale
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
-from mipmap_plugin.models.places import REPORT
-from mipmap_plugin.models.places import state_path as state_path
+from mipmap_plugin.models.places import REPORT, state_path
 from mipmap_plugin.plugin_errors import naming_any, unchanged
+from mipmap_plugin.process import threads
+from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
-from mipmap_plugin.splatting.filters import INTEGRALS, USUAL_EPS2D
+from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D
+from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
-from mipmap_plugin.torch_modes import usual_modes
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 
 class RenderOptions(TypedDict, total=False):
-    """Further options of `Wrapped.render`."""
+    """Further options of `FrozenBase.render`."""
 
     viewer: str | None  # render as this viewer does, instead of with a screen filter; without a filter_3D if it does not read it
     filter_3d: bool  # first smooth every splat to the finest detail that the cameras could resolve (Mip-Splatting's 3D filter)
@@ -62,8 +59,8 @@ class RenderOptions(TypedDict, total=False):
     exposure: bool  # apply the exposure of the photograph that the camera is named after, if exposure.json has it
 
 
-class Wrapped:
-    """A frozen base model with its cameras, ready to be adapted to any scale."""
+class FrozenBase:
+    """A frozen base model with its cameras: what levels build on. `wrap.Wrapped` can make them, too."""
 
     def __init__(
         self, model: SplatModel, cameras: Sequence[Camera], backend: str, trained: TrainedScale, threads: int | None = None
@@ -76,11 +73,11 @@ class Wrapped:
         self.keeps_images = True  # for further scales, up to 1 GiB; False saves that memory where `adapt` is called once
 
     def __repr__(self) -> str:
-        return notebook.line("Wrapped", notebook.base_facts(self.model, self.cameras, self.trained))
+        return notebook.line(type(self).__name__, notebook.base_facts(self.model, self.cameras, self.trained))
 
     def _repr_html_(self) -> str:
         facts = notebook.base_facts(self.model, self.cameras, self.trained)
-        return notebook.table("Wrapped", facts, lambda camera: self.render(camera).image, self.views()[0])
+        return notebook.table(type(self).__name__, facts, lambda camera: self.render(camera).image, self.views()[0])
 
     def effects(self, scale: float = 1.0, screen_filter: str | None = None, supersampling: int = 1, viewer: str | None = None) -> Effects:
         """How this model is rendered at `scale`, or by the viewer of that name (`splatting.viewers`).
@@ -189,10 +186,7 @@ class Wrapped:
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
         check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
-        whole = not (model.traits.same_for_all_views or model.traits.thins) and settings.setdefault("merge_to", 1.0) < 1
-        if whole or (settings.get("most_splats") and not model.traits.same_for_all_views):
-            reason = "its splats differ by view or time, or have a 3D filter, so none are merged"
-            raise SettingsError(f"{model.family}: {reason}; leave {'' if model.traits.thins else 'merge_to and '}most_splats (--splats, --bytes) out")
+        settings = mergeable_settings(model, settings)
         if images is not None and self.model.traits.exposures.changed:
             raise SettingsError("the images were exposed differently, which adaptation does not support (exposure.json); leave them out")
         config, targets = self._planned(recipe, scale, viewer, settings)
@@ -205,8 +199,7 @@ class Wrapped:
         needs = [replace(self._needs, screen_filter=target.screen_filter, settings=target.settings) for target in targets.values()]
         backend, note, has_gradients = choose(self._backend, config, needs, self._needs)
         if config.steps:
-            largest = max(cameras or self.views(), key=lambda camera: camera.width * camera.height).zoomed(scale)
-            check_image(largest.width, largest.height, self.model.parameters()["means"].device)
+            self._refuse_large(cameras or self.views(), scale)
         if start is not None and start.scale <= scale:
             raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
         base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
@@ -225,17 +218,16 @@ class Wrapped:
         config, targets = make_config(recipe, scale, **settings), self.targets(viewer)
         return config if len(targets) == 1 else make_config(recipe, scale, **(settings_for_several(config) | settings)), targets
 
+    def _refuse_large(self, views: Sequence[Camera], scale: float) -> None:
+        """Raise SettingsError if the memory cannot hold the largest image that is adapted to."""
+        largest = max(views, key=lambda camera: camera.width * camera.height).zoomed(scale)
+        check_image(largest.width, largest.height, self.model.parameters()["means"].device)
+
     def _base_images(self, model: SplatModel, backend: Backend, keep: bool) -> BaseImages:
         """Those that are drawn already, or none yet: of another base. `keep`: for further scales and stages."""
         if self.images is None or not self.images.are_of(model, backend, self.effects()):
             self.images = BaseImages(model, backend, self.effects(), LIMIT if keep else 0)
         return self.images
-
-    @usual_modes()
-    def levels(self, viewer: str, *, resume: str | Path | None = None, **options: Any) -> Any:
-        """Return a ladder of levels (`levels.ladder.Ladder`), to be saved with `save(folder)`. `options`: those of `LadderRequest.of`."""
-        ladder = import_module("mipmap_plugin.levels.ladder")  # which builds on this class, so that it cannot be imported above
-        return ladder.make_levels(self, ladder.LadderRequest.of(viewer, **options), resume)
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = True, viewer: str | None = None) -> None:
         """Raise now the error that saving a model adapted for `viewer` to `path` would raise at the end, as far as it can be predicted."""
@@ -280,6 +272,11 @@ class Wrapped:
         """The checkpoint's cameras, or a generated orbit, for an adapted file that of its base, if it came without any."""
         return self.cameras or choose_views([], orbit_of(self.model), AdaptConfig())[0]
 
+    def refuse_undrawn(self, views: Sequence[Camera] | None = None) -> None:
+        """Raise SettingsError if none of the views, by default the base's own, shows anything of it (`refuse_blind`)."""
+        looked_from = self.views() if views is None else views
+        refuse_blind(looked_from, self.model, self.effects().near_plane, lambda view: self.render(view).image)
+
     def place(self, scene: Scene) -> Scene:
         """Return the scene in the model's frame (`placed`); a checkpoint that came without cameras gets those of the scene."""
         in_frame = placed(self.model, scene)
@@ -296,4 +293,4 @@ class Wrapped:
 
     def any_camera(self) -> Camera:
         """One of the cameras, or a camera of one pixel if there are none."""
-        return self.cameras[0] if self.cameras else Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
+        return self.cameras[0] if self.cameras else NO_CAMERA
