@@ -19,6 +19,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, together, write_json
+from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image
 from mipmap_plugin.models import contract
@@ -99,7 +100,9 @@ class Adapted:
         """The report of the file at `path`, which also says what its format has no place for, and who draws it otherwise."""
         left_out = without_place(path, getattr(self.model, "extras", ()), getattr(self.model, "sh_degree", 0))
         lost = filter(None, (left_out, self._drawn_otherwise(path)))
-        return self.report.model_copy(update={"notes": [*self.report.notes, *lost]})
+        moved = self.model.traits.placed and (path.suffix.lower() == ".ply" or is_written(path))  # which does not say where the cameras go
+        cameras_from = {} if moved else self.report.cameras_from
+        return self.report.model_copy(update={"notes": [*self.report.notes, *lost], "cameras_from": cameras_from})
 
     def _drawn_otherwise(self, path: Path) -> str:
         return "" if self.report.viewer else drawn_otherwise(path, self.model.trained)

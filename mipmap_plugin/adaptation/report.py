@@ -44,6 +44,7 @@ class Report(BaseModel):
         versions: Of this package and of torch.
         notes: What became of the model on the way, such as columns of the base's file that the new splats do not have, in sentences.
         inputs: What was given beside the checkpoint: hashes of cameras and photographs, background, screen filter.
+        cameras_from: Where its cameras were read from on this machine, for whoever looks at a lone file, which has none beside it.
         orbit: What views without cameras go around, the same for the file as for its base.
     """
 
@@ -70,6 +71,7 @@ class Report(BaseModel):
     versions: dict[str, str]
     notes: list[str] = []
     inputs: dict[str, str] = {}
+    cameras_from: dict[str, str] = {}
     orbit: Orbit | None = None
 
     def psnr_before(self) -> float | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from mipmap_plugin.commands.common import wrap
+from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, ScreenFilter
 from mipmap_plugin.commands.voice import say
@@ -72,6 +72,8 @@ def view(
         page = _page(wrapped, adapted, backend, PageSettings(host, port, name, *_choices(wrapped, viewer), _free(checkpoint, output)))
         try:
             say(f"{page.address} shows {name}; Ctrl-C ends it")
+            if place := base_cameras(wrapped, cameras):
+                say(f"its views are those of its base, in {place}; --cameras gives others")
             if browser and has_display():
                 webbrowser.open(page.address)
             page.run()

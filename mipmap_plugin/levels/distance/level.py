@@ -260,6 +260,7 @@ class LevelRun:
             curve=curve,
             versions=versions(),
             inputs=scene.base.asked,
+            cameras_from=scene.base.cameras_from,
             orbit=orbit_of(scene.base.model),
             notes=doubts_in(scene.base.model.notes),
         )
