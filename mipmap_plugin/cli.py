@@ -1,5 +1,5 @@
-"""The command line: thin commands over the library. Exit codes: 0 success, 2 an error, printed in one sentence, 130 interrupted, 141 where
-whoever read what is printed has stopped."""
+"""The command line: thin commands over the library. Exit codes: 0 success, 2 an error, printed in one sentence, 130 interrupted, 143 or 129
+told to end (SIGTERM, SIGHUP), 141 where whoever read what is printed has stopped."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from mipmap_plugin.commands.list import list_
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
+from mipmap_plugin.ending import ends_as_by_ctrl_c
 from mipmap_plugin.errors import MipmapPluginError
 from mipmap_plugin.freed_memory import keep_freed_memory
 from mipmap_plugin.garbage import leave_at_exit
@@ -62,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(words: Sequence[str]) -> int:
     """Run a command; return the exit code."""
     try:
-        with _our_warnings_only():
+        with _our_warnings_only(), ends_as_by_ctrl_c() as ending:
             app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
     except BrokenPipeError:  # as of `| head`, whose reader wants no more
         return 141
@@ -76,7 +77,7 @@ def _run(words: Sequence[str]) -> int:
         return 2
     except KeyboardInterrupt as interrupt:
         voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
-        return 130
+        return ending.code
     return 0
 
 

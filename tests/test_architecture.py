@@ -14,7 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # From the ground up; a module imports only what lies below its own storey, or in its own package.
 STOREYS = [
-    {"errors", "freed_memory", "garbage"},
+    {"ending", "errors", "freed_memory", "garbage"},
     {"limits", "pool"},
     {"registry", "config", "torchvision_absent", "torch_modes", "threads", "progress", "screen_filters", "allowed", "plugin_errors"},
     {"render_settings"},

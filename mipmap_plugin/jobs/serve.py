@@ -18,6 +18,7 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import replace
 from typing import IO
 
+from mipmap_plugin.ending import INTERRUPTED, Ending, ends_as_by_ctrl_c
 from mipmap_plugin.freed_memory import keep_freed_memory
 from mipmap_plugin.jobs.job import Job, Outcome
 
@@ -26,13 +27,21 @@ Request = tuple[Job, "int | None"]
 
 def main() -> None:
     signal.signal(signal.SIGINT, _leave)
+    with ends_as_by_ctrl_c() as ending:
+        _serve(ending)
+
+
+def _serve(ending: Ending) -> None:
     keep_freed_memory()  # also in workers of dask, whose environment asks for the opposite
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints must not mix with the answers
     requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(sys.stdin.buffer, requests), daemon=True).start()
     while True:
-        pickle.dump(_run_quietly(*requests.get()), answers)
+        outcome = _run_quietly(*requests.get())
+        if ending.code != INTERRUPTED:  # not by its owner, who begins the job again elsewhere, from the state that was saved
+            os._exit(ending.code)
+        pickle.dump(outcome, answers)
         answers.flush()
 
 
