@@ -23,7 +23,7 @@ from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
 from mipmap_plugin.ending import ends_as_by_ctrl_c
-from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.errors import MipmapPluginError, of_a_file
 from mipmap_plugin.freed_memory import keep_freed_memory
 from mipmap_plugin.garbage import leave_at_exit
 from mipmap_plugin.limits import is_out_of_memory
@@ -67,8 +67,11 @@ def _run(words: Sequence[str]) -> int:
             app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
     except BrokenPipeError:  # as of `| head`, whose reader wants no more
         return 141
-    except (MipmapPluginError, OSError) as error:
+    except MipmapPluginError as error:
         voice.complain(f"mipmap-plugin: {_told(error)}")
+        return 2
+    except OSError as error:
+        voice.complain(f"mipmap-plugin: {_told(of_a_file(error))}")
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):

@@ -17,6 +17,7 @@ from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import Background, Checkpoint, ScreenFilter
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.atomic import refuse_unwritable
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -64,6 +65,8 @@ def view(
         raise SettingsError(f"port: must be from 0 to 65535, got {port}")
     if output is not None and output.exists() and not output.is_dir():
         raise SettingsError(f"{output} is no folder, which the page could save to; give --output a folder")
+    if output is not None:
+        refuse_unwritable(output / checkpoint.name)
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     if viewer is not None:
         wrapped.target(viewer)  # raises before any work
