@@ -37,6 +37,7 @@ class Report(BaseModel):
         ended_by: What ended the run, such as a number of steps or a time budget.
         returned: Which of the run's states the file holds, and why if it is not the last.
         validation: dB of each state on views that nothing was adapted to and that did not steer the run, at most 54 of a view.
+        written: dB of the file itself on the same views, where its format rounds splats; None where it does not.
         viewers: Of a file for several viewers: dB in each on the same views; `validation` is the worst of the extreme viewers.
         as_trained: dB of the base itself on the same views, drawn as its training drew it; None at x1, and where the file is drawn so too.
         peak_memory_mib: Of tensors on the GPU while adapting; None without a GPU.
@@ -64,6 +65,7 @@ class Report(BaseModel):
     ended_by: str
     returned: str
     validation: dict[str, float]
+    written: float | None = None
     viewers: dict[str, float] = {}
     as_trained: float | None = None
     peak_memory_mib: float | None = None
@@ -79,7 +81,9 @@ class Report(BaseModel):
         return self.validation.get(AS_IT_IS)
 
     def psnr_after(self) -> float | None:
-        """PSNR (dB) of what the file holds, on the same views."""
+        """PSNR (dB) of what the file holds, on the same views; before its format rounds it, where the file is not saved yet."""
+        if self.written is not None:
+            return self.written
         return next((psnr for state, psnr in self.validation.items() if self.returned.startswith(state)), None)
 
     def gain(self) -> str:
@@ -88,7 +92,7 @@ class Report(BaseModel):
         if before is None or after is None:
             return f"holds {self.returned}"
         if self.returned.startswith(AS_IT_IS):
-            return f"holds {AS_IT_IS}, for nothing was better: {before:.2f} dB on views that nothing was adapted to"
+            return f"holds {AS_IT_IS}, for nothing was better: {after:.2f} dB on views that nothing was adapted to"
         return f"{before:.2f} -> {after:.2f} dB on views that nothing was adapted to"
 
     def provenance(self) -> dict[str, Any]:

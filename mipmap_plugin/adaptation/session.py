@@ -173,9 +173,9 @@ class Session:
         if not self.validation.choosing:
             note, psnrs = f", not validated: at this scale one pixel of the base is more than {WINDOW} px wide", {}
         report = self._report(states[best], curve or [at_end], ended_by, f"{best}{note}", psnrs)
-        used_views = [*self.views, *self.validation.steering, *self.validation.choosing]
+        used, files = [*self.views, *self.validation.steering, *self.validation.choosing], [self.state] if self.state else []
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
-        return Adapted(model, report, self.backend, self.effects, self.targets, [self.state] if self.state else [], used_views)
+        return Adapted(model, report, self.backend, self.effects, self.targets, files, used, judge=self.validation.kept())
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""

@@ -203,7 +203,8 @@ def test_an_output_error_names_the_output(tmp_path, monkeypatch, name):
     monkeypatch.setattr(torch, "save", full)
     with pytest.raises(OutputError) as told:
         new.save(out)
-    assert str(told.value).startswith(str(out)) and str(told.value).endswith("cannot be written: No space left on device")
+    reason = "cannot be written: No space left on device; free some, or choose another disk"
+    assert str(told.value).startswith(str(out)) and str(told.value).endswith(reason)
     assert ".tmp" not in str(told.value)
 
 
