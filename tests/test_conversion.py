@@ -10,7 +10,9 @@ from mipmap_plugin.adaptation.optimization.budget import Pace
 from mipmap_plugin.adaptation.session import Session
 from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.evaluation.metrics import psnr
+from mipmap_plugin.formats.torch_file import load_torch, save_torch
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.outputs import is_adapted
 from mipmap_plugin.models.places import conversion_state, state_path
@@ -102,6 +104,23 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, nth):
     assert list(tmp_path.glob("*.resume.x1"))  # should the disk be full, nothing is lost
     files = [adapted.save(tmp_path / f"{i}.ply").read_bytes() for i, adapted in enumerate((whole, resumed))]
     assert files[0] == files[1] and not list(tmp_path.glob("*resume*"))
+
+
+def test_what_the_conversion_kept_stays_where_the_zoom_in_is_refused(tmp_path):
+    """As by a state of another version."""
+    state = tmp_path / "run.resume"
+
+    def press(step, seconds, render):
+        if step == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(Interrupted):
+        wrapped().adapt(2, viewer="antialiased", resume=state, observe=press, **BRIEF)
+    content = load_torch(state)
+    save_torch(state, content | {"fingerprint": "", "versions": {"mipmap_plugin": "0.0.1"}}, overwrite=True)
+    with pytest.raises(SettingsError, match=r"run.resume: this state was left by mipmap_plugin 0\.0\.1, and this is .*; go on with that"):
+        wrapped().adapt(2, viewer="antialiased", resume=state, **BRIEF)
+    assert state.exists() and (tmp_path / "run.resume.x1").exists()
 
 
 def test_a_time_budget_is_for_both_and_told_as_it_was_given(monkeypatch):

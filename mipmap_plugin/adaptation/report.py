@@ -152,4 +152,4 @@ def versions() -> dict[str, str]:
         own = version("mipmap-plugin")
     except PackageNotFoundError:  # run from a source tree that was not installed
         own = "source"
-    return {"mipmap_plugin": own, "torch": torch.__version__}
+    return {"mipmap_plugin": own, "torch": str(torch.__version__)}  # plain text, which a state is read with
