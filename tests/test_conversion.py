@@ -135,7 +135,7 @@ def test_a_budget_that_both_stages_start_takes_is_told_whole_and_once():
         spent = wrapped().adapt(2, viewer="antialiased", time_budget_s=1e-3, **BRIEF).report
     assert spent.ended_by == "time budget of 0.001 s, all of which the conversion and the start took"
     assert [("time budget" in str(warning.message)) for warning in said].count(True) == 1
-    assert [("time budget of 0.001 s" in note) for note in spent.notes] == [True, False]
+    assert [("time budget of 0.001 s" in note) for note in spent.notes].count(True) == 1
 
 
 def test_what_the_choice_takes_of_a_budget_is_told_beside_both_starts(monkeypatch):

@@ -30,7 +30,7 @@ from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Qu
 from mipmap_plugin.adaptation.parallel import views_at_once
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
-from mipmap_plugin.adaptation.start.candidates import StartSearch
+from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.start.problem import FinerLevel, StartProblem
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -136,7 +136,7 @@ class Session:
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
         initial, start = search.best()
-        self.notes = () if self.finer and self.finer.told else search.notes
+        self.notes = [note for note in search.notes if note == UNMATCHED or not (self.finer and self.finer.told)]
         states = {AS_IT_IS: self._for_target(self._base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked_steps, self.config.model_copy(update={"steps": 0}))
