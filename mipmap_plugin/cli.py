@@ -1,5 +1,5 @@
-"""The command line: thin commands over the library. Exit codes: 0 success, 2 an error, printed in one sentence, 130 interrupted, 141 where
-whoever read what is printed has stopped."""
+"""The command line: thin commands over the library. Exit codes: 0 success, 2 an error, printed in one sentence, 130 interrupted, 143 or 129
+told to end (SIGTERM, SIGHUP), 141 where whoever read what is printed has stopped."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from mipmap_plugin.commands.list import list_
 from mipmap_plugin.commands.render import render
 from mipmap_plugin.commands.tradeoff import tradeoff
 from mipmap_plugin.commands.view import view
-from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.errors import MipmapPluginError, of_a_file
 from mipmap_plugin.limits import is_out_of_memory
 from mipmap_plugin.process.freed_memory import keep_freed_memory
 from mipmap_plugin.process.garbage import leave_at_exit
+from mipmap_plugin.process.signals import ends_as_by_ctrl_c
 
 DESCRIPTION = (
     "Make a Gaussian-splatting checkpoint look right at another zoom. With every command go --quiet, to print errors, warnings and JSON only, "
@@ -62,12 +63,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(words: Sequence[str]) -> int:
     """Run a command; return the exit code."""
     try:
-        with _our_warnings_only():
+        with _our_warnings_only(), ends_as_by_ctrl_c() as ending:
             app.cli(prog="mipmap-plugin", description=DESCRIPTION, args=words)
     except BrokenPipeError:  # as of `| head`, whose reader wants no more
         return 141
-    except (MipmapPluginError, OSError) as error:
+    except MipmapPluginError as error:
         voice.complain(f"mipmap-plugin: {_told(error)}")
+        return 2
+    except OSError as error:
+        voice.complain(f"mipmap-plugin: {_told(of_a_file(error))}")
         return 2
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
@@ -76,7 +80,7 @@ def _run(words: Sequence[str]) -> int:
         return 2
     except KeyboardInterrupt as interrupt:
         voice.complain(f"\nmipmap-plugin: {str(interrupt) or 'interrupted'}")
-        return 130
+        return ending.code
     return 0
 
 
@@ -104,7 +108,3 @@ def _told(words: object) -> str:
     from mipmap_plugin.models.zipped_folder import told
 
     return told(words)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

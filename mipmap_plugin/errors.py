@@ -1,5 +1,6 @@
 """The exceptions. Every error that a user can cause is a `MipmapPluginError`, whose message says what is wrong, where, and what to do."""
 
+import errno
 
 # Maximum characters of a message. A damaged file that it quotes may have megabytes in place of a name or a number.
 MAX_LENGTH = 1500
@@ -48,6 +49,30 @@ class OutputError(MipmapPluginError, OSError):
 
 class OutputExists(MipmapPluginError, FileExistsError):
     """An output that exists already and must not be overwritten."""
+
+
+# What the names of temporary folders begin with.
+TEMPORARY = "mipmap-plugin-"
+
+# What to do about an error of the system, by its number.
+REMEDIES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some, or choose another disk"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "choose a place that you may write to (--output)"),
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.EMFILE: "let this process open more files (ulimit -n)",
+}
+
+
+def of_system(error: OSError) -> str:
+    """What the system says of an error, and what to do about it."""
+    return f"{error.strerror or error}; {REMEDIES.get(error.errno or 0, 'choose another path')}"
+
+
+def of_a_file(error: OSError) -> str:
+    """An error of the system that nobody foresaw, in a sentence: which file, what, and what to do."""
+    where = f"{error.filename}: " if error.filename else ""
+    temporary = "; the variable TMPDIR names another place for temporary files" if TEMPORARY in str(error.filename) else ""
+    return f"{where}{error.strerror or error}; check that path, who may read and write there, and that its disk is not full{temporary}"
 
 
 def brief(error: BaseException) -> str:

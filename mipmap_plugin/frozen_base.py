@@ -69,6 +69,7 @@ class FrozenBase:
         self.background = trained.background or (0.0, 0.0, 0.0)
         self.loading_s = 0.0  # seconds that loading the model took
         self.asked: dict[str, str] = {}  # what was given beside the checkpoint (`Report.inputs`); "" for what was not
+        self.cameras_from: dict[str, str] = {}  # where its cameras were read from (`Report.cameras_from`)
         self.images: BaseImages | None = None  # of the base, drawn so far for all scales; None: the next call draws all of its own
         self.keeps_images = True  # for further scales, up to 1 GiB; False saves that memory where `adapt` is called once
 
@@ -179,9 +180,8 @@ class FrozenBase:
         called before the first step and after each (of the conversion before a zoom-in, too: `adaptation.conversion`); `render(camera)` is
         the current image [H, W, 3], without gradients, and the run ends where it returns True.
         `images`: a scene whose training images are the truth of a zoom-in, instead of the base's renders of these views.
-        `start`: a model for the same viewer at a finer scale, to start from instead of from the base.
-        While it runs, torch's default dtype is float32, and torch may have one thread, in the whole process: torch has one of each.
-        Raises SettingsError and BackendUnavailable.
+        `start`: a model for the same viewer at a finer scale, to start from instead of from the base. While it runs, torch's default dtype is
+        float32, and torch may have one thread, in the whole process: torch has one of each. Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
         check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
@@ -211,6 +211,7 @@ class FrozenBase:
             stages = Stages(request, list(cameras), photographs, None if resume is None else Path(resume), observe)
             adapted = stages.adapt(scale, config, first)
         adapted.report.seconds["loading"] = self.loading_s
+        adapted.report.cameras_from.update(self.cameras_from)
         return replace(adapted, cameras=self.views())
 
     def _planned(self, recipe: str, scale: float, viewer: str | None, settings: dict[str, Any]) -> tuple[AdaptConfig, dict[str, Effects]]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
+from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
 from mipmap_plugin.adaptation.optimization.resume import Interrupted as Interrupted  # what `adapt` raises
 from mipmap_plugin.adaptation.target.photographs import placed
 from mipmap_plugin.backends import device_for
@@ -24,7 +25,7 @@ from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.process.torch_modes import usual_modes
-from mipmap_plugin.scenes import Scene, model_cameras
+from mipmap_plugin.scenes import Scene
 from mipmap_plugin.screen_filters import USUAL_EPS2D
 
 if TYPE_CHECKING:
@@ -57,7 +58,8 @@ def wrap_model(
 
     A checkpoint is loaded to the GPU if a backend serves it there (`backends.device_for`); a model stays on its device.
 
-    `cameras`: views of the scale of its training, or the scene that it was trained on; by default those beside the checkpoint.
+    `cameras`: views of the scale of its training, or the scene that it was trained on; by default those beside the checkpoint, or
+    those of the base of an adapted file.
     `background`: linear RGB; by default that of the checkpoint, or else black. `screen_filter`: the filter that it was trained with, if
     its files do not say ("classic", "antialiased", "mip", "analytic"). `threads`: to adapt with; by default as many as torch
     has. With the backend cpu the result does not depend on it. Raises CheckpointError, SceneError, and SettingsError for an unknown filter
@@ -72,10 +74,20 @@ def wrap_model(
         if not isinstance(screen_filter, str) or screen_filter not in USUAL_EPS2D:
             raise SettingsError(f"there is no screen filter {screen_filter!r}; choose from {', '.join(USUAL_EPS2D)}")
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
-    given = own_cameras(model) if cameras is None else cameras.cameras if isinstance(cameras, Scene) else of_base_scale(cameras)
-    wrapped = Wrapped(model, placed(model, cameras).cameras if isinstance(cameras, Scene) else given, backend, trained, threads)
-    wrapped.loading_s, wrapped.asked = loading_s, asked_for(model.folder, given, color, screen_filter)
+    found, read_from = _found(model, cameras)
+    given = found.cameras if isinstance(found, Scene) else found
+    wrapped = Wrapped(model, placed(model, found).cameras if isinstance(found, Scene) else given, backend, trained, threads)
+    wrapped.loading_s, wrapped.asked, wrapped.cameras_from = loading_s, asked_for(model.folder, given, color, screen_filter), read_from
     return wrapped
+
+
+def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | None) -> tuple[Sequence[Camera] | Scene, dict[str, str]]:
+    """The cameras that are given, those beside the model's file, or, of an adapted file, those of its base; and `where` they were read from."""
+    if isinstance(cameras, Scene):
+        return cameras, where(cameras.source, model.folder)
+    if cameras is not None:
+        return of_base_scale(cameras), {}
+    return own_cameras(model.source, model.folder)
 
 
 def asked_for(
@@ -94,8 +106,3 @@ def asked_for(
 def _loaded(path: str | Path, backend: str) -> SplatModel:
     model, device = load_model(path), device_for(backend)
     return model if device == "cpu" else model.to(device)
-
-
-def own_cameras(model: SplatModel) -> list[Camera]:
-    """The cameras beside the model's file, at the image size of its training; empty if there are none."""
-    return model_cameras(model.folder, read_options(model.folder)[0])

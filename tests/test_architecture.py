@@ -34,6 +34,7 @@ STOREYS = [
     {"demo"},
     {"commands"},
     {"cli"},
+    {"__main__"},
 ]
 
 # Where each outside library may be imported; torch and the standard library may be anywhere.

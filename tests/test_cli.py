@@ -606,6 +606,6 @@ def test_scales_that_are_no_zoom(text):
 
 def test_the_module_runs():
     root = Path(__file__).parents[1]
-    done = subprocess.run([sys.executable, "-m", "mipmap_plugin.cli", "--help"], capture_output=True, text=True, cwd=root)
+    done = subprocess.run([sys.executable, "-m", "mipmap_plugin", "--help"], capture_output=True, text=True, cwd=root)
     assert done.returncode == 0 and done.stderr == ""
     assert all(command in done.stdout for command in ("inspect", "adapt", "render", "evaluate", "backends", "demo"))

@@ -414,3 +414,25 @@ def test_real_splats_survive_each_format(shared_data, tmp_path, ending):
     base = load_model(shared_data / "checkpoints/yashica-t4/yashica-t4-top8192.ply")
     saved = base.save(tmp_path / f"a.{ending}", provenance={})
     assert (agree(base, load_model(saved), nearest=True) > 0.95).all()
+
+
+def test_the_db_of_a_file_are_of_what_its_format_keeps(tool, tmp_path, capsys):
+    """The stand-in writes SPZ that it reads as `answer.ply`, another model: as if the format rounded a lot."""
+    script = (tool / "splat-transform").read_text()
+    (tool / "splat-transform").write_text(script + f"pathlib.Path(target).write_bytes({gzip.compress(SPZ)!r}) if target.endswith('.spz') else None\n")
+    words = ["--scale", "1/4", "--steps", "0", "--backend", "reference", "--viewer", "classic"]
+    tiny.model(seed=5).save(tool / "answer.ply", provenance={}, overwrite=True)
+    source = tiny.ply(tmp_path / "scan.ply")
+    assert main(["adapt", str(source), *words, "--output", str(tmp_path / "scan.spz")]) == 0
+    said = capsys.readouterr()
+    report = json.loads((tmp_path / "scan.spz.adaptation.json").read_text())
+    exact = next(psnr for state, psnr in report["validation"].items() if report["returned"].startswith(state))
+    assert report["written"] < exact - 1
+    assert f"-> {report['written']:.2f} dB on views" in said.out
+    assert "its format rounds splats, which costs" in said.err and any("its format rounds splats" in note for note in report["notes"])
+
+
+def test_a_ply_is_not_measured_again(tmp_path, capsys):
+    words = ["--scale", "1/4", "--steps", "0", "--backend", "reference"]
+    assert main(["adapt", str(tiny.ply(tmp_path / "scan.ply")), *words, "--output", str(tmp_path / "out.ply")]) == 0
+    assert json.loads((tmp_path / "out.ply.adaptation.json").read_text())["written"] is None

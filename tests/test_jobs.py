@@ -525,7 +525,7 @@ def test_ctrl_c_saves_the_state_of_every_running_job(run, scenes, tmp_path, engi
     if "--dask" in engine:
         pytest.importorskip("distributed")
     words = ["adapt", scenes / "chair", scenes / "lego", "--scale", "1/2", "--scale", "1/4", "--backend", "reference", "--views", "given"]
-    command = [sys.executable, "-m", "mipmap_plugin.cli", *map(str, words), "--steps", "100000", "--recipe", "paper", *engine]
+    command = [sys.executable, "-m", "mipmap_plugin", *map(str, words), "--steps", "100000", "--recipe", "paper", *engine]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, env=saving_often(tmp_path / "site")
     )

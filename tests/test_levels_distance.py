@@ -11,6 +11,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, load_model, wrap_model
+from mipmap_plugin.adaptation.optimization.validation import Validation
 from mipmap_plugin.adaptation.start.pixel_size import pixel_size, seen_pixel_size
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.camera import Camera
@@ -21,7 +22,8 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.distance import chunks as chunks_module
 from mipmap_plugin.levels.distance.chunks import Chunks, shrunk
 from mipmap_plugin.levels.distance.coarsening import coarsened, kept_splats, shaped
-from mipmap_plugin.levels.distance.ladder import by_distance, scene_of
+from mipmap_plugin.levels.distance.ladder import _first, by_distance, scene_of
+from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun
 from mipmap_plugin.levels.distance.mixture import Mixture, together
 from mipmap_plugin.levels.distance.rule import DistanceRule, focal, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
@@ -350,6 +352,43 @@ def test_a_ladder_from_end_to_end(tmp_path, small_chunks, capsys):
     assert keyed == {f"{point['zoom']:.4g}": point["psnr_db"] for point in manifest["curve"]}
     print_summary(folder, manifest)
     assert "3 levels by distance" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("db", "name"),
+    [
+        ((30.0, 36.0, 34.0), "merged splats of the finer level"),  # half of the gain is kept
+        ((30.0, 36.0, 32.0), "the finer level in closed form"),
+        ((30.0, 29.0, 29.8), "merged splats of the finer level"),  # what merging may cost in any recipe
+        ((30.0, 29.0, 29.5), AS_FINER),  # all would be worse than that
+    ],
+)
+def test_a_level_that_no_step_betters_is_not_merged_at_any_cost(small_chunks, monkeypatch, db, name):
+    """`db`: of the finer level as it is, in closed form, and merged."""
+    finer, formed, merged = db
+    base, coarser = wrapped(), LevelRun._coarser
+    request = LadderRequest.of("classic", by="distance", coarsest=1 / 4, ratio=2.0, **BRIEF | {"steps": 0})
+    band = request.first_band(base.target("classic"), base.effects())
+    first, quality = _first(base, request, band, None).model, {}
+
+    def noted(self, weights, kept):
+        student = coarser(self, weights, kept)
+        quality[student] = formed if weights is None else merged
+        return student
+
+    monkeypatch.setattr(LevelRun, "_coarser", noted)
+    monkeypatch.setattr(Validation, "steer", lambda self, model: quality.get(model, finer))
+    student, told = LevelRun(scene_of(base, request, band), 1, [first])._start()
+    assert told == name
+    if name == AS_FINER:
+        assert torch.equal(student.parameters()["means"], first.parameters()["means"])
+
+
+def test_a_level_that_is_worse_than_the_finer_one_says_so(small_chunks, monkeypatch):
+    monkeypatch.setattr(LevelRun, "_as_finer", lambda *_: 99.0)
+    with pytest.warns(UserWarning, match=r"level_1 has .* dB where it is shown, where the finer level would have 99\.0, with more splats"):
+        report = wrapped().levels("classic", by="distance", coarsest=1 / 2, ratio=2.0, **BRIEF).contents.levels[1].report
+    assert report.validation[AS_FINER] == 99.0 and any(note.startswith("level_1 has") for note in report.notes)
 
 
 def test_an_interrupted_ladder_goes_on_with_its_finished_levels(tmp_path, small_chunks, monkeypatch):

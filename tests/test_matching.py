@@ -3,14 +3,18 @@
 from dataclasses import replace
 
 import pytest
+import tiny
 import torch
 
+from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
+from mipmap_plugin.adaptation.start.candidates import UNMATCHED
 from mipmap_plugin.adaptation.start.matching import MAX_FACTOR, ROUNDS, matched_opacities
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
+from mipmap_plugin.wrap import wrap_model
 
 VIEW = Camera(4, 3, 10.0, 10.0, 2.0, 1.5, torch.eye(4))
 PIXELS = 12
@@ -76,3 +80,15 @@ def test_what_hardly_shows_of_a_splat_says_little_of_its_opacity():
     opacities, whole = torch.tensor([0.3]), torch.tensor([1000.0])
     new = matched_opacities(opacities, torch.tensor([0.2]), whole, lambda tried: torch.tensor([0.1]))
     assert new.item() == pytest.approx(0.3 * (1.2 / 1.1) ** ROUNDS, rel=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:the time budget")
+@pytest.mark.parametrize("viewer", [None, "antialiased"], ids=["as trained", "converted before"])
+def test_a_budget_that_ends_before_opacities_are_matched_says_so(monkeypatch, viewer):
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    steps = {"steps": 2, "extra_views": 2, "viewer": viewer, "merge_to": 1.0}
+    whole = base.adapt(4, **steps).report
+    monkeypatch.setattr(candidates._Clock, "allows", lambda *_: False)
+    short = base.adapt(4, **steps, time_budget_s=60.0).report
+    assert UNMATCHED in short.notes and UNMATCHED not in whole.notes
+    assert short.psnr_after() >= short.psnr_before()

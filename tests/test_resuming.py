@@ -39,7 +39,7 @@ def tradeoff(folder, output):
 
 def stopped(words, number, cells, at_least):
     """Run a command until so many cells are kept, and send it a signal; return what it said."""
-    command = [sys.executable, "-X", "faulthandler", "-m", "mipmap_plugin.cli", *words]  # which says where a process was that aborts
+    command = [sys.executable, "-X", "faulthandler", "-m", "mipmap_plugin", *words]  # which says where a process was that aborts
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         wait_until(lambda: len(list(cells.glob("*.pt"))) >= at_least or process.poll() is not None)

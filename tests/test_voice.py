@@ -126,14 +126,14 @@ def test_a_log_that_can_be_written_no_more_does_not_end_the_command(base, capsys
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
 def test_what_cannot_be_printed_is_one_sentence(base):
-    command = [sys.executable, "-m", "mipmap_plugin.cli", "inspect", base, "--no-viewers"]
+    command = [sys.executable, "-m", "mipmap_plugin", "inspect", base, "--no-viewers"]
     with open("/dev/full", "w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "standard output cannot be written (No space left" in done.stderr
 
 
 def test_whoever_stops_reading_ends_the_command_in_silence(base):
-    command = [sys.executable, "-m", "mipmap_plugin.cli", "inspect", base, "--no-viewers"]
+    command = [sys.executable, "-m", "mipmap_plugin", "inspect", base, "--no-viewers"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         process.stdout.close()
         assert process.stderr.read() == ""
@@ -145,7 +145,7 @@ def test_any_name_and_any_closed_stream_are_coped_with(tmp_path, closed):
     """In an encoding that lacks what a sentence has, and a name that is no text."""
     file = os.fsencode(tmp_path) + b"/\xff\xc3.ply"
     os.rename(tiny.ply(tmp_path / "a.ply"), file)
-    line = b"exec " + shlex.quote(sys.executable).encode() + b" -m mipmap_plugin.cli inspect " + file + b" --no-viewers --log log " + closed.encode()
+    line = b"exec " + shlex.quote(sys.executable).encode() + b" -m mipmap_plugin inspect " + file + b" --no-viewers --log log " + closed.encode()
     settings = {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
     done = subprocess.run(["sh", "-c", line], cwd=tmp_path, env={**os.environ, **settings}, capture_output=True, check=False)
     assert done.returncode == 0 and b"Traceback" not in done.stderr

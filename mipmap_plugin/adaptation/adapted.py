@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import torch
 
 from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends import supersample
@@ -18,10 +20,11 @@ from mipmap_plugin.backends.base import Backend, Rendered
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects, explain
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.atomic import refuse_output, together, write_json
+from mipmap_plugin.formats.atomic import refuse_output, staged, together, write_json
+from mipmap_plugin.formats.splat_transform import is_written
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.limits import check_image
-from mipmap_plugin.models import contract
+from mipmap_plugin.models import contract, load_model
 from mipmap_plugin.models.base import SplatModel, checked_splats, effects_of
 from mipmap_plugin.models.exposure import exposed
 from mipmap_plugin.models.mip import for_loader_of
@@ -29,6 +32,7 @@ from mipmap_plugin.models.outputs import drawn_otherwise, parts_of, without_plac
 from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.plugin_errors import naming_any, unchanged
 from mipmap_plugin.process.torch_modes import usual_modes
+from mipmap_plugin.progress import announced
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,6 +48,8 @@ class Adapted:
         states: Of the run, and of a conversion before it, which are needed until the model is saved.
         adapted_to: The cameras of the base scale that the model was adapted to or selected on.
         cameras: The base's, at its scale.
+        judge: The views that nothing was adapted to, with their truth, to measure a file whose format rounds splats; None where there are none.
+        written: dB of such files on those views, once they are saved.
     """
 
     model: SplatModel
@@ -54,6 +60,8 @@ class Adapted:
     states: Sequence[StateFile] = ()
     adapted_to: Sequence[Camera] = ()
     cameras: Sequence[Camera] = ()
+    judge: Validation | None = None
+    written: dict[Path, float] = field(default_factory=dict)
 
     @usual_modes()
     def render(self, camera: Camera, *, outputs: Sequence[str] = (), exposure: bool = False, viewer: str | None = None) -> Rendered:
@@ -88,18 +96,38 @@ class Adapted:
         with together(Path(path)), naming_any({f"family {self.model.family!r}": self.model}):  # a new model never appears without its report
             model = for_loader_of(self.report.viewer, self.model, Path(path))
             saved = contract.save(model, Path(path), self.report.provenance(), overwrite=overwrite)
+            self._judge(saved)
             write_json(saved.with_name(saved.name + REPORT), self.report_of(saved).model_dump(), overwrite=overwrite)
         for state in self.states:
             state.remove()
-        if differs := self._drawn_otherwise(saved):
-            warn(differs)
+        for said in filter(None, (self._rounded(saved), self._drawn_otherwise(saved))):
+            warn(said)
         return saved
 
+    def _judge(self, saved: Path) -> None:
+        """Measure a file that is being written, as far as its format rounds splats. Raises CheckpointError if it cannot be read."""
+        if self.judge is None or not is_written(saved):
+            return
+        with warnings.catch_warnings(), announced(f"measuring {saved.name}"):
+            warnings.simplefilter("ignore")  # what there is to say of its splats was said of the base's
+            rounded = load_model(staged(saved)).to(self.model.parameters()["means"].device)
+        self.written[saved] = min(self.judge.viewer_psnrs(rounded, self.judge.choosing))
+
     def report_of(self, path: Path) -> Report:
-        """The report of the file at `path`, which also says what its format has no place for, and who draws it otherwise."""
+        """The report of the file at `path`, which also says what its format rounds, what it has no place for, and who draws it otherwise."""
         left_out = without_place(path, getattr(self.model, "extras", ()), getattr(self.model, "sh_degree", 0))
-        lost = filter(None, (left_out, self._drawn_otherwise(path)))
-        return self.report.model_copy(update={"notes": [*self.report.notes, *lost]})
+        lost = filter(None, (left_out, self._rounded(path), self._drawn_otherwise(path)))
+        moved = self.model.traits.placed and (path.suffix.lower() == ".ply" or is_written(path))  # which does not say where the cameras go
+        cameras_from = {} if moved else self.report.cameras_from
+        changes = {"notes": [*self.report.notes, *lost], "cameras_from": cameras_from, "written": self.written.get(path)}
+        return self.report.model_copy(update=changes)
+
+    def _rounded(self, path: Path) -> str:
+        """What the rounding of its format costs the file at `path`, in a sentence; "" where that is hardly anything, or was not measured."""
+        exact, written = self.report.psnr_after(), self.written.get(path)
+        if exact is None or written is None or written >= exact - HARM_DB:
+            return ""
+        return f"{path.name}: its format rounds splats, which costs {exact - written:.2f} dB on views that nothing was adapted to; a .ply keeps them"
 
     def _drawn_otherwise(self, path: Path) -> str:
         return "" if self.report.viewer else drawn_otherwise(path, self.model.trained)

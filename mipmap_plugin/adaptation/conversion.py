@@ -26,6 +26,7 @@ from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.adapted_scale import refuse_adapted
 from mipmap_plugin.models.contract import refuse_broken
 from mipmap_plugin.models.places import conversion_state
@@ -92,10 +93,11 @@ class Stages:
 
 @contextmanager
 def _kept_if_interrupted(states: Sequence[StateFile]) -> Iterator[None]:
-    """Leave the states to the next run, should this one be interrupted; remove them should it fail, as no other run leaves one then."""
+    """Leave the states to the next run, should this one be interrupted, or be refused, as by a state of another version; remove them should it
+    fail, as no other run leaves one then."""
     try:
         yield
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, SettingsError):
         for state in states:
             state.release()
         raise

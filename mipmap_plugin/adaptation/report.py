@@ -37,6 +37,7 @@ class Report(BaseModel):
         ended_by: What ended the run, such as a number of steps or a time budget.
         returned: Which of the run's states the file holds, and why if it is not the last.
         validation: dB of each state on views that nothing was adapted to and that did not steer the run, at most 54 of a view.
+        written: dB of the file itself on the same views, where its format rounds splats; None where it does not.
         viewers: Of a file for several viewers: dB in each on the same views; `validation` is the worst of the extreme viewers.
         as_trained: dB of the base itself on the same views, drawn as its training drew it; None at x1, and where the file is drawn so too.
         peak_memory_mib: Of tensors on the GPU while adapting; None without a GPU.
@@ -44,6 +45,7 @@ class Report(BaseModel):
         versions: Of this package and of torch.
         notes: What became of the model on the way, such as columns of the base's file that the new splats do not have, in sentences.
         inputs: What was given beside the checkpoint: hashes of cameras and photographs, background, screen filter.
+        cameras_from: Where its cameras were read from on this machine, for whoever looks at a lone file, which has none beside it.
         orbit: What views without cameras go around, the same for the file as for its base.
     """
 
@@ -63,6 +65,7 @@ class Report(BaseModel):
     ended_by: str
     returned: str
     validation: dict[str, float]
+    written: float | None = None
     viewers: dict[str, float] = {}
     as_trained: float | None = None
     peak_memory_mib: float | None = None
@@ -70,6 +73,7 @@ class Report(BaseModel):
     versions: dict[str, str]
     notes: list[str] = []
     inputs: dict[str, str] = {}
+    cameras_from: dict[str, str] = {}
     orbit: Orbit | None = None
 
     def psnr_before(self) -> float | None:
@@ -77,7 +81,9 @@ class Report(BaseModel):
         return self.validation.get(AS_IT_IS)
 
     def psnr_after(self) -> float | None:
-        """PSNR (dB) of what the file holds, on the same views."""
+        """PSNR (dB) of what the file holds, on the same views; before its format rounds it, where the file is not saved yet."""
+        if self.written is not None:
+            return self.written
         return next((psnr for state, psnr in self.validation.items() if self.returned.startswith(state)), None)
 
     def gain(self) -> str:
@@ -86,7 +92,7 @@ class Report(BaseModel):
         if before is None or after is None:
             return f"holds {self.returned}"
         if self.returned.startswith(AS_IT_IS):
-            return f"holds {AS_IT_IS}, for nothing was better: {before:.2f} dB on views that nothing was adapted to"
+            return f"holds {AS_IT_IS}, for nothing was better: {after:.2f} dB on views that nothing was adapted to"
         return f"{before:.2f} -> {after:.2f} dB on views that nothing was adapted to"
 
     def provenance(self) -> dict[str, Any]:
@@ -146,4 +152,4 @@ def versions() -> dict[str, str]:
         own = version("mipmap-plugin")
     except PackageNotFoundError:  # run from a source tree that was not installed
         own = "source"
-    return {"mipmap_plugin": own, "torch": torch.__version__}
+    return {"mipmap_plugin": own, "torch": str(torch.__version__)}  # plain text, which a state is read with

@@ -28,7 +28,7 @@ from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, WINDOW, Quality, Validation, split_validation
 from mipmap_plugin.adaptation.renderers import Renderer, SteppingRenderer, unrounded, views_renderer
 from mipmap_plugin.adaptation.report import AS_IT_IS, PeakMemory, Report, changes, filters, versions
-from mipmap_plugin.adaptation.start.candidates import StartSearch
+from mipmap_plugin.adaptation.start.candidates import UNMATCHED, StartSearch
 from mipmap_plugin.adaptation.start.compilation import calls_of, warm_up
 from mipmap_plugin.adaptation.start.problem import FinerLevel, StartProblem
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -138,7 +138,7 @@ class Session:
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())
         initial, start = search.best()
-        self.notes = () if self.finer and self.finer.told else search.notes
+        self.notes = [note for note in search.notes if note == UNMATCHED or not (self.finer and self.finer.told)]
         states = {AS_IT_IS: self._for_target(self._base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
         ended_by = "0 steps" + fewer_note(self.asked_steps, self.config.model_copy(update={"steps": 0}))
@@ -176,9 +176,9 @@ class Session:
         if not self.validation.choosing:
             note, psnrs = f", not validated: at this scale one pixel of the base is more than {WINDOW} px wide", {}
         report = self._report(states[best], curve or [at_end], ended_by, f"{best}{note}", psnrs)
-        used_views = [*self.views, *self.validation.steering, *self.validation.choosing]
+        used, files = [*self.views, *self.validation.steering, *self.validation.choosing], [self.state] if self.state else []
         model = states[best].copy() if getattr(states[best], "shares", False) else states[best]
-        return Adapted(model, report, self.backend, self.effects, self.targets, [self.state] if self.state else [], used_views)
+        return Adapted(model, report, self.backend, self.effects, self.targets, files, used, judge=self.validation.kept())
 
     def _optimize(self, student: SplatModel, resume: Path | None, observe: Observer | None) -> tuple[Run, str]:
         """Run Algorithm 1 on `student`, or continue it from the state in `resume`; return the run and what ended it."""

@@ -155,7 +155,7 @@ def _saved(adapted: Adapted, target: Path, overwrite: bool, *, quiet: bool) -> d
     """Save an adapted model, print a summary unless `quiet`, and return its report."""
     saved = adapted.save(target, overwrite=overwrite)
     if not quiet:
-        _say(saved, adapted)
+        _say(saved, adapted.report_of(saved), adapted.model)
     return {"file": str(saved), **adapted.report_of(saved).model_dump()}
 
 
@@ -202,12 +202,11 @@ def _made_for(report: Report, model: SplatModel) -> str:
     return f"made for renderers that draw as {own if trained.screen_filter != 'classic' else '3DGS does (INRIA, gsplat, nerfstudio)'}{advice}"
 
 
-def _say(saved: Path, adapted: Adapted) -> None:
+def _say(saved: Path, report: Report, model: SplatModel) -> None:
     """Two lines, what and where; the rest goes to the log."""
-    report = adapted.report
     splats = f"{report.gaussians_before:,} -> {report.gaussians_after:,} splats, {report.seconds['total']:.1f} s"
     say(f"x{report.scale:g}{f' in {report.viewer}' if report.viewer else ''}: {report.gain()}, {splats}")
-    say(f"{saved}, {_made_for(report, adapted.model)}")
+    say(f"{saved}, {_made_for(report, model)}")
     for line in _details(report):
         detail(f"  {line}")
 
@@ -215,6 +214,8 @@ def _say(saved: Path, adapted: Adapted) -> None:
 def _details(report: Report) -> Iterator[str]:
     psnrs = ", ".join(f"{name} {psnr:.2f}" for name, psnr in report.validation.items())
     yield f"holds {report.returned}{f' (dB on views that nothing was adapted to: {psnrs})' if psnrs else ''}; ended by {report.ended_by}"
+    if report.written is not None:
+        yield f"the file as its format rounds it: {report.written:.2f} dB on the same views"
     if report.viewers:
         yield f"in each viewer: {', '.join(f'{name} {psnr:.1f}' for name, psnr in report.viewers.items())} dB"
     if report.as_trained is not None:

@@ -49,6 +49,12 @@ def wrap(
         return wrapped
 
 
+def base_cameras(wrapped: Wrapped, given: Path | None) -> str:
+    """Where the cameras of an adapted file's base were found; "" if they lay beside the file, or were `given`."""
+    place = wrapped.cameras_from.get("scene", "")
+    return "" if given is not None or place == str(wrapped.model.folder and wrapped.model.folder.absolute()) else place
+
+
 def scene(path: Path) -> Scene:
     """The scene at `path`, whose photographs judge; a warning tells of absent ones. Raises SceneError."""
     from mipmap_plugin.scenes import load_scene

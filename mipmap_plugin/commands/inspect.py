@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mipmap_plugin.commands.common import print_facts, summary
+from mipmap_plugin.commands.common import base_cameras, print_facts, summary
 from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
@@ -67,7 +67,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
     from mipmap_plugin.models.vanilla import VanillaModel
     from mipmap_plugin.scenes import unread_cameras
 
-    model = wrapped.model
+    model, place = wrapped.model, base_cameras(wrapped, None)
     with announced("examining"):
         gaussians = model.gaussians(wrapped.views()[0])
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
@@ -79,7 +79,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
-        "cameras": summary(wrapped.cameras, unread_cameras(model.source)),
+        "cameras": summary(wrapped.cameras, unread_cameras(model.source)) + (f", of its base, in {place}" if place else ""),
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
         "health": told or ["nothing found"],
     }

@@ -25,7 +25,8 @@ class Log:
         try:
             self._file = path.open("a", encoding="utf-8", errors="backslashreplace") if _may_be_a_log(path) else None
         except (OSError, ValueError) as error:
-            raise OutputError(f"{path} cannot be written ({error}); give --log another file") from error
+            reason = getattr(error, "strerror", None) or error
+            raise OutputError(f"{path} cannot be written ({reason}); give --log another file") from error
         if self._file is None:
             raise OutputError(f"{path} holds something else than a log; give --log another file")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from mipmap_plugin.commands.common import wrap
+from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import picture_names
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale
 from mipmap_plugin.commands.voice import say
@@ -80,6 +80,8 @@ def render(
     count = f"{len(views)} picture{'s' if len(views) > 1 else ''}"
     taken = [f"at x{zoom:g}"] * (scale is None and zoom != 1) + [f"in {own_viewer}"] * (own_viewer is not None)
     say(", ".join([f"{count} in {output}", *[" ".join(taken), "which the file was adapted for"] * bool(taken)]))
+    if place := base_cameras(wrapped, cameras):
+        say(f"seen by the cameras of its base, in {place}; --cameras gives others")
 
 
 def _check(wrapped: Wrapped, views: Sequence[Camera], exposure: bool) -> None:

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from mipmap_plugin.commands.common import wrap
+from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.formats.atomic import refuse_unwritable
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -60,6 +61,8 @@ def view(
         raise SettingsError(f"port: must be from 0 to 65535, got {port}")
     if output is not None and output.exists() and not output.is_dir():
         raise SettingsError(f"{output} is no folder, which the page could save to; give --output a folder")
+    if output is not None:
+        refuse_unwritable(output / checkpoint.name)
     wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
     if viewer is not None:
         wrapped.target(viewer)  # raises before any work
@@ -68,6 +71,8 @@ def view(
         page = _page(wrapped, adapted, backend, PageSettings(host, port, name, *_choices(wrapped, viewer), _free(checkpoint, output)))
         try:
             say(f"{page.address} shows {name}; Ctrl-C ends it")
+            if place := base_cameras(wrapped, cameras):
+                say(f"its views are those of its base, in {place}; --cameras gives others")
             if browser and has_display():
                 webbrowser.open(page.address)
             page.run()

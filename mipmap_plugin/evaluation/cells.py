@@ -44,7 +44,6 @@ class Cells:
         """Write a finished cell, of tensors and plain values, atomically. Raises OutputError."""
         file = self._file(key)
         if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
             save_torch(file, content, overwrite=True)
 
     def _file(self, key: Mapping[str, Any]) -> Path | None:

@@ -16,7 +16,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.errors import MipmapPluginError, OutputError, OutputExists
+from mipmap_plugin.errors import MipmapPluginError, OutputError, OutputExists, of_system
 from mipmap_plugin.formats.staging import Staging, settle
 
 # Files that systems leave in folders, and that nobody misses.
@@ -96,7 +96,7 @@ def _as_output_error(path: Path) -> Iterator[None]:
         raise
     except OSError as error:
         file = next((parent for parent in path.parents if os.path.isfile(parent)), None)
-        reason = f"{file} is a file, not a folder; choose another path" if file else error.strerror or error
+        reason = f"{file} is a file, not a folder; choose another path" if file else of_system(error)
         raise OutputError(f"{path} cannot be written: {reason}") from error
 
 
@@ -142,13 +142,12 @@ def refuse_unwritable(path: Path, room: int = 0, *, what: str = "the base takes"
     else there is to say of them, are parts of the sentence."""
     with _as_output_error(path):
         place = absolute(path)
-        if place.parent.is_dir():
-            Staging(place).close()
         there = next(folder for folder in place.parents if os.path.lexists(folder))
         if not there.is_dir():
             raise OSError(errno.ENOTDIR, f"{there} is not a folder")
         if not os.access(there, os.W_OK | os.X_OK):
             raise OSError(errno.EACCES, f"no permission to write to {there}")
+        Staging(there / place.relative_to(there).parts[0]).close()  # as the system may refuse for a reason of its own
         free = shutil.disk_usage(there).free
     if free < room:
         reason = f"its disk has {free:,} bytes free, and {what} {room:,}{why}"

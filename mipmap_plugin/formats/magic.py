@@ -35,7 +35,7 @@ def read_head(path: Path, size: int = HEAD) -> bytes:
         with path.open("rb") as file:
             head = file.read(size)
     except OSError as error:
-        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}") from error
+        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}; check the path, and who may read it") from error
     _refuse_placeholder(path, head)
     return head
 

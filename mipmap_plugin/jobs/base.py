@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.process.garbage import uncollected
 
 if TYPE_CHECKING:
+    from mipmap_plugin.camera import Camera
     from mipmap_plugin.wrap import Wrapped
 
 COLORS = {None: None, "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
@@ -27,15 +29,18 @@ class Base:
 
     def asked(self) -> dict[str, str]:
         """What is given beside the checkpoint, as its adaptations record it, without loading it. Raises CheckpointError, SceneError."""
+        from mipmap_plugin.adaptation.cameras_of_base import own_cameras
+        from mipmap_plugin.models import detect
         from mipmap_plugin.models.inria_folder import read_options
-        from mipmap_plugin.scenes import load_scene, model_cameras
+        from mipmap_plugin.scenes import load_scene
         from mipmap_plugin.wrap import asked_for
 
         folder = self._model_folder()
         if self.cameras is not None:
-            cameras = load_scene(self.cameras, read_options(folder)[0]).cameras
+            cameras: Sequence[Camera] = load_scene(self.cameras, read_options(folder)[0]).cameras
         else:
-            cameras = tuple(model_cameras(folder, read_options(folder)[0]))
+            own, _ = own_cameras(detect(self.checkpoint).path, folder)
+            cameras = own if isinstance(own, list) else own.cameras
         return asked_for(folder, cameras, COLORS[self.background], self.screen_filter)
 
     def unpacked(self) -> Base:

@@ -20,6 +20,7 @@ from typing import IO
 
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.process.freed_memory import keep_freed_memory
+from mipmap_plugin.process.signals import INTERRUPTED, Ending, ends_as_by_ctrl_c
 
 Request = tuple[Job, "int | None"]
 
@@ -27,13 +28,21 @@ Request = tuple[Job, "int | None"]
 def main() -> None:
     """Do the jobs that come on standard input, and write their outcomes to standard output, until the owner closes it."""
     signal.signal(signal.SIGINT, _leave)
+    with ends_as_by_ctrl_c() as ending:
+        _serve(ending)
+
+
+def _serve(ending: Ending) -> None:
     keep_freed_memory()  # also in workers of dask, whose environment asks for the opposite
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints must not mix with the answers
     requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(sys.stdin.buffer, requests), daemon=True).start()
     while True:
-        pickle.dump(_run_quietly(*requests.get()), answers)
+        outcome = _run_quietly(*requests.get())
+        if ending.code != INTERRUPTED:  # not by its owner, who begins the job again elsewhere, from the state that was saved
+            os._exit(ending.code)
+        pickle.dump(outcome, answers)
         answers.flush()
 
 

@@ -39,7 +39,8 @@ class LevelStore:
             if not file.is_file():
                 raise SettingsError(f"{folder}: unfinished ladders are kept there, but it has other things in it; choose another output")
             if read_json(file) != facts:
-                raise SettingsError(f"{folder}: holds levels of another base, viewer or settings; repeat the run with those, or delete it")
+                others = "levels of another base, viewer or settings, or of another version"
+                raise SettingsError(f"{folder}: holds {others}; repeat the run with those, or delete it")
         write_json(file, facts, overwrite=True)
 
     def level(self, name: str, make: Callable[[Path | None], Adapted]) -> Adapted:

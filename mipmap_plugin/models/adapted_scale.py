@@ -36,15 +36,19 @@ def adapted_orbit(source: Path | None) -> tuple[list[float], list[float], float]
     return None
 
 
+def report_beside(source: Path | None) -> dict[str, Any]:
+    """The report beside the adapted file `source`; {} if there is none. Raises SceneError for a damaged one."""
+    report = None if source is None else source.with_name(source.name + REPORT)
+    found = read_json(report) if report is not None and report.is_file() else {}
+    return found if isinstance(found, dict) else {}
+
+
 def _record(source: Path | None) -> dict[str, Any]:
     """What this package wrote into a file, or beside it. Raises CheckpointError for a damaged file, SceneError for a damaged report."""
     if source is None or not source.is_file():  # made in memory, gone since, or a folder of another family
         return {}
-    report = source.with_name(source.name + REPORT)
     record = (provenance_of(read_header(source).comments) or {}) if kind_of(source) == "ply" else {}
-    if "scale" not in record and report.is_file():
-        record = read_json(report)
-    return record if isinstance(record, dict) else {}
+    return record if "scale" in record else report_beside(source)
 
 
 def refuse_adapted(source: Path | None) -> None:

@@ -30,6 +30,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         scale=scene.scale,
         base=scene.digest,
         inputs=scene.wrapped.asked,
+        cameras_from=scene.wrapped.cameras_from,
         orbit=orbit_of(scene.wrapped.model, scene.base.places[:, :3]),
         settings=config,
         backend=scene.backend_note,

@@ -23,6 +23,7 @@ from corpus import SAMPLES
 from mipmap_plugin.adaptation.optimization import resume
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats import staging
+from mipmap_plugin.formats.torch_file import load_torch
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
 
@@ -185,6 +186,24 @@ def test_a_killed_run_goes_on_from_its_last_state_to_the_same_bytes(tmp_path):
     resumed, whole = (model.adapt(1 / 4, steps=6, extra_views=2, views_per_step=2, warm_up=0, resume=path) for path in (state, None))
     saved = [each.save(tmp_path / f"{i}.ply").read_bytes() for i, each in enumerate((resumed, whole))]
     assert saved[0] == saved[1] and not state.exists()
+
+
+# A state of another version
+
+
+@pytest.mark.parametrize("versions", [None, {"mipmap_plugin": "0.0.1", "torch": "1.0"}], ids=["before versions were kept", "another"])
+@pytest.mark.parametrize("spoilt", ["fingerprint", "planned"], ids=["other settings", "other contents"])
+def test_a_state_of_another_version_is_named_and_stays(tmp_path, monkeypatch, versions, spoilt):
+    monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
+    living = model.adapt(1 / 4, steps=1, resume=state)
+    del living  # not saved
+    content = load_torch(state) | {"versions": versions, spoilt: None}
+    torch.save({name: value for name, value in content.items() if value is not None}, state)
+    who = "an older version" if versions is None else "mipmap_plugin 0.0.1 and torch 1.0"
+    with pytest.raises(SettingsError, match=f"state: this state was left by {who}, and this is .*; go on with that version, or delete it"):
+        model.adapt(1 / 4, steps=1, resume=state)
+    assert state.exists()
 
 
 # A damaged state

@@ -203,7 +203,8 @@ def test_an_output_error_names_the_output(tmp_path, monkeypatch, name):
     monkeypatch.setattr(torch, "save", full)
     with pytest.raises(OutputError) as told:
         new.save(out)
-    assert str(told.value).startswith(str(out)) and str(told.value).endswith("cannot be written: No space left on device")
+    reason = "cannot be written: No space left on device; free some, or choose another disk"
+    assert str(told.value).startswith(str(out)) and str(told.value).endswith(reason)
     assert ".tmp" not in str(told.value)
 
 
@@ -262,10 +263,10 @@ def test_a_state_that_cannot_be_kept_costs_a_warning(tmp_path, monkeypatch):
 
 
 def test_states_beyond_the_last_are_refused(tmp_path):
-    living = [claim_state_file(tmp_path / "state", lambda _: False) for _ in range(staging.SLOTS)]
+    living = [claim_state_file(tmp_path / "state", lambda _: "belongs to another") for _ in range(staging.SLOTS)]
     assert len({each.path for each in living}) == staging.SLOTS
     with pytest.raises(SettingsError, match="state"):
-        claim_state_file(tmp_path / "state", lambda _: False)
+        claim_state_file(tmp_path / "state", lambda _: "belongs to another")
 
 
 # The cache

@@ -19,6 +19,7 @@ from mipmap_plugin.adaptation.optimization.run import Run, Task, Trial
 from mipmap_plugin.adaptation.optimization.snapshot import Snapshot
 from mipmap_plugin.adaptation.optimization.state_file import StateFile, claim_state_file
 from mipmap_plugin.adaptation.optimization.validation import Steering
+from mipmap_plugin.adaptation.report import versions
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.atomic import refuse_output
@@ -57,7 +58,7 @@ class StateKeeper:
         states: list[dict[str, Any]] = []
         try:
             self._requested.parent.mkdir(parents=True, exist_ok=True)
-            self.file = claim_state_file(self._requested, lambda path: self._load_if_ours(path, states))
+            self.file = claim_state_file(self._requested, lambda path: self._whose(path, states))
         except OSError as error:
             warnings.warn(f"{self._requested} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)
         if not states:
@@ -65,14 +66,17 @@ class StateKeeper:
         try:
             return load_run(states[0], student, config)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            if others := _of_another_version(states[0]):
+                raise SettingsError(f"{self._path}: this state {others}, or delete it to start anew") from error
             raise SettingsError(f"{self._path}: this state of a run is incomplete; delete it to start anew ({error})") from error
 
-    def _load_if_ours(self, path: Path, states: list[dict[str, Any]]) -> bool:
-        """Append the state in a file to `states` if it belongs to this run, and return whether it does."""
+    def _whose(self, path: Path, states: list[dict[str, Any]]) -> str:
+        """Append the state in a file to `states` and return "" if it belongs to this run; else say whose it is, and what to do with it."""
         state = _read(path)
         if isinstance(state, dict) and state.get("fingerprint") == self._fingerprint:
             states.append(state)
-        return bool(states)
+            return ""
+        return _of_another_version(state) or "belongs to another base, settings or views; repeat the run with those"
 
     @property
     def _path(self) -> Path | None:
@@ -116,6 +120,7 @@ def save_run(run: Run, path: Path, fingerprint: str) -> None:
     """Save everything that `load_run` needs. `fingerprint` identifies the base, the settings and the views."""
     state = {
         "fingerprint": fingerprint,
+        "versions": versions(),
         "step": run.step,
         "seconds": run.watch.seconds,
         "costs": run.costs.sums(),
@@ -178,6 +183,14 @@ def _trial(state: dict[str, Any] | None, device: torch.device) -> Trial | None:
         return None
     before = state["before"] and {name: tensor.to(device) for name, tensor in state["before"].items()}
     return Trial(**{**state, "before": before})
+
+
+def _of_another_version(state: Any) -> str:
+    """That a state was left by another version, in which settings may be others, in words; "" if it was not."""
+    if not isinstance(state, dict) or "parameters" not in state or (theirs := state.get("versions")) == (ours := versions()):
+        return ""
+    told = " and ".join(f"{name} {version}" for name, version in theirs.items()) if isinstance(theirs, dict) else "an older version"
+    return f"was left by {told}, and this is {' and '.join(f'{name} {version}' for name, version in ours.items())}; go on with that version"
 
 
 def _read(path: Path) -> Any:

@@ -32,13 +32,14 @@ class StateFile:
         self.release()
 
 
-def claim_state_file(requested: Path, is_ours: Callable[[Path], bool]) -> StateFile:
+def claim_state_file(requested: Path, whose: Callable[[Path], str]) -> StateFile:
     """Lock and return the state to resume, at `requested`, `requested`.2 and so on, or else the first of these that is free.
 
-    `is_ours` returns whether a state belongs to this run. Raises SettingsError if there are only states of other runs that have ended.
+    `whose` says whose a state is and what to do with it; "" if it is of this run. Raises SettingsError if there are only states of other runs that
+    have ended, which stay where they are.
     """
     free: StateFile | None = None
-    foreign = []
+    foreign = list[tuple[Path, str]]()
     for path in (requested, *(requested.with_name(f"{requested.name}.{number}") for number in range(2, SLOTS + 1))):
         exists = os.path.lexists(path)
         if not exists and free is not None and not os.path.lexists(_lock_of(path)):
@@ -46,15 +47,17 @@ def claim_state_file(requested: Path, is_ours: Callable[[Path], bool]) -> StateF
         if (lock := claim(_lock_of(path))) is None:
             continue  # a run that is still going on keeps its state there
         file = StateFile(path, lock)
-        if exists and is_ours(path):
+        others = whose(path) if exists else ""
+        if exists and not others:
             return file
         if exists:
-            foreign.append(path)
+            foreign.append((path, others))
         elif free is None:
             free = file
-    if foreign or free is None:
-        path = foreign[0] if foreign else requested
-        raise SettingsError(f"{path}: this state belongs to another base, settings or views; repeat the run with those, or delete it to start anew")
+    if foreign:
+        raise SettingsError("{}: this state {}, or delete it to start anew".format(*foreign[0]))
+    if free is None:
+        raise SettingsError(f"{requested}: {SLOTS} other runs keep their states there; wait for one of them, or choose another output")
     return free
 
 

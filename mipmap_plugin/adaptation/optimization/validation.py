@@ -7,7 +7,7 @@ The other half is used once, at the end, to choose among the base as it is, the 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
 from typing import NamedTuple
@@ -105,6 +105,13 @@ class Validation:
         draws = [_drawing(render, model, shared, cameras) for render in renders]
         errors = [list(side_by_side(partial(error, draw), range(len(views)), threads)) for draw in draws]
         return [torch.stack(each).tolist() for each in errors]  # a GPU is waited for once, and not for each view
+
+    def kept(self) -> Validation | None:
+        """The views that choose with their truth alone, to judge by when the run and what it holds are gone; None if there are none."""
+        if not self.choosing:
+            return None
+        truths = {view: self.truth(view) for view in self.choosing}
+        return replace(self, steering=[], truth=truths.__getitem__)
 
     def steer(self, model: SplatModel) -> float:
         """The visible quality (dB) on the steering views."""

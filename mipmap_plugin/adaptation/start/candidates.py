@@ -64,6 +64,10 @@ def start_name(forms: bool, *, merged: bool = False, thinned: bool = False) -> s
     return f"the closed form of {splats}" if merged else "the closed form"
 
 
+# What is said where a time budget ended before opacities were matched to the base's blend weights (`matching`), which gains some dB.
+UNMATCHED = "the time budget left no time to fit opacities to what splats show in the base's images, so that the start has less dB than it could"
+
+
 class StartSearch:
     """The candidates, and the choice among them by their PSNR on the steering views."""
 
@@ -192,9 +196,11 @@ class StartSearch:
     def _closed_form(self, gaussians: Gaussians, weights: Tensor | None) -> tuple[Tensor, Tensor]:
         """Scales [N, 3] and opacities [N] in closed form, with opacities that match the blend weights where these are known."""
         problem = self._problem
-        rounds = ROUNDS if self._matches_weights and weights is not None else 0
+        rounds = wanted = ROUNDS if self._matches_weights and weights is not None else 0
         while rounds and not self._clock.allows("weights", rounds):
             rounds -= 1
+        if rounds == 0 < wanted and UNMATCHED not in self.notes:
+            self.notes.append(UNMATCHED)
         area_power = 1.0 if rounds else AREA_POWER
         pixel = self._pixel_size(gaussians.means)
         formed_for = mean_pixel_size(gaussians.means, problem.closest_of, self._count) if problem.scale > 1 else pixel

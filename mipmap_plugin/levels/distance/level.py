@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from mipmap_plugin.adaptation.optimization.amount import affordable_for, fewer_n
 from mipmap_plugin.adaptation.optimization.loop import adapt
 from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Task
-from mipmap_plugin.adaptation.optimization.validation import Validation, split_validation
+from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation, split_validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.compilation import warm_up
@@ -28,6 +28,7 @@ from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import GOLDEN, choose_views, orbit_of
+from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Backend, Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
 from mipmap_plugin.config import AdaptConfig
@@ -52,6 +53,9 @@ SAMPLES, MEASURED_SAMPLES = 2, 3
 
 # The settings of a zoom-out end here; at x1 nothing would be merged.
 BELOW_1 = 1 - 1e-3
+
+# The finer level, of which a level is made, and which it replaces farther away.
+AS_FINER = "the finer level as it is"
 
 # A view is used at least so many times in a run, because its truth costs as much as several steps.
 USES = 6
@@ -173,8 +177,7 @@ class LevelRun:
         """[H, W, 3], 0..1: the part of each pixel that is this level's. Without it, the level would make up for what others lack elsewhere."""
 
         def make() -> Tensor:
-            live = self.scene.pixel_of(self.finest.means) < self.size
-            target = self.scene.target
+            live, target = self.scene.pixel_of(self.finest.means) < self.size, self.scene.target
             plain = replace(target, sh_degree=0, background=(0.0, 0.0, 0.0), settings=target.settings.without_color_rounding())
             return self.scene.backend.render(self.unmerged.part_of(self.number, live, camera), camera, plain).image.clamp(0, 1)
 
@@ -188,8 +191,8 @@ class LevelRun:
         warm_up(self.scene.backend, self.finest, drawn_with, Calls(self.config.steps > 0, True, pixels=pixels))
         with announced(f"level {self.number}: merging"):
             student, name = self._start()
-        initial, states, curve, ended_by, kept = student.copy(), {}, [], "0 steps", None
-        states[f"the start, {name}"] = initial
+        initial, curve, ended_by, kept = student.copy(), [], "0 steps", None
+        states = {f"the start, {name}": initial}
         self.seconds["total"] = now(self.finest.means.device) - began
         if self.config.steps:
             task = WalkTask(self.views, 1.0, self.truth, self._render, False, self.validation, size=self.size)
@@ -200,28 +203,45 @@ class LevelRun:
             curve, kept, self.seconds["total"] = run.curve, keeper.remaining_file(), run.watch.seconds
             self.seconds["optimization"] = run.watch.seconds - run.costs.seconds()
         best, psnrs = self.validation.choose(states)
+        psnrs[AS_FINER] = self._as_finer(lambda finer: self.validation.viewer_psnrs(finer, self.validation.choosing)[0])
         report = self._report(states[best], curve, ended_by, best, psnrs)
         effects = {str(self.scene.request.viewer): self.scene.target}
-        files = [kept] if kept else []
-        return Adapted(states[best], report, self.scene.backend, self.scene.target, effects, files, self.views, self.scene.views)
+        return Adapted(states[best], report, self.scene.backend, self.scene.target, effects, [kept] if kept else [], self.views, self.scene.views)
 
     def _start(self) -> tuple[SplatModel, str]:
         """The student, and what it is called: as few splats as a ladder by zoom would keep, or more where merging would cost too much."""
         scene, pixels = self.scene, self.scene.pixel_of(self.scene.splats.means)
         kept, moved = kept_splats(pixels, self.size, scene.rule.ratio), int((scene.pixel_of(self.finest.means) < self.size).sum())
-        views = evenly(scene.views, enough_views(scene.splats.means, scene.views))
-        weights = blend_weights(self.finest, views, scene.backend, scene.target)
-        formed_db = self.validation.steer(self._coarser(None, moved))
+        weights = blend_weights(self.finest, evenly(scene.views, enough_views(scene.splats.means, scene.views)), scene.backend, scene.target)
+        formed_db, finer_db = self.validation.steer(self._coarser(None, moved)), self._as_finer(self.validation.steer)
+        least = formed_db - MERGING_COSTS
+        if not self.config.steps:  # which would regain it; half of what it gains on the finer level may go, as by zoom
+            least = max(formed_db, finer_db) - min(MERGING_COSTS, max(self.config.merging_costs, (formed_db - finer_db) / 2))
         for root in (1, 2, 4):
             student = self._coarser(weights, math.ceil(moved * min(1.0, kept / max(1, moved)) ** (1 / root)))
-            if self.validation.steer(student) >= formed_db - MERGING_COSTS:
+            if self.validation.steer(student) >= least:
                 return student, "merged splats of the finer level"
+        if finer_db > formed_db and not self.config.steps:
+            self.mixture, self.fixed = self.unmerged, 0
+            return self._for_target(), AS_FINER
         return self._coarser(None, moved), "the finer level in closed form"
+
+    def _as_finer(self, measure: Callable[[SplatModel], float]) -> float:
+        """What `measure` says of the finer level where this one is shown, which it would replace."""
+        own, self.mixture, self.fixed = (self.mixture, self.fixed), self.unmerged, 0
+        measured = measure(self.finer[-1])
+        self.mixture, self.fixed = own
+        return measured
+
+    def _for_target(self) -> SplatModel:
+        """A copy of the finer level that is rendered with the target's screen filter."""
+        student, target = self.finer[-1].copy(), self.scene.target
+        student.trained = replace(student.trained, screen_filter=target.screen_filter, eps2d=target.eps2d)
+        return student
 
     def _coarser(self, weights: Tensor | None, kept: int) -> SplatModel:
         """The finer level, merged down to so many of the splats that change. Its mixture with the other levels is the run's from now on."""
-        scene, number, student = self.scene, self.number, self.finer[-1].copy()
-        student.trained = replace(student.trained, screen_filter=scene.target.screen_filter, eps2d=scene.target.eps2d)
+        scene, number, student = self.scene, self.number, self._for_target()
         sizes = (scene.rule.middle(number - 1) if number > 1 else 0.0, self.size)
 
         def form(splats: Gaussians) -> Gaussians:
@@ -261,9 +281,18 @@ class LevelRun:
             curve=curve,
             versions=versions(),
             inputs=scene.base.asked,
+            cameras_from=scene.base.cameras_from,
             orbit=orbit_of(scene.base.model),
-            notes=doubts_in(scene.base.model.notes),
+            notes=[*doubts_in(scene.base.model.notes), *self._worse(best, psnrs)],
         )
+
+    def _worse(self, best: str, psnrs: dict[str, float]) -> list[str]:
+        """A note, which is also a warning, on a level that has less dB than the finer one would where it is shown; none if it has not."""
+        if psnrs[best] >= psnrs[AS_FINER] - HARM_DB:
+            return []
+        figures = f"{psnrs[best]:.1f} dB where it is shown, where the finer level would have {psnrs[AS_FINER]:.1f}"
+        warn(note := f"level_{self.number} has {figures}, with more splats; more steps would better it")
+        return [note]
 
 
 def _most_views(config: AdaptConfig) -> int:

@@ -1,0 +1,50 @@
+"""The cameras of the base of an adapted file, which a lone file has not beside it: its report says where they were read from."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from mipmap_plugin.camera import Camera, digest_of
+from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.models.adapted_scale import report_beside
+from mipmap_plugin.models.inria_folder import read_options
+from mipmap_plugin.scenes import Scene, load_scene, model_cameras
+
+# What is said where the cameras are gone, or are others by now.
+GONE = "views of a generated orbit are taken instead; give the scene's cameras (--cameras)"
+
+
+def own_cameras(source: Path | None, folder: Path | None) -> tuple[list[Camera] | Scene, dict[str, str]]:
+    """The cameras beside the file `source` of a model in `folder`, or those of the base that it was adapted from; and `where` they were read from."""
+    beside = model_cameras(folder, read_options(folder)[0])
+    return (beside, where(None, folder)) if beside else _of_base(source) or ([], {})
+
+
+def where(scene: Path | None, folder: Path | None) -> dict[str, str]:
+    """Where cameras are read from, as `Report.cameras_from` records it: a scene or, by default, the model folder, whose options say their size."""
+    read_from = scene or folder
+    paths = {"scene": read_from, "options": folder}
+    return {} if read_from is None else {name: str(path.absolute()) for name, path in paths.items() if path is not None}
+
+
+def _of_base(source: Path | None) -> tuple[Scene, dict[str, str]] | None:
+    """The scene that the base of the file `source` was seen by, and `where` it is; None if `source` is a base, or was adapted without cameras.
+
+    A warning says so where they are gone, or are others by now.
+    """
+    place = ""
+    try:
+        match report := report_beside(source):
+            case {"cameras_from": {"scene": str() as place, **others}, "inputs": {"cameras": str() as wanted}}:
+                options = others.get("options")
+            case _:
+                return None
+        scene = load_scene(place, read_options(Path(options) if isinstance(options, str) else None)[0])
+        reason = "" if digest_of(scene.cameras) == wanted else f"the cameras in {place} are others now"
+    except (MipmapPluginError, OSError) as error:
+        reason = str(error)
+    if reason:
+        warnings.warn(f"{source} was adapted with cameras that are not found any more ({reason}): {GONE}", stacklevel=3)
+        return None
+    return scene, report["cameras_from"]

@@ -1,0 +1,124 @@
+"""A command that is told to end, by `timeout`, a cluster or a closed terminal, does what Ctrl-C does: nothing temporary stays."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import zipfile
+
+import pytest
+import tiny
+import torch
+
+from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.cli import main
+from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.jobs.job import Job
+from mipmap_plugin.jobs.worker import Worker, do
+from mipmap_plugin.process import signals
+from mipmap_plugin.process.signals import ends_as_by_ctrl_c
+
+# A command that is told to end, as `timeout` does it, when it has unpacked its checkpoint.
+TOLD_TO_END = """
+import os, signal, sys
+from mipmap_plugin import cli, models
+
+def told(path, **_):
+    models.zipped_folder.opened(path)
+    assert os.listdir("unpacked")
+    signal.raise_signal(signal.SIGTERM)
+
+models.load_model = told
+code = cli.main(["inspect", "base.zip"])
+signal.raise_signal(signal.SIGTERM)
+sys.exit(code)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _signals_as_before():
+    before = {number: signal.getsignal(number) for number in (*signals.SIGNALS, signal.SIGINT)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def zipped(folder, archive):
+    with zipfile.ZipFile(archive, "w") as opened:
+        for file in folder.rglob("*"):
+            opened.write(file, file.relative_to(folder.parent))
+    return archive
+
+
+def test_what_was_unpacked_is_removed(tmp_path):
+    zipped(tiny.folder(tmp_path / "base"), tmp_path / "base.zip")
+    (tmp_path / "unpacked").mkdir()
+    environment = {**os.environ, "TMPDIR": str(tmp_path / "unpacked"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, "-c", TOLD_TO_END], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr.strip()) == (128 + signal.SIGTERM, "mipmap-plugin: interrupted")
+    assert not list((tmp_path / "unpacked").iterdir())
+
+
+@pytest.mark.parametrize("number", signals.SIGNALS)
+def test_a_run_keeps_its_state(tmp_path, monkeypatch, capsys, number):
+    render, told = ReferenceBackend.render, []
+
+    def telling(self, gaussians, camera, effects):
+        if gaussians.means.requires_grad and torch.is_grad_enabled() and camera.width > 1 and not told:  # in a step
+            told.append(signal.raise_signal(number))
+            signal.raise_signal(number)
+        return render(self, gaussians, camera, effects)
+
+    monkeypatch.setattr(ReferenceBackend, "render", telling)
+    words = ["--scale", "1/4", "--backend", "reference", "--views", "given", "--steps", "3", "--output", str(tmp_path / "new.ply")]
+    assert main(["adapt", str(tiny.folder(tmp_path / "base")), *words]) == 128 + number
+    assert "interrupted at step 1; run the same command again to continue" in capsys.readouterr().err
+    assert (tmp_path / "new.ply.resume").exists() and not (tmp_path / "new.ply").exists()
+
+
+def test_a_second_signal_counts_when_the_first_is_long_ago(monkeypatch):
+    now = iter([100.0, 100.0 + signals.SAME_S - 1, 100.0 + 3 * signals.SAME_S])
+    monkeypatch.setattr(signals.time, "monotonic", lambda: next(now))
+    heard = []
+    signal.signal(signal.SIGINT, lambda *_: heard.append("Ctrl-C"))
+    with ends_as_by_ctrl_c():
+        for _ in range(3):
+            signal.raise_signal(signal.SIGTERM)
+    assert len(heard) == 2
+
+
+def test_it_ends_also_where_ctrl_c_is_ignored():
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with pytest.raises(KeyboardInterrupt), ends_as_by_ctrl_c() as told:
+        signal.raise_signal(signal.SIGTERM)
+    assert told.code == 128 + signal.SIGTERM
+
+
+def test_what_nohup_ignores_stays_ignored():
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with ends_as_by_ctrl_c():
+        signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+
+
+def test_nothing_is_changed_afterwards():
+    with ends_as_by_ctrl_c() as told:
+        pass
+    assert [signal.getsignal(number) for number in signals.SIGNALS] == [signal.SIG_DFL] * len(signals.SIGNALS)
+    assert told.code == signals.INTERRUPTED
+
+
+def test_a_job_whose_worker_is_told_to_end_is_done_again(tmp_path):
+    worker, told = Worker(1), []
+
+    def tell_once():
+        if not told:
+            told.append(os.kill(worker._process.pid, signal.SIGTERM))
+
+    job = Job(Base(tiny.folder(tmp_path / "base"), backend="reference"), tmp_path / "out.ply", 0.5, settings={"steps": 0, "views": "given"})
+    try:
+        assert do(job, worker, tell_once).status == "done" and told
+    finally:
+        worker.close()
