@@ -15,13 +15,13 @@ from gpu_work import Work, kept
 from workloads import split_into
 
 from mipmap_plugin import load_model, load_scene, wrap_model
-from mipmap_plugin.adaptation.optimization.loop import STOPPED
+from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.evaluation.evaluate import Evaluator, adapted_row
 from mipmap_plugin.evaluation.measure import adapt_alone
 from mipmap_plugin.evaluation.protocols import PROTOCOLS, test_views
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.vanilla import VanillaModel
-from mipmap_plugin.wrap import Wrapped, own_cameras
+from mipmap_plugin.wrap import Wrapped
 
 RESULTS = Path(__file__).parent / "results"
 FLOWERS = "flowers_r8"
@@ -110,7 +110,7 @@ class Subject:
     @classmethod
     def of(cls, base: Base, place: Place) -> Subject:
         here = load_model(place.data / base.path)
-        cameras = own_cameras(here)
+        cameras = wrap_model(here).cameras
         model = here.to(place.device)
         wrapped = wrap_model(model if base.splats is None else denser(model, base.splats), cameras=cameras, backend=place.backend)
         images = place.data / "images" / base.name.split("_")[0]
@@ -140,13 +140,13 @@ class Subject:
 
 
 # What a report says where `_is_over`, and what is meant.
-ENDED = {STOPPED: "the end of the time"}
+ENDED = {End.OBSERVER.value: "the end of the time"}
 
 
 def denser(model: SplatModel, splats: int) -> SplatModel:
     """A stand-in for a larger capture: the same scene of more splats."""
     with torch.no_grad():
-        return VanillaModel.from_gaussians(split_into(model.gaussians(own_cameras(model)[0]), splats), model.trained)
+        return VanillaModel.from_gaussians(split_into(model.gaussians(wrap_model(model).any_camera()), splats), model.trained)
 
 
 @kept

@@ -14,9 +14,8 @@ from gpu_work import Work, kept
 from torch import Tensor
 from workloads import activated, effects_of
 
-from mipmap_plugin import Camera, Gaussians, load_model
+from mipmap_plugin import Camera, Gaussians, load_model, wrap_model
 from mipmap_plugin.backends.base import AdamStep
-from mipmap_plugin.wrap import own_cameras
 
 BASE = "lego_200"
 WIDTHS = (50, 100, 200, 400)  # px
@@ -51,7 +50,7 @@ class Shots:
 def of_base(data: Path, device: str) -> Shots:
     """The raw parameters of the base, and its first views."""
     model = load_model(data / "checkpoints" / "bases" / BASE)
-    cameras = own_cameras(model)[: max(COUNTS)]
+    cameras = wrap_model(model).cameras[: max(COUNTS)]
     return Shots(raw_of(model.gaussians(cameras[0]).detach(), device), cameras)
 
 
