@@ -42,8 +42,9 @@ PROTOCOL = PROTOCOLS["P3"]
 # Every third of 25 test views: a view takes a second, and there are hundreds of rows.
 VIEWS = slice(0, 24, 3)
 
-# The picture's base, scale and view, and how many px high each of its parts is shown.
+# The picture's base, scale, view and viewers, and how many px high each of its parts is shown.
 SHOWN = ("lego_200", 1 / 4, 4)
+SHOWN_IN = ("spark", "playcanvas", "gaussian-splats-3d", "three")
 HEIGHT = 200
 
 INTRO = """# What real viewers show
@@ -173,7 +174,7 @@ def rows_of_viewer(
         quality = fmean(psnr(image, truth) for image, truth in zip(images, truths, strict=True))
         rows.append(Row(base, work.scale, viewer, name, count_of(path), quality))
         print(rows[-1], flush=True)
-        if (base, work.scale) == SHOWN[:2]:
+        if (base, work.scale) == SHOWN[:2] and viewer in SHOWN_IN:
             save(pictures / f"{viewer}_{name}.png", images[SHOWN[2]])
             save(pictures / "truth.png", truths[SHOWN[2]])
     return rows
@@ -216,8 +217,8 @@ def cell(row: Row | None) -> str:
 
 
 def mosaic(pictures: Path) -> Image.Image | None:
-    """A row for each viewer: the truth, then every file; None where the picture's base was not measured."""
-    screenshots = {viewer: {name: pictures / f"{viewer}_{name}.png" for name in FILES} for viewer in VIEWERS}
+    """A row for each viewer that is shown: the truth, then every file; None where the picture's base was not measured."""
+    screenshots = {viewer: {name: pictures / f"{viewer}_{name}.png" for name in FILES} for viewer in SHOWN_IN}
     viewers = [viewer for viewer, files in screenshots.items() if any(path.exists() for path in files.values())]
     names = [name for name in FILES if any(screenshots[viewer][name].exists() for viewer in viewers)]
     if not viewers:
