@@ -1,6 +1,7 @@
 """The exceptions. Every error that a user can cause is a `MipmapPluginError`, whose message says what is wrong, where, and what to do."""
 
 import errno
+import re
 
 # Maximum characters of a message. A damaged file that it quotes may have megabytes in place of a name or a number.
 MAX_LENGTH = 1500
@@ -71,8 +72,13 @@ def of_system(error: OSError) -> str:
 def of_a_file(error: OSError) -> str:
     """An error of the system that nobody foresaw, in a sentence: which file, what, and what to do."""
     where = f"{error.filename}: " if error.filename else ""
-    temporary = "; the variable TMPDIR names another place for temporary files" if TEMPORARY in str(error.filename) else ""
+    temporary = "; the variable TMPDIR names another place for temporary files" if is_temporary(error.filename) else ""
     return f"{where}{error.strerror or error}; check that path, who may read and write there, and that its disk is not full{temporary}"
+
+
+def is_temporary(path: object) -> bool:
+    """Whether a path leads into a temporary folder of this package, to whose name Python adds eight characters."""
+    return re.search(rf"\b{TEMPORARY}[a-z0-9_]{{8}}\b", str(path)) is not None
 
 
 def brief(error: BaseException) -> str:

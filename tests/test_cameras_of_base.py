@@ -12,7 +12,9 @@ import torch
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.cli import main
+from mipmap_plugin.errors import TEMPORARY
 from mipmap_plugin.jobs.base import Base
+from mipmap_plugin.models import zipped_folder
 from mipmap_plugin.scenes import load_scene, write_cameras
 
 
@@ -71,6 +73,21 @@ def test_a_report_without_a_place_is_one_of_before(base, tmp_path, record):
 def test_a_job_knows_them_without_loading(base, tmp_path):
     adapted = instant(base, tmp_path / "adapted.ply")
     assert Base(adapted).asked() == Base(adapted, backend="reference").load().asked
+
+
+def test_those_of_an_archive_are_found_in_it_again(base, tmp_path, monkeypatch, capsys):
+    archive = shutil.make_archive(str(tmp_path / "zipped"), "zip", tmp_path, "base")
+    expected, adapted = poses(base), instant(archive, tmp_path / "adapted.ply")
+    monkeypatch.setattr(zipped_folder, "_OPENED", {})  # as in a later process, when what was unpacked is gone
+    assert torch.equal(poses(adapted), expected)
+    assert main(["inspect", str(adapted), "--no-viewers"]) == 0 and f", of its base, in {archive}" in capsys.readouterr().out
+    assert main(["inspect", archive, "--no-viewers"]) == 0 and "of its base" not in capsys.readouterr().out
+
+
+def test_what_another_process_unpacked_is_not_recorded(base, tmp_path):
+    unpacked = tmp_path / f"{TEMPORARY}ab12_x9z" / "base"
+    shutil.copytree(base, unpacked)
+    assert not wrap_model(unpacked, backend="reference").cameras_from
 
 
 def test_a_file_in_another_frame_names_none(base, tmp_path):

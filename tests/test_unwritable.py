@@ -77,17 +77,18 @@ def test_every_command_that_writes_says_so_before_any_work(tmp_path, monkeypatch
 
 def test_an_error_that_nobody_foresaw_is_a_sentence(tmp_path, monkeypatch, capsys):
     def full(*_, **__):
-        raise OSError(errno.ENOSPC, "No space left on device", "/tmp/mipmap-plugin-ab12/plain.ply")
+        raise OSError(errno.ENOSPC, "No space left on device", "/tmp/mipmap-plugin-ab12_x9z/plain.ply")
 
     monkeypatch.setattr("mipmap_plugin.models.load_model", full)
     assert main(["inspect", str(tiny.ply(tmp_path / "base.ply"))]) == 2
     said = capsys.readouterr().err
-    assert said.startswith("mipmap-plugin: /tmp/mipmap-plugin-ab12/plain.ply: No space left on device; check that path")
+    assert said.startswith("mipmap-plugin: /tmp/mipmap-plugin-ab12_x9z/plain.ply: No space left on device; check that path")
     assert "TMPDIR names another place" in said and "Errno" not in said
 
 
 def test_and_has_no_advice_on_temporary_files_where_it_is_about_others():
     assert "TMPDIR" not in of_a_file(PermissionError(errno.EACCES, "Permission denied", "scan.ply"))
+    assert "TMPDIR" not in of_a_file(PermissionError(errno.EACCES, "Permission denied", "/home/me/mipmap-plugin-main/scan.ply"))
     assert of_a_file(OSError("odd")).startswith("odd; check that path")
 
 

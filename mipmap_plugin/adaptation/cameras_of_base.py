@@ -6,9 +6,10 @@ import warnings
 from pathlib import Path
 
 from mipmap_plugin.camera import Camera, digest_of
-from mipmap_plugin.errors import MipmapPluginError
+from mipmap_plugin.errors import MipmapPluginError, is_temporary
 from mipmap_plugin.models.adapted_scale import report_beside
 from mipmap_plugin.models.inria_folder import read_options
+from mipmap_plugin.models.zipped_folder import opened, told
 from mipmap_plugin.scenes import Scene, load_scene, model_cameras
 
 # What is said where the cameras are gone, or are others by now.
@@ -22,10 +23,14 @@ def own_cameras(source: Path | None, folder: Path | None) -> tuple[list[Camera] 
 
 
 def where(scene: Path | None, folder: Path | None) -> dict[str, str]:
-    """Where cameras are read from, as `Report.cameras_from` records it: a scene or, by default, the model folder, whose options say their size."""
+    """Where cameras are read from, as `Report.cameras_from` records it: a scene or, by default, the model folder, whose options say their size.
+
+    Of an unpacked archive, which is removed, the archive; nothing where another process unpacked it, as for a worker.
+    """
     read_from = scene or folder
     paths = {"scene": read_from, "options": folder}
-    return {} if read_from is None else {name: str(path.absolute()) for name, path in paths.items() if path is not None}
+    places = {name: told(path.absolute()) for name, path in paths.items() if path is not None}
+    return {} if read_from is None or any(map(is_temporary, places.values())) else places
 
 
 def _of_base(source: Path | None) -> tuple[Scene, dict[str, str]] | None:
@@ -40,7 +45,7 @@ def _of_base(source: Path | None) -> tuple[Scene, dict[str, str]] | None:
                 options = others.get("options")
             case _:
                 return None
-        scene = load_scene(place, read_options(Path(options) if isinstance(options, str) else None)[0])
+        scene = load_scene(opened(Path(place)), read_options(opened(Path(options)) if isinstance(options, str) else None)[0])
         reason = "" if digest_of(scene.cameras) == wanted else f"the cameras in {place} are others now"
     except (MipmapPluginError, OSError) as error:
         reason = str(error)

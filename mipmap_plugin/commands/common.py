@@ -51,8 +51,10 @@ def wrap(
 
 def base_cameras(wrapped: Wrapped, given: Path | None) -> str:
     """Where the cameras of an adapted file's base were found; "" if they lay beside the file, or were `given`."""
+    from mipmap_plugin.models.zipped_folder import told
+
     place = wrapped.cameras_from.get("scene", "")
-    return "" if given is not None or place == str(wrapped.model.folder and wrapped.model.folder.absolute()) else place
+    return "" if given is not None or place == told(wrapped.model.folder and wrapped.model.folder.absolute()) else place
 
 
 def scene(path: Path) -> Scene:

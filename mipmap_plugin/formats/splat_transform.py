@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mipmap_plugin.errors import CheckpointError, OutputError, SettingsError
+from mipmap_plugin.errors import TEMPORARY, CheckpointError, OutputError, SettingsError
 from mipmap_plugin.formats.atomic import new_file
 
 # `magic.kind_of` -> name of the format, and the suffix by which splat-transform recognizes it.
@@ -146,7 +146,7 @@ def as_ply(path: Path, kind: str) -> Iterator[Path]:
         raise CheckpointError(f"{path} is Streamed SOG: {reason}")
     if reason := _damage(path):
         raise CheckpointError(f"{path} is damaged ({reason}); download or export it again")
-    with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         source = path.absolute()
         if not (path.suffix == ".json" or path.name.lower().endswith(ending)):  # an unpacked SOG is recognized by the name of its meta.json
             source = Path(folder, f"source{ending}")
@@ -176,7 +176,7 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
     Raises SettingsError (`refuse_exchange`), OutputExists, OutputError.
     """
     tool = refuse_exchange(path)
-    with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder, new_file(path, overwrite) as temporary:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder, new_file(path, overwrite) as temporary:
         ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
         plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
         write(plain)

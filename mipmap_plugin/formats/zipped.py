@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from zipfile import ZipFile, ZipInfo
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import TEMPORARY, CheckpointError
 from mipmap_plugin.formats.magic import archive
 
 # How many times as large as its archive a PLY may be. Those of captures are less than twice as large, and one without view-dependent color, whose
@@ -35,7 +35,7 @@ def unpacked(path: Path) -> Iterator[Path]:
     entry = only_ply(path)
     if entry is None:
         raise CheckpointError(f"{path} is no zip archive of one PLY; unpack it and give the PLY or the folder in it")
-    with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         refuse_large(path, entry.file_size, Path(folder))
         with archive(path) as opened:
             ply = copied(path, opened, entry, Path(folder, "unpacked.ply"))

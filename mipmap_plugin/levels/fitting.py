@@ -12,7 +12,7 @@ from typing import Any
 
 from mipmap_plugin.adaptation.report import provenance, versions
 from mipmap_plugin.adaptation.views import orbit_of
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import TEMPORARY, SettingsError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
 from mipmap_plugin.frozen_base import FrozenBase
@@ -73,7 +73,7 @@ def splats_within(model: SplatModel, size: int, name: str, record: dict[str, Any
     """
     count = len(model.parameters()["means"])
     ending = next((each for each in ENDINGS if name.lower().endswith(each)), "")
-    with tempfile.TemporaryDirectory(prefix="mipmap-plugin-") as folder:
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
         every = Path(folder, f"all{ending}")
         own = contract.save(for_loader_of(record.get("viewer"), model, every), every, record)
         besides, all_of_them = read_header(own).body if own.suffix == ".ply" else 0, own.stat().st_size

@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.errors import TEMPORARY, SettingsError
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.splat_transform import LOD_META
 from mipmap_plugin.formats.streamed_sog import Chunk, read_chunks, write_streamed_sog
@@ -101,7 +101,7 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
     rising = distances(manifest, canvas)
     if not rising:
         raise SettingsError(SINGLE_LEVEL)
-    with new_folder(folder / STREAMED, overwrite) as temporary, TemporaryDirectory(prefix="mipmap-plugin-") as copies:
+    with new_folder(folder / STREAMED, overwrite) as temporary, TemporaryDirectory(prefix=TEMPORARY) as copies:
         made = temporary / LOD_META
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))
         files = [level["file"] for level in manifest["levels"]]

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.adaptation.renderers import NO_CAMERA
+from mipmap_plugin.errors import TEMPORARY
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.splat_transform import write_exchange
 from mipmap_plugin.levels.exported import readable
@@ -89,7 +90,7 @@ def _bounds(model: SplatModel, reach: float) -> tuple[Tensor, Tensor]:
 def write_tile(ply: Path, tile: Path) -> None:
     """Write a GLB of the splats of a PLY. Raises SettingsError without splat-transform, OutputError."""
     compressed = tile.with_suffix(".spz")
-    with TemporaryDirectory(prefix="mipmap-plugin-") as folder:
+    with TemporaryDirectory(prefix=TEMPORARY) as folder:
         write_exchange(compressed, partial(shutil.copyfile, readable(ply, Path(folder, ply.name))), overwrite=False)
     low, high = _bounds(load_model(ply), 0.0)
     tile.write_bytes(glb(compressed.read_bytes(), low.tolist(), high.tolist()))

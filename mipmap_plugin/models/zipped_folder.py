@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.errors import TEMPORARY, CheckpointError
 from mipmap_plugin.formats.magic import archive
 from mipmap_plugin.formats.zipped import copied, only_ply, refuse_large
 from mipmap_plugin.models.places import PARTS
@@ -31,7 +31,7 @@ def opened(path: Path) -> Path:
     with _LOCK:
         key = path.absolute(), state.st_mtime_ns, state.st_size
         if key not in _OPENED:
-            place = tempfile.TemporaryDirectory(prefix="mipmap-plugin-")
+            place = tempfile.TemporaryDirectory(prefix=TEMPORARY)
             _OPENED[key] = place, _unpack(path, root, Path(place.name, path.stem or "model"))
         return _OPENED[key][1]
 
