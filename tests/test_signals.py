@@ -38,8 +38,10 @@ sys.exit(code)
 
 
 @pytest.fixture(autouse=True)
-def _signals_as_before():
+def _usual_signals():
     before = {number: signal.getsignal(number) for number in (*signals.SIGNALS, signal.SIGINT)}
+    for number in signals.SIGNALS:
+        signal.signal(number, signal.SIG_DFL)  # also where these tests are run by nohup
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
