@@ -31,6 +31,15 @@ def test_a_pixel_is_that_of_the_closest_view_that_sees_the_splat():
     torch.testing.assert_close(pixel_size(means, [VIEW, CLOSER]), torch.tensor([2.0, 1.0, math.hypot(30, 2)]) / FOCAL)
 
 
+def test_a_broken_numba_leaves_it_to_torch(monkeypatch):
+    def broken():
+        raise ImportError("Numba needs NumPy 2.2 or less")
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr("mipmap_plugin.backends.cpu._drawing", broken)
+    torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), [VIEW]), torch.tensor([4.0]) / FOCAL)
+
+
 @pytest.mark.skipif(not importlib.util.find_spec("numba"), reason="numba is not installed")
 @pytest.mark.parametrize("near", [0.0, 3.0])
 def test_compiled_code_finds_what_torch_finds(near, monkeypatch):

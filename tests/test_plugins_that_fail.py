@@ -100,6 +100,7 @@ def test_a_wrong_alpha_of_a_backend_is_told_by_its_name(alpha):
         ("blend_weights", lambda self, *_: torch.zeros(3), "blend_weights has to return 60 finite numbers"),
         ("weigh_views", lambda self, *_: torch.zeros(3), r"weigh_views has to return finite numbers \[\d+, 60\]"),
         ("stepper", lambda self, raw: 1 / 0, "failed: ZeroDivisionError"),
+        ("compile_ahead", lambda self, *_: 1 / 0, "failed: ZeroDivisionError"),
     ],
 )
 def test_what_a_backend_may_have_is_looked_at_too(part, method, said):

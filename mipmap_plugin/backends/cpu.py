@@ -131,9 +131,13 @@ def finest_pixels(means: Tensor, views: Sequence[Camera], near: float) -> tuple[
 
 
 def _has_kernels_for(means: Tensor) -> bool:
+    """Whether kernels can look at these splats. Where numba is broken, torch does so: another backend may draw them."""
     if means.device.type != "cpu" or means.dtype != torch.float32 or not importlib.util.find_spec("numba"):
         return False
-    _drawing()  # reports what numba lacks
+    try:
+        _drawing()
+    except ImportError:  # BackendUnavailable is one
+        return False
     return True
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.backends.base import AdamStep, Needs, Rendered, Stepper
+from mipmap_plugin.backends.base import AdamStep, Calls, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import PluginError
@@ -18,7 +18,7 @@ from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.plugin_errors import naming, unchanged
 
 # What a backend may have beside `lacking` and `render`.
-OPTIONAL = ("render_views", "blend_weights", "weigh_views", "stepper")
+OPTIONAL = ("render_views", "blend_weights", "weigh_views", "stepper", "compile_ahead")
 
 
 class Guarded:
@@ -93,6 +93,10 @@ class Guarded:
     def _stepper(self, theirs: Any, raw: Mapping[str, Tensor]) -> Stepper:
         with naming(self._title):
             return _GuardedStepper(self._title, theirs(raw))
+
+    def _compile_ahead(self, theirs: Any, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
+        with naming(self._title), unchanged(self._title, _tensors(gaussians)):
+            theirs(gaussians, effects, calls)
 
 
 class _GuardedStepper:
