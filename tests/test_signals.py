@@ -81,7 +81,7 @@ def test_a_run_keeps_its_state(tmp_path, monkeypatch, capsys, number):
 
 
 def test_a_second_signal_counts_when_the_first_is_long_ago(monkeypatch):
-    now = iter([100.0, 100.0 + signals.SAME_S - 1, 100.0 + 3 * signals.SAME_S])
+    now = iter([100.0, 100.0 + signals.SAME_S - 1, 100.0 + signals.SAME_S + 1])  # the one between does not begin the time anew
     monkeypatch.setattr(signals.time, "monotonic", lambda: next(now))
     heard = []
     signal.signal(signal.SIGINT, lambda *_: heard.append("Ctrl-C"))

@@ -30,10 +30,10 @@ class Ending:
 
     def heard(self, number: int, frame: FrameType | None) -> None:
         """Do what Ctrl-C does now; also where that is ignored, as by what a script starts in the background."""
-        before, self._heard_at = self._heard_at, time.monotonic()
-        if self._heard_at - before < SAME_S:
+        now = time.monotonic()
+        if now - self._heard_at < SAME_S:
             return
-        self.code = 128 + number
+        self._heard_at, self.code = now, 128 + number
         on_ctrl_c = signal.getsignal(signal.SIGINT)
         if not callable(on_ctrl_c):
             raise KeyboardInterrupt
