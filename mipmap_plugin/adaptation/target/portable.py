@@ -20,8 +20,8 @@ from mipmap_plugin.screen_filters import COMPENSATED
 # on lego, and a quarter no better than that.
 MERGE_FACTOR = 0.5
 
-# dB that merging may cost before the first step, as that of coarse levels: steps regain more. With the 0.3 dB of a single viewer's file lego
-# at x1/4 keeps all its splats, and its worst viewer ends 4 dB lower.
+# dB that merging may cost before the first step, as that of coarse levels: steps mostly regain more. With the 0.3 dB of a single viewer's file
+# lego at x1/4 keeps all its splats, and its worst viewer ends 4 dB lower; of captures docs/recipes_found.md has what is gained and lost.
 MERGING_COSTS = 3.0
 
 
@@ -37,12 +37,12 @@ def extreme_targets(targets: Mapping[str, Effects]) -> dict[str, Effects]:
     """The viewers among `targets` that are extreme in one respect, of equals the first: the widest dilation with compensation, of these the one
     that limits colors most, and without; the narrowest dilation; and those that leave out most splats or change them most for their size.
 
-    Spark limits colors, and gsplat's antialiased mode does not, but for which they are alike: with it in place of the latter the worst viewer
-    of flowers, a capture that has colors above 1, is 1.4 dB better at x1/4, the mean of all 0.3 dB; lego is as good.
+    That is Spark, which also sorts by distance, and not gsplat's antialiased mode: so the worst viewer of flowers, a capture that has colors
+    above 1, is 1.4 dB better at x1/4, the mean of all 0.3 dB; lego is as good, and a made-up capture worse (docs/recipes_found.md).
     """
     respects: tuple[Callable[[Effects], tuple[float, ...]], ...] = (
         lambda effects: (0.0 if _compensates(effects) else effects.eps2d,),
-        lambda effects: (effects.eps2d if _compensates(effects) else 0.0, -(effects.settings.max_color or math.inf)),
+        lambda effects: (effects.eps2d, -(effects.settings.max_color or math.inf)) if _compensates(effects) else (0.0, -math.inf),
         lambda effects: (-effects.eps2d,),
         lambda effects: (effects.settings.min_variance, effects.settings.min_contribution),
         lambda effects: (effects.settings.least_spread,),
