@@ -197,6 +197,10 @@ class Camera:
         return replace(self, viewmat=viewmat, name=name)
 
 
+# A camera of one pixel, for what does not depend on it.
+ONE_PIXEL = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
+
+
 def viewmat_of(rotation: Tensor, center: Tensor) -> Tensor:
     """World to camera [4, 4] float64 from a camera-to-world rotation [3, 3] and the eye [3]."""
     viewmat = torch.eye(4, dtype=torch.float64)

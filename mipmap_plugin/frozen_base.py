@@ -15,7 +15,6 @@ from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, render_model
 from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
 from mipmap_plugin.adaptation.conversion import Stages, conversion
-from mipmap_plugin.adaptation.renderers import NO_CAMERA
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
@@ -24,7 +23,7 @@ from mipmap_plugin.adaptation.target.portable import settings_for_several
 from mipmap_plugin.adaptation.views import choose_views, orbit_of, refuse_blind
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
-from mipmap_plugin.camera import Camera, checked, digest_of, of_base_scale
+from mipmap_plugin.camera import ONE_PIXEL, Camera, checked, digest_of, of_base_scale
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
@@ -294,4 +293,4 @@ class FrozenBase:
 
     def any_camera(self) -> Camera:
         """One of the cameras, or a camera of one pixel if there are none."""
-        return self.cameras[0] if self.cameras else NO_CAMERA
+        return self.cameras[0] if self.cameras else ONE_PIXEL

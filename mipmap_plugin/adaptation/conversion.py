@@ -16,14 +16,13 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import count_of_views
-from mipmap_plugin.adaptation.renderers import NO_CAMERA
 from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
 from mipmap_plugin.adaptation.views import orbited
 from mipmap_plugin.adaptation.warn import warn
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import SettingsError
@@ -68,7 +67,7 @@ class Stages:
         refuse_adapted(self.request.images.model.source)
         if not self.cameras and config.views != "orbit":
             warn(orbited(self.request.images.model.source))
-        refuse_broken(self.request.images.model, next(iter(self.cameras), NO_CAMERA), steps=config.steps > 0)
+        refuse_broken(self.request.images.model, next(iter(self.cameras), ONE_PIXEL), steps=config.steps > 0)
         if first is None:
             return Session(self.request, scale, config, self.cameras, self.photographs).run(self.resume, self.observe)
         session = Session(self.request, 1.0, first, self.cameras, None)

@@ -12,16 +12,13 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import Backend, Stepper
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.process import threads
 from mipmap_plugin.process.threads import side_by_side
 from mipmap_plugin.splatting.packing import in_two_steps, packed
-
-# A camera of one pixel, for what does not depend on it.
-NO_CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 # The numbers of views in a step and their images [h, w, 3] -> the gradient of each one's loss, [h, w, 3], and its mean square error, [].
 Comparison = Callable[[Sequence[int], Sequence[Tensor]], list[tuple[Tensor, Tensor]]]
@@ -54,7 +51,7 @@ class Renderer:
         if settings.packing is None or settings.bucketed or (even is not None and (even.largest_first or even.sphere_from is not None)):
             return partial(self, gaussians)
         once, rest = in_two_steps(settings.packing)
-        rounded = packed(gaussians, NO_CAMERA, once)
+        rounded = packed(gaussians, ONE_PIXEL, once)
         return partial(Renderer(self.backend, replace(self.effects, settings=replace(settings, packing=rest))), rounded)
 
 

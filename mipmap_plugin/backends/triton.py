@@ -26,7 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Calls, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.buckets import ranks_of_views
@@ -34,8 +34,6 @@ from mipmap_plugin.splatting.packing import packed
 
 if TYPE_CHECKING:
     from mipmap_plugin.backends.triton_kernels.views import Shot
-
-ONE_PIXEL = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 OLDEST = (3, 3)  # versions before it compile no tuples
 NO_TRITON = "it needs triton, which comes with torch's CUDA wheels: pip install triton"

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mipmap_plugin.adaptation.renderers import NO_CAMERA
+from mipmap_plugin.camera import ONE_PIXEL
 from mipmap_plugin.errors import TEMPORARY
 from mipmap_plugin.formats.atomic import new_folder, write_json
 from mipmap_plugin.formats.splat_transform import write_exchange
@@ -82,7 +82,7 @@ def bounding_box(model: SplatModel) -> list[float]:
 
 def _bounds(model: SplatModel, reach: float) -> tuple[Tensor, Tensor]:
     """The least and the greatest coordinates of all splats, [3] each, `reach` standard deviations beyond their centers."""
-    splats = model.gaussians(NO_CAMERA).detach()
+    splats = model.gaussians(ONE_PIXEL).detach()
     beyond: Tensor = reach * splats.scales.max(dim=1).values[:, None]
     return (splats.means - beyond).amin(dim=0), (splats.means + beyond).amax(dim=0)
 

@@ -13,12 +13,10 @@ from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.start.merging import merge
 from mipmap_plugin.backends.base import AdamStep, Calls
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import USUAL
-
-CAMERA = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
 
 
 def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], calls: Calls) -> None:
@@ -30,11 +28,11 @@ def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], call
     # The first with the usual settings, and the first with others, for which a backend may have kernels of their own.
     kinds = list({setting.settings == USUAL: setting for setting in reversed(effects)}.values())
     for setting in effects:
-        image = backend.render(replace(few, means=few.means.clone().requires_grad_(calls.gradients)), CAMERA, setting).image
+        image = backend.render(replace(few, means=few.means.clone().requires_grad_(calls.gradients)), ONE_PIXEL, setting).image
         if calls.merging and setting in kinds:  # here, because another process may be compiling the backward pass by now
-            weights = blend_weights(few, [CAMERA], backend, setting)
+            weights = blend_weights(few, [ONE_PIXEL], backend, setting)
             merge(few, torch.ones_like(weights), weights, fraction=0.5)
-            closed_form(few, [CAMERA], 0.5, effects[0], setting)
+            closed_form(few, [ONE_PIXEL], 0.5, effects[0], setting)
         if calls.gradients and image.requires_grad and not steps:
             image.sum().backward()
     if steps and calls.gradients:
@@ -54,7 +52,7 @@ def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:
     raw = {name: getattr(splats, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
     stepper = backend.stepper(raw)
     unpacked = replace(effects, settings=replace(effects.settings, packing=None))
-    stepper.differentiate(0, torch.zeros_like(stepper.render(0, CAMERA, unpacked).image))
+    stepper.differentiate(0, torch.zeros_like(stepper.render(0, ONE_PIXEL, unpacked).image))
     moments = {name: torch.zeros_like(tensor) for name, tensor in raw.items()}
     rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 0.0)
     stepper.step(AdamStep(raw, moments, moments, rates, betas=(0.9, 0.999), correction=1.0, eps=1.0))

@@ -18,7 +18,7 @@ import torch
 
 from mipmap_plugin.backends.cpu_kernels import compositing_back, descending, drawing, layout, projection_back
 from mipmap_plugin.backends.cpu_kernels.records import Frame, Limits, Lists
-from mipmap_plugin.camera import Camera
+from mipmap_plugin.camera import ONE_PIXEL
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.process import threads
 
@@ -55,8 +55,7 @@ def compile_back(has_covariances: bool, effects: Effects) -> None:
     covariances = torch.zeros(1, 3, 3) if has_covariances else None
     harmonics = torch.zeros(1, (effects.sh_degree + 1) ** 2, 3)
     splats = drawing.as_arrays(torch.zeros(1, 3), torch.zeros(1, 4), torch.zeros(1, 3), torch.zeros(1), harmonics, covariances)
-    camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, torch.eye(4))
-    (view, flags), integers = drawing.view_of(camera, effects, splats, gradients=True), np.zeros(0, np.int32)
+    (view, flags), integers = drawing.view_of(ONE_PIXEL, effects, splats, gradients=True), np.zeros(0, np.int32)
     lists = Lists(np.zeros(1, np.int64), integers, *[np.zeros(0, np.int64)] * 2, np.zeros(2, np.int64), integers)
     pixel, picture = np.zeros((1, 1), np.float32), np.zeros((1, 1, 3), np.float32)
     table, frame = np.zeros((1, layout.SPLAT_FIELDS), np.float32), Frame(np.zeros(3, np.float32), pixel, pixel)
