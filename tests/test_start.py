@@ -133,6 +133,32 @@ def test_what_is_merged_furthest_without_being_worse_than_the_base_is_begun_with
     assert (start_of(report), report.gaussians_after) == ("the closed form of merged splats", tried[4])
 
 
+@pytest.fixture
+def told(monkeypatch):
+    """The dB of base, closed form, and merging mildly, strongly and in between, as they are given; whatever is measured later is worth nothing."""
+    tried, decibels = [], []
+
+    def quality(self, model):
+        tried.append(len(model))
+        return Quality(*[decibels[len(tried) - 1] if len(tried) <= len(decibels) else 0.0] * 2)
+
+    monkeypatch.setattr(Validation, "quality", quality)
+    return decibels
+
+
+def test_a_stronger_merging_is_tried_where_the_mildest_gains_but_the_base_looks_better_still(told):
+    told[:] = [30.0, 20.0, 25.0, 35.0]
+    assert start_of(adapted(merge_to=0.5).report) == "the closed form of merged splats"
+
+
+@pytest.mark.parametrize(("viewer", "costs", "start"), [
+    (None, 0.3, "the closed form"), ("spark", 0.3, "the closed form of merged splats"), ("spark", 0.2, "the closed form"),
+])  # fmt: skip
+def test_the_mildest_merging_may_cost_twice_as_much_before_steps_for_another_renderer(told, viewer, costs, start):
+    told[:] = [20.0, 30.0, 29.5, 28.0, 28.0]
+    assert start_of(adapted(merge_to=0.5, merging_costs=costs, steps=1, viewer=viewer).report) == start
+
+
 def beside(seen: int, hidden: int) -> VanillaModel:
     """A ball of splats that the cameras look at, and others in pairs far behind all of them."""
     shown, others = tiny.gaussians(seen), tiny.gaussians(hidden, seed=1)
