@@ -31,10 +31,10 @@ from mipmap_plugin.screen_filters import INTEGRATED
 # The powers of `merge_to` that are tried: the last, the mildest, and then the others, until merging loses little enough.
 POWERS = (1, 1 / 2, 1 / 4)
 
-# dB that the mildest may cost more, before steps for a renderer that draws otherwise than the training did: those have much to learn, and fewer
-# splats learn it sooner. Lego at x1/8 gains 0.9 dB for spark and 1.0 for three.js, chair 0.8 for three.js; bird has as much with three fifths of
-# its splats. What stronger ones cost more does not come back: 0.3 to 1.2 dB of chair, 0.4 of flowers.
-MILD_COSTS = 0.3
+# dB that the mildest may cost before steps for a renderer that draws otherwise than the training did, also where other merging may cost less: fewer
+# splats learn that sooner, and better. Lego at x1/8 gains 0.9 dB for spark, as many with the `thorough` recipe, and 1.0 for three.js, chair 0.8 for
+# three.js; bird has as much with three fifths of its splats. What stronger ones cost does not come back: 0.3 to 1.2 dB of chair, 0.4 of flowers.
+MILD_COSTS = 0.6
 
 # Before them, what starts from a finer level is merged even where too few of its splats share a pixel: else chair would keep half of them at x0.57.
 # What is left has to show at least so many dB: from 29 dB lego's steps regain all that merging cost, from 20 dB those of flowers, a capture, a third.
@@ -89,8 +89,8 @@ class StartSearch:
         self._alike = draws_alike(problem.base_effects, problem.target)
         # The steps of a zoom-out end 0.2 dB higher from the base's own shapes (lego and chair, x1/4).
         keeps = self._alike and problem.config.steps > 0 and problem.scale <= 1
-        learns = problem.config.steps > 0 and problem.base_effects != problem.target
-        self._more_costs = min(problem.config.merging_costs, MILD_COSTS) if learns else 0.0
+        costs, learns = problem.config.merging_costs, problem.config.steps > 0 and problem.base_effects != problem.target
+        self._more_costs = max(0.0, MILD_COSTS - costs) if learns and costs else 0.0
         unchanged = keeps or filter_suffices(problem.base_effects, problem.target)
         self._forms = problem.config.closed_form and not keeps
         spreads = problem.target.screen_filter == SURFEL or problem.target.screen_filter in INTEGRATED  # otherwise than by a variance in px²
