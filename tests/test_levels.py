@@ -457,6 +457,28 @@ def test_a_ladder_that_failed_before_its_first_level_is_in_nobodys_way(tmp_path,
     assert make_levels(wrapped(), request(coarsest=0.6), resume=tmp_path / "state").levels
 
 
+@pytest.mark.parametrize("by", ["zoom", "distance"])
+def test_a_ladder_that_failed_before_its_first_level_leaves_nothing(tmp_path, monkeypatch, by):
+    base = wrapped()
+    monkeypatch.setattr(base, "adapt", lambda *_, **__: interrupt())
+    with pytest.raises(Interrupted):
+        make_levels(base, request(by=by), resume=tmp_path / "new" / "state")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_ladder_whose_first_level_has_a_state_keeps_it(tmp_path, monkeypatch):
+    base = wrapped()
+
+    def begun(scale, resume, **_):
+        resume.write_text("a state")
+        interrupt()
+
+    monkeypatch.setattr(base, "adapt", begun)
+    with pytest.raises(Interrupted):
+        make_levels(base, request(), resume=tmp_path / "state")
+    assert {each.name for each in (tmp_path / "state").iterdir()} == {"request.json", "level_0.ply.resume"}
+
+
 def test_a_damaged_unfinished_ladder_is_told(tmp_path):
     (tmp_path / "request.json").write_text("{")
     (tmp_path / "level_0.ply").touch()
