@@ -80,7 +80,8 @@ def test_the_truth_of_a_zoomed_view_is_the_bases_own_image():
 
 
 @pytest.mark.parametrize(
-    ("band", "reason"), [((0.5, 4.0), "a band ends at the base's scale"), ((2.0, 1.0), "must rise"), ((0.0, 1.0), "greater than 0")]
+    ("band", "reason"),
+    [((0.5, 4.0), "a band ends at the base's scale"), ((2.0, 1.0), "^setting band: must rise, got"), ((0.0, 1.0), "each a number above 0, got")],
 )
 def test_impossible_bands_are_refused(band, reason):
     with pytest.raises(SettingsError, match=reason):

@@ -15,7 +15,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
 from mipmap_plugin.formats.atomic import json_text, write_json
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.staging import missing_folders, remove_empty
@@ -82,7 +82,7 @@ class LevelStore:
                 warnings.simplefilter("ignore")  # what there is to say of its splats was said of the base's
                 read = load_model(file)
         except (ValueError, MipmapPluginError) as error:
-            raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({error}); delete its folder to start anew") from error
+            raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({brief(error)}); delete its folder to start anew") from error
         plain: SplatModel = cast(Filtered, read).bare() if read.traits.filtered else read  # the filter of a file for Mip-Splatting is 0
         model = plain.to(self._base.model.parameters()["means"].device)
         model.trained = _trained(self._base, self._target)
