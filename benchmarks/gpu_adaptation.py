@@ -6,11 +6,12 @@ import json
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from gpu_records import Adaptation
 from gpu_work import Work, kept
 from workloads import split_into
 
@@ -77,25 +78,6 @@ class Place:
     device: str = "cuda"
     until: float = math.inf  # of `time.monotonic`, when steps end
     settings: tuple[tuple[str, Any], ...] = ()  # that override the recipe's
-
-
-@dataclass(frozen=True)
-class Adaptation:
-    """One base adapted to one scale by the default recipe."""
-
-    base: str
-    scale: float
-    backend: str
-    seconds: float  # as the report counts: without loading
-    again_seconds: float  # of a second adaptation to the same scale
-    wall_seconds: float  # of the first, all in all
-    steps: int
-    ended_by: str
-    peak_mib: float | None  # of tensors on the GPU
-    psnr_db: float  # on real test images that nothing was adapted to, or on held-out views of the base's own
-    processor_db: float | None  # the same on a processor; None: not measured
-    phases: dict[str, float] = field(default_factory=dict)
-    viewer: str = ""  # "": as the base was trained
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
 from multiprocessing import get_context
 
 import torch
+from gpu_records import Checked
 from gpu_work import BROKEN
 
 from mipmap_plugin.backends import get_backend
@@ -21,22 +21,6 @@ ROUNDS = 4  # at most so many sets of processes, if kernels break them
 OPTIONAL = {"views": ("render_views", check_views), "steps": ("stepper", check_steps)}
 USUAL = "sh-degree-3"
 ALL = (*CASES, *OPTIONAL)
-
-
-@dataclass(frozen=True)
-class Checked:
-    """What the hard cases have shown of one backend so far."""
-
-    backend: str
-    cases: int
-    skipped: int
-    failed: dict[str, str]  # case -> what is wrong
-    unchecked: int = 0
-
-    @classmethod
-    def of(cls, backend: str, outcomes: Sequence[Outcome], unchecked: int = 0) -> Checked:
-        failed = {outcome.case: outcome.message for outcome in outcomes if not outcome.passed}
-        return cls(backend, len(outcomes), sum(outcome.skipped for outcome in outcomes), failed, unchecked)
 
 
 def check(name: str, device: str, processes: int, cases: Sequence[str] = ALL) -> Iterator[Checked]:

@@ -8,28 +8,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from gpu_records import FirstUse
 from gpu_work import Work
 
 from mipmap_plugin.models.places import REPORT
 
 BASE, STEPS, EXPECTED_S = "lego_200", 10, 60.0
 COMMAND = "from mipmap_plugin.cli import main; raise SystemExit(main())"
-
-
-@dataclass(frozen=True)
-class FirstUse:
-    """Seconds of a command that adapts a base with few steps."""
-
-    backend: str
-    viewer: str
-    first_s: float
-    compilation_s: float  # of the first
-    again_s: float
-    again_compilation_s: float
 
 
 def measure(backend: str, viewer: str, data: Path) -> Iterator[FirstUse]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
+from gpu_records import Kernel, Profile
 from gpu_speed import Case, Scene, calls, scene_of, title
 from gpu_work import Work
 from torch.profiler import ProfilerActivity, profile
@@ -24,29 +24,6 @@ EXPECTED_S = 8.0
 # What a trace calls that which runs on a GPU, and what it says of a kernel's launches.
 ON_GPU = ("kernel", "gpu_memcpy", "gpu_memset")
 OCCUPANCY, REGISTERS = "est. achieved occupancy %", "registers per thread"
-
-
-class Kernel(NamedTuple):
-    """One kernel in one image and its gradients."""
-
-    name: str
-    us: float
-    launches: float
-    occupancy: float | None  # %, as the profiler estimates it from registers, shared memory and the grid
-    registers: int | None  # per thread
-    least_bytes: int | None  # that have to move; None: not known
-
-
-@dataclass(frozen=True)
-class Profile:
-    """The kernels of one backend on one case that take most of the time, forward and backward."""
-
-    backend: str
-    splats: int
-    width: int  # px
-    height: int  # px
-    all_us: float
-    kernels: list[Kernel]
 
 
 def profile_one(name: str, case: Case, device: str, cases: Sequence[Case]) -> Iterator[Profile]:

@@ -10,12 +10,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from gpu_adaptation import Adaptation
-from gpu_conformance import Checked
-from gpu_first_use import FirstUse
-from gpu_profile import Kernel, Profile
-from gpu_tables import Failure, Speed, report
-from gpu_views import Views
+from gpu_records import Adaptation, Checked, Failure, FirstUse, Kernel, Profile, Speed, Views
+from gpu_tables import adaptation_table, conformance_table, first_use_table, profile_table, speed_table, views_table
 
 from mipmap_plugin.formats.atomic import write_json
 
@@ -105,3 +101,16 @@ class Results:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / f"{self.name}.json", facts | lists, overwrite=True)
         (folder / f"{self.name}.md").write_text(report(self) + "\n")
+
+
+def report(results: Results) -> str:
+    """Everything as one page."""
+    known = results.machine
+    machine = ", ".join(f"{name} {value}" for name, value in known.items() if name != "device")
+    copied = f" A copy moves {results.bandwidth / 1e9:.0f} GB/s, read and written." if results.bandwidth else ""
+    made = "Made by `python benchmarks/gpu.py --data DATA`"
+    lines = [f"# {known['device']}", f"{made}; {machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
+    lines += [adaptation_table(results.adaptation), first_use_table(results.first_uses), conformance_table(results.conformance)]
+    lines += [profile_table(results.profiles, results.bandwidth)]
+    lines += [f"Not measured: {' '.join(filter(None, [failure.backend, failure.what]))}: {failure.reason}" for failure in results.failures]
+    return "\n\n".join(filter(None, lines))

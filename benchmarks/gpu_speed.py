@@ -11,7 +11,7 @@ from typing import Literal
 
 import torch
 from gpu_gsplat import find, with_itself
-from gpu_tables import Failure, Speed
+from gpu_records import Failure, Speed
 from gpu_timing import Clock
 from gpu_work import Work, kept
 from scenes import Scene as Generated

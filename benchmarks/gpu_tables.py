@@ -1,53 +1,15 @@
-"""What was measured on a GPU as Markdown."""
+"""Tables, as Markdown, of what was measured on a GPU."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+
+from gpu_records import Adaptation, Checked, FirstUse, Kernel, Profile, Speed, Views
 
 from mipmap_plugin.evaluation.report import markdown
 
-if TYPE_CHECKING:
-    from gpu_adaptation import Adaptation
-    from gpu_conformance import Checked
-    from gpu_first_use import FirstUse
-    from gpu_profile import Kernel, Profile
-    from gpu_results import Results
-    from gpu_views import Views
-
 YARDSTICK = "gsplat itself"
 PAPER = "Mipmap-GS needs 40 s for a zoom-out and 75 s for a zoom-in of bicycle on an A100, its targets not counted (arXiv 2408.06286)."
-
-
-@dataclass(frozen=True)
-class Speed:
-    """One backend on one scene."""
-
-    backend: str
-    mode: str  # of the viewer whose filter is drawn
-    splats: int
-    width: int  # px
-    height: int  # px
-    forward_ms: float
-    both_ms: float  # forward and backward
-    peak_mib: float  # over what was held before
-    forward_bytes: int  # the least that has to move
-    both_bytes: int
-
-
-@dataclass(frozen=True)
-class Failure:
-    """What was not measured, and why."""
-
-    backend: str
-    what: str
-    reason: str
-    late: bool = False  # no time was left
-
-    @classmethod
-    def of(cls, backend: str, what: str, error: Exception) -> Failure:
-        return cls(backend, what, f"{type(error).__name__}: {error}".splitlines()[0])
 
 
 def speed_table(rows: Sequence[Speed], bandwidth: float) -> str:
@@ -150,16 +112,3 @@ def first_use_table(rows: Sequence[FirstUse]) -> str:
     ]
     table = markdown(["backend", "viewer", "first command, s", "of it compilation", "second command, s", "of it compilation"], body)
     return f"## First use\n\nThe command `adapt` on lego_200 at x1/4 with ten steps, and the same again.\n\n{table}" if body else ""
-
-
-def report(results: Results) -> str:
-    """Everything as one page."""
-    known = results.machine
-    machine = ", ".join(f"{name} {value}" for name, value in known.items() if name != "device")
-    copied = f" A copy moves {results.bandwidth / 1e9:.0f} GB/s, read and written." if results.bandwidth else ""
-    made = "Made by `python benchmarks/gpu.py --data DATA`"
-    lines = [f"# {known['device']}", f"{made}; {machine}.{copied}", speed_table(results.speed, results.bandwidth), views_table(results.views)]
-    lines += [adaptation_table(results.adaptation), first_use_table(results.first_uses), conformance_table(results.conformance)]
-    lines += [profile_table(results.profiles, results.bandwidth)]
-    lines += [f"Not measured: {' '.join(filter(None, [failure.backend, failure.what]))}: {failure.reason}" for failure in results.failures]
-    return "\n\n".join(filter(None, lines))

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from gpu_gsplat import ITSELF, find, rasterized, with_itself
+from gpu_records import Views
 from gpu_timing import Clock
 from gpu_work import Work, kept
 from torch import Tensor
@@ -24,18 +25,6 @@ EXPECTED_S = 6.0  # of one backend at one width
 
 # The raw parameters' names in an `AdamStep`, and here.
 NAMES = {"means": "means", "quats": "quats", "scales": "log_scales", "opacities": "logits", "sh": "sh"}
-
-
-@dataclass(frozen=True)
-class Views:
-    """Milliseconds per view: forward and backward, and of a whole step."""
-
-    backend: str
-    width: int  # px
-    views: int
-    alone_ms: float  # one after the other
-    together_ms: float | None  # in one call; None: the backend has none
-    step_ms: float  # in the quickest way that the backend has, and Adam's step
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from gpu_tables import Failure
+from gpu_records import Failure
 
 Result = TypeVar("Result")
 

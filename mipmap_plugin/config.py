@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from collections.abc import Mapping, Sequence
+from types import UnionType
+from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from mipmap_plugin.limits import MAX_SEED
 
@@ -92,13 +94,49 @@ class AdaptConfig(BaseModel):
     most_growth: float | None = Field(None, ge=1, description="Maximum ratio of splats after densifying to splats before; None: unlimited.")
     reset_opacity_at: int | None = Field(None, ge=0, description="Step before which all opacities are cut to 0.01, on a white background only.")
 
-    @model_validator(mode="after")
-    def _band_rises(self) -> AdaptConfig:
-        if self.band[0] > self.band[1]:
-            raise ValueError(f"band: must rise, got {self.band[0]:g} to {self.band[1]:g}")
-        return self
+    @field_validator("band")
+    @classmethod
+    def _band_rises(cls, band: tuple[float, float]) -> tuple[float, float]:
+        if band[0] > band[1]:
+            raise ValueError("must rise")
+        return band
 
     @property
     def warm_up_steps(self) -> int:
         """The number of steps of the warm-up."""
         return math.ceil(self.warm_up * self.steps)
+
+
+# What a value of each type is in words.
+WORDS: dict[Any, str] = {int: "a whole number", float: "a number", bool: "True or False", str: "a text", LearningRates: "rates by name"}
+
+
+def allowed(name: str) -> str:
+    """What the setting of that name, such as "merge_to" or "rates.means", may be: "a number above 0 and up to 1"."""
+    owner, _, within = name.rpartition(".")
+    field = (LearningRates if owner else AdaptConfig).model_fields[within]
+    return _of_type(field.annotation, field.metadata)
+
+
+def _of_type(kind: Any, bounds: Sequence[Any]) -> str:
+    """In words: values of this type within these bounds, which are pydantic's."""
+    first, *others = get_args(kind) or (kind,)
+    if get_origin(kind) is UnionType:
+        return f"{_of_type(first, bounds)}, or None"
+    if get_origin(kind) is Annotated:
+        return _of_type(first, others[0].metadata)
+    if get_origin(kind) is tuple:
+        return f"a pair, each {_of_type(first, bounds)}"
+    if get_origin(kind) is Literal:
+        return f"{', '.join(map(repr, (first, *others[:-1])))} or {others[-1]!r}"
+    return WORDS[kind] + _between({key: getattr(bound, key) for bound in bounds for key in ("gt", "ge", "lt", "le") if hasattr(bound, key)})
+
+
+def _between(bounds: Mapping[str, float]) -> str:
+    """Bounds in words, of which gt and lt are not themselves allowed; there is no upper one without a lower one."""
+    most = next((f"{word}{bounds[key]}" for key, word in {"le": "", "lt": "below "}.items() if key in bounds), "")
+    if "ge" in bounds:
+        return f" from {bounds['ge']} to {most}" if most else f" of at least {bounds['ge']}"
+    if "gt" in bounds:
+        return f" above {bounds['gt']}" + (f" and {'' if 'lt' in bounds else 'up to '}{most}" if most else "")
+    return ""

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from mipmap_plugin.config import AdaptConfig, LearningRates
+from mipmap_plugin.config import AdaptConfig, LearningRates, allowed
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.limits import check_scale
 from mipmap_plugin.registry import Registry
@@ -123,10 +123,11 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
     if overrides.get("steps") is not None:
         settings.pop("most_steps", None)
     try:
-        config = AdaptConfig(**{"recipe": name, **settings, **overrides})
+        config = AdaptConfig(**(given := {"recipe": name, **settings, **overrides}))
     except ValidationError as error:
-        asked = all(each["loc"] and each["loc"][0] in overrides for each in error.errors())
-        raise SettingsError(f"{'' if asked else f'recipe {name}: '}{'; '.join(map(_told, error.errors()))}") from None
+        asked = all(each["loc"][0] in overrides for each in error.errors())
+        told = dict.fromkeys(_told(each, given) for each in error.errors())  # of a pair, whose parts may both be wrong, once
+        raise SettingsError(f"{'' if asked else f'recipe {name}: '}{'; '.join(told)}") from None
     if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
         raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
     return config
@@ -137,14 +138,17 @@ def most_steps(name: str, scale: float, steps: int | None) -> int | None:
     return None if steps is None or recipe(name, scale).steps == 0 else steps
 
 
-def _told(error: Any) -> str:
-    """One error of pydantic's, in a sentence."""
-    name = ".".join(map(str, error["loc"]))
+def _told(error: Any, given: Mapping[str, Any]) -> str:
+    """One error of pydantic's in settings that were given, in a sentence."""
+    name, *within = error["loc"]
+    got, known = given[name], AdaptConfig.model_fields
+    if within and name == "rates" and error["type"] != "invalid_key":
+        name, got, known = f"rates.{within[0]}", error["input"], LearningRates.model_fields
     if error["type"] == "extra_forbidden":
-        known = LearningRates.model_fields if len(error["loc"]) > 1 else AdaptConfig.model_fields
         meant = get_close_matches(str(error["loc"][-1]), known, 1)
         return f"there is no setting {name}; {f'did you mean {meant[0]}? ' if meant else ''}mipmap_plugin.config has all of them"
-    return f"setting {name}: {error['msg']}" if name else error["msg"].removeprefix("Value error, ")
+    own = str(error["ctx"]["error"]) if error["type"] == "value_error" else f"must be {allowed(name)}"
+    return f"setting {name}: {own}, got {got!r}"
 
 
 def scale_of_fraction(kept: float) -> float:

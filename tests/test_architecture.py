@@ -150,6 +150,12 @@ def test_no_files_import_each_other_in_a_circle():
     assert circles(graph) == []
 
 
+def test_no_benchmarks_import_each_other_in_a_circle():
+    """They do so by bare names, as scripts."""
+    scripts = {path.stem: path for path in (PACKAGE.parent / "benchmarks").glob("*.py")}
+    assert circles({name: {full.split(".")[0] for full in imports(path)} & scripts.keys() for name, path in scripts.items()}) == []
+
+
 def test_a_circle_would_be_found():
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == [["b", "c"]]
 

@@ -515,7 +515,7 @@ def test_a_damaged_state_ends_in_one_sentence(run, model_folder, tmp_path):
 def test_requests_that_cannot_be_served_end_in_one_sentence(run, model_folder):
     refused(run("adapt", model_folder, "--scale", "4", "--backend", "gpu"), "there is no backend 'gpu'; choose from", "reference")
     refused(run("adapt", model_folder, "--scale", "4", "--upsampler", "swin"), "there is no upsampler 'swin'; choose from bicubic, lanczos")
-    refused(run("adapt", model_folder, "--scale", "4", "--steps", "-1"), "setting steps: Input should be greater than or equal to 0")
+    refused(run("adapt", model_folder, "--scale", "4", "--steps", "-1"), "setting steps: must be a whole number of at least 0, got -1")
     refused(run("adapt", model_folder), "--scale is required; give --scale 1/4")
     refused(run("evaluate", model_folder, "--images", model_folder), "--scale is required; give --scale 1/4")
     refused(run("adapt", model_folder, "--scale", "4", "--cameras", "nowhere.json"), "nowhere.json: there is no such file")

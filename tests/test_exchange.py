@@ -4,6 +4,7 @@ import gzip
 import hashlib
 import json
 import math
+import re
 import shutil
 import struct
 import sys
@@ -423,12 +424,17 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tool, tmp_path, capsys):
     words = ["--scale", "1/4", "--steps", "0", "--backend", "reference", "--viewer", "classic"]
     tiny.model(seed=5).save(tool / "answer.ply", provenance={}, overwrite=True)
     source = tiny.ply(tmp_path / "scan.ply")
-    assert main(["adapt", str(source), *words, "--output", str(tmp_path / "scan.spz")]) == 0
+    assert main(["adapt", str(source), *words, "--output", str(tmp_path / "scan.spz"), "--report"]) == 0
     said = capsys.readouterr()
     report = json.loads((tmp_path / "scan.spz.adaptation.json").read_text())
     exact = next(psnr for state, psnr in report["validation"].items() if report["returned"].startswith(state))
     assert report["written"] < exact - 1
     assert f"-> {report['written']:.2f} dB on views" in said.out
+    page = (tmp_path / "scan.spz.report.html").read_text()
+    record = json.loads(re.search(r'<script type="application/json" id="record">(.*?)</script>', page, re.DOTALL)[1])
+    [picture] = [picture for picture in record["zooms"][0]["pictures"] if picture["role"] == "adapted"]
+    assert picture["mean"] == {"psnr_db": report["written"]} and picture["view"]["psnr_db"] < exact - 1
+    assert f"→ {report['written']:.1f} dB on views" in record["lead"] and record["adaptations"][0]["written"] == report["written"]
     assert "its format rounds splats, which costs" in said.err and any("its format rounds splats" in note for note in report["notes"])
 
 

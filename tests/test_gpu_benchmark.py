@@ -24,15 +24,16 @@ import gpu_conformance  # noqa: E402
 import gpu_first_use  # noqa: E402
 import gpu_profile  # noqa: E402
 import gpu_speed  # noqa: E402
-from gpu_adaptation import Adaptation, Base, Place  # noqa: E402
-from gpu_conformance import Checked, check  # noqa: E402
+from gpu_adaptation import Base, Place  # noqa: E402
+from gpu_conformance import check  # noqa: E402
 from gpu_gsplat import Itself  # noqa: E402
-from gpu_profile import Kernel, Profile, kernels, of_trace  # noqa: E402
-from gpu_results import Results  # noqa: E402
+from gpu_profile import kernels, of_trace  # noqa: E402
+from gpu_records import Adaptation, Checked, Failure, Kernel, Profile, Speed, Views  # noqa: E402
+from gpu_results import Results, report  # noqa: E402
 from gpu_speed import Scene, denser  # noqa: E402
-from gpu_tables import Failure, Speed, report, speed_table  # noqa: E402
+from gpu_tables import speed_table  # noqa: E402
 from gpu_timing import Clock, copied_per_second  # noqa: E402
-from gpu_views import Shots, Views, measure, raw_of  # noqa: E402
+from gpu_views import Shots, measure, raw_of  # noqa: E402
 
 from mipmap_plugin import load_model  # noqa: E402
 from mipmap_plugin.backends.conformance import Outcome  # noqa: E402

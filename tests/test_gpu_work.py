@@ -18,8 +18,8 @@ import gpu_adaptation  # noqa: E402
 import gpu_conformance  # noqa: E402
 import gpu_views  # noqa: E402
 from gpu_adaptation import Base  # noqa: E402
+from gpu_records import Failure  # noqa: E402
 from gpu_results import Results  # noqa: E402
-from gpu_tables import Failure  # noqa: E402
 from gpu_work import DONE, Work, carry_out, forget, kept  # noqa: E402
 
 WHOLE = {"part": 1.0, "other": 1.0}

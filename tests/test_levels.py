@@ -80,7 +80,8 @@ def test_the_truth_of_a_zoomed_view_is_the_bases_own_image():
 
 
 @pytest.mark.parametrize(
-    ("band", "reason"), [((0.5, 4.0), "a band ends at the base's scale"), ((2.0, 1.0), "must rise"), ((0.0, 1.0), "greater than 0")]
+    ("band", "reason"),
+    [((0.5, 4.0), "a band ends at the base's scale"), ((2.0, 1.0), "^setting band: must rise, got"), ((0.0, 1.0), "each a number above 0, got")],
 )
 def test_impossible_bands_are_refused(band, reason):
     with pytest.raises(SettingsError, match=reason):
@@ -455,6 +456,28 @@ def test_a_ladder_that_failed_before_its_first_level_is_in_nobodys_way(tmp_path,
     with pytest.raises(Interrupted):
         make_levels(base, request(), resume=tmp_path / "state")
     assert make_levels(wrapped(), request(coarsest=0.6), resume=tmp_path / "state").levels
+
+
+@pytest.mark.parametrize("by", ["zoom", "distance"])
+def test_a_ladder_that_failed_before_its_first_level_leaves_nothing(tmp_path, monkeypatch, by):
+    base = wrapped()
+    monkeypatch.setattr(base, "adapt", lambda *_, **__: interrupt())
+    with pytest.raises(Interrupted):
+        make_levels(base, request(by=by), resume=tmp_path / "new" / "state")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_ladder_whose_first_level_has_a_state_keeps_it(tmp_path, monkeypatch):
+    base = wrapped()
+
+    def begun(scale, resume, **_):
+        resume.write_text("a state")
+        interrupt()
+
+    monkeypatch.setattr(base, "adapt", begun)
+    with pytest.raises(Interrupted):
+        make_levels(base, request(), resume=tmp_path / "state")
+    assert {each.name for each in (tmp_path / "state").iterdir()} == {"request.json", "level_0.ply.resume"}
 
 
 def test_a_damaged_unfinished_ladder_is_told(tmp_path):

@@ -28,10 +28,11 @@ from mipmap_plugin.levels.distance.mixture import Mixture, together
 from mipmap_plugin.levels.distance.rule import DistanceRule, focal, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import WalkTruth, backed, foreground
 from mipmap_plugin.levels.distance.yardstick import Walks
-from mipmap_plugin.levels.manifest import MANIFEST
+from mipmap_plugin.levels.manifest import MANIFEST, read_manifest
 from mipmap_plugin.levels.request import Band, LadderRequest
 from mipmap_plugin.levels.streamed import distances, progression
 from mipmap_plugin.models.vanilla import VanillaModel
+from mipmap_plugin.pages.walks import walks_page
 from mipmap_plugin.scenes import write_cameras
 
 RULE = DistanceRule(first=0.1, ratio=2.0, count=4)
@@ -389,6 +390,29 @@ def test_a_level_that_is_worse_than_the_finer_one_says_so(small_chunks, monkeypa
     with pytest.warns(UserWarning, match=r"level_1 has .* dB where it is shown, where the finer level would have 99\.0, with more splats"):
         report = wrapped().levels("classic", by="distance", coarsest=1 / 2, ratio=2.0, **BRIEF).contents.levels[1].report
     assert report.validation[AS_FINER] == 99.0 and any(note.startswith("level_1 has") for note in report.notes)
+
+
+def test_a_level_at_the_end_that_is_the_finer_one_again_is_left_out(tmp_path, small_chunks, monkeypatch, capsys):
+    base, start = wrapped(near=100, far=60), LevelRun._start
+    options = dict(by="distance", coarsest=1 / 8, ratio=2.0, **BRIEF | {"steps": 0})
+    whole = base.levels("classic", **options).contents
+    assert len(whole.levels) == 4 and not whole.left_out
+
+    def repeating(self):
+        student = start(self)
+        return (self._for_target(), AS_FINER) if self.number in (1, 3) else student
+
+    monkeypatch.setattr(LevelRun, "_start", repeating)
+    ladder = base.levels("classic", **options)
+    assert len(ladder.levels) == 3  # the first stays, for another one comes after it
+    manifest = read_manifest(ladder.save(tmp_path / "ladder"))
+    [left_out], curve = manifest["left_out"], manifest["curve"]
+    assert left_out["scale"] == whole.scene.scale(3) and left_out["splats"] == manifest["levels"][2]["splats"]
+    assert len(manifest["switches"]) == 2 and manifest["levels"][2]["pixel_to"] is None
+    assert [point["pixel"] for point in curve] == [point.pixel for point in whole.curve] and curve[-1]["level"] == 2
+    print_summary(tmp_path / "ladder", manifest)
+    assert "where a neighbor is shown: nothing was better than the finer level as it is" in capsys.readouterr().out
+    assert walks_page("ladder", ladder.contents, manifest, ()).zooms
 
 
 def test_an_interrupted_ladder_goes_on_with_its_finished_levels(tmp_path, small_chunks, monkeypatch):

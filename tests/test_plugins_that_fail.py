@@ -303,9 +303,9 @@ def test_a_recipe_may_be_made_from_another():
 def test_what_a_recipe_sets_wrong_is_told_by_its_name():
     register_recipe("mine", lambda scale, network: {"steps": -4})
     base = wrap_model(tiny.model(), cameras=tiny.cameras(2))
-    with pytest.raises(SettingsError, match="recipe mine: setting steps: Input should be"):
+    with pytest.raises(SettingsError, match="recipe mine: setting steps: must be a whole number of at least 0, got -4"):
         base.adapt(0.5, recipe="mine")
-    with pytest.raises(SettingsError, match=r"^setting steps: Input should be"):
+    with pytest.raises(SettingsError, match=r"^setting steps: must be a whole number of at least 0, got -4"):
         base.adapt(0.5, steps=-4)
 
 

@@ -1,8 +1,10 @@
 """Recipes: known by name, a stranger's as ours, and wrong ones answered in a sentence."""
 
+import re
+
 import pytest
 
-from mipmap_plugin.config import AdaptConfig
+from mipmap_plugin.config import AdaptConfig, LearningRates, allowed
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.recipes import RECIPES, recipe, register_recipe
 
@@ -34,6 +36,33 @@ def test_what_is_no_recipe_is_named():
     register_recipe("mine", lambda scale, network: dict(stepps=3), replace=True)
     with pytest.raises(SettingsError, match="setting stepps"):
         recipe("mine", 2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (dict(merge_to=0), "setting merge_to: must be a number above 0 and up to 1, got 0"),
+        (dict(min_opacity="x"), "setting min_opacity: must be a number from 0 to below 1, got 'x'"),
+        (dict(most_growth=0.5), "setting most_growth: must be a number of at least 1, or None, got 0.5"),
+        (dict(nesterov="maybe"), "setting nesterov: must be True or False, got 'maybe'"),
+        (dict(upsampler=3), "setting upsampler: must be a text, got 3"),
+        (dict(betas=(1, 2)), "setting betas: must be a pair, each a number from 0 to below 1, got (1, 2)"),
+        (dict(band=(1,)), "setting band: must be a pair, each a number above 0, got (1,)"),
+        (dict(rates=3), "setting rates: must be rates by name, got 3"),
+        (dict(rates={3: 1}), "setting rates: must be rates by name, got {3: 1}"),
+        (dict(seed=1.5, loss=3), f"setting seed: must be {allowed('seed')}, got 1.5; setting loss: must be 'psnr', 'l2' or 'l1', got 3"),
+    ],
+    ids=lambda value: "+".join(value) if isinstance(value, dict) else "",
+)
+def test_each_wrong_setting_is_told_with_what_it_may_be_and_what_was_got(settings, said):
+    with pytest.raises(SettingsError) as refused:
+        recipe("default", 1 / 4, **settings)
+    assert str(refused.value) == said
+
+
+def test_what_any_setting_may_be_has_words():
+    for name in (*AdaptConfig.model_fields, *(f"rates.{name}" for name in LearningRates.model_fields)):
+        assert re.fullmatch(r"a (whole )?number\b.*|a pair, each a number .*|a text|True or False|rates by name|'.*' or '.*'", allowed(name))
 
 
 @pytest.mark.parametrize("name", ["default", "thorough"])

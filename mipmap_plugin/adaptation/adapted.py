@@ -108,10 +108,17 @@ class Adapted:
         """Measure a file that is being written, as far as its format rounds splats. Raises CheckpointError if it cannot be read."""
         if self.judge is None or not is_written(saved):
             return
-        with warnings.catch_warnings(), announced(f"measuring {saved.name}"):
+        with announced(f"measuring {saved.name}"):
+            self.written[saved] = min(self.judge.viewer_psnrs(self._read(staged(saved)), self.judge.choosing))
+
+    def as_written(self, path: Path) -> Adapted:
+        """This with the splats and the report of the file at `path`, whose format may round them."""
+        return replace(self, model=self._read(path) if is_written(path) else self.model, report=self.report_of(path))
+
+    def _read(self, file: Path) -> SplatModel:
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what there is to say of its splats was said of the base's
-            rounded = load_model(staged(saved)).to(self.model.parameters()["means"].device)
-        self.written[saved] = min(self.judge.viewer_psnrs(rounded, self.judge.choosing))
+            return load_model(file).to(self.model.parameters()["means"].device)
 
     def report_of(self, path: Path) -> Report:
         """The report of the file at `path`, which also says what its format rounds, what it has no place for, and who draws it otherwise."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -87,8 +88,15 @@ def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
     if not able:
         raise BackendUnavailable("no backend can do this: " + " | ".join(f"{n}: {'; '.join(r)}" for n, r in reasons_of.items()))
     best = max(able, key=lambda backend: backend.speed)
+    _warn_of_numba(best.name, reasons_of.get("cpu", []))
     others = [f"{n} cannot: {r[0]}" for n, r in reasons_of.items() if r]
     return best, f"{best.name}: the fastest that can serve the request{_note_in_brackets(best)}" + "".join(f"; {reason}" for reason in others)
+
+
+def _warn_of_numba(chosen: str, reasons: Sequence[str]) -> None:
+    """Say that a working numba would save much time. The backend cpu names it only where it lacks nothing else."""
+    if chosen == "reference" and reasons and "numba" in reasons[0]:
+        warnings.warn(f"backend cpu cannot do this: {reasons[0]}; until then the backend reference does, many times slower", stacklevel=3)
 
 
 def _lacking(name: str, backend: Backend, needs: Sequence[Needs]) -> list[str]:

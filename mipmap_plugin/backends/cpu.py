@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from types import ModuleType
 from typing import Any
 
@@ -15,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import BackendUnavailable, install
+from mipmap_plugin.errors import BackendUnavailable, brief, install
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.render_settings import RenderSettings
 from mipmap_plugin.screen_filters import INTEGRATED
@@ -23,6 +24,8 @@ from mipmap_plugin.splatting.buckets import ranks_for
 from mipmap_plugin.splatting.packing import packed
 
 NO_NUMBA = f"it needs numba; {install('cpu')}"
+NO_FOLDER = "numba has no writable folder for compiled code; set the environment variable NUMBA_CACHE_DIR to one"
+REINSTALL = "run pip install --force-reinstall numba, which brings all that it needs"
 
 # The position of the coefficients among the arguments of `_Draw.forward`.
 SH = 5
@@ -44,11 +47,12 @@ class CpuBackend:
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""
-        missing = [] if importlib.util.find_spec("numba") else [NO_NUMBA]
         supported = {"max_color", "color_steps", "radial", "bucketed", "even_buckets", "frozen_beyond", "packing"}
         changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - supported
         unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
-        return missing + self.capabilities.lacking(needs) + unsupported
+        if lacking := self.capabilities.lacking(needs) + unsupported:
+            return lacking
+        return [reason] if (reason := missing()) else []
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if numba is missing or the request is not supported."""
@@ -131,14 +135,8 @@ def finest_pixels(means: Tensor, views: Sequence[Camera], near: float) -> tuple[
 
 
 def _has_kernels_for(means: Tensor) -> bool:
-    """Whether kernels can look at these splats. Where numba is broken, torch does so: another backend may draw them."""
-    if means.device.type != "cpu" or means.dtype != torch.float32 or not importlib.util.find_spec("numba"):
-        return False
-    try:
-        _drawing()
-    except ImportError:  # BackendUnavailable is one
-        return False
-    return True
+    """Whether kernels can look at these splats. Where they do not load, torch does so: another backend may draw them."""
+    return means.device.type == "cpu" and means.dtype == torch.float32 and not missing()
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -156,15 +154,23 @@ def _ranks(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> An
     return bucketing.ranks(_array(gaussians.means), _array(gaussians.scales), camera)
 
 
-def _drawing() -> ModuleType:
-    """The kernels. Imported at use, so that without numba this module can report what is missing."""
+@cache  # numba that failed to load is half loaded, and would fail in another way when tried again
+def missing() -> str:
+    """What this machine lacks to run the kernels, and what to do; empty if nothing. It imports numba."""
+    if importlib.util.find_spec("numba") is None:
+        return NO_NUMBA
     try:
-        from mipmap_plugin.backends.cpu_kernels import drawing
-    except RuntimeError as error:
-        if "cannot cache" not in str(error):
-            raise
-        raise BackendUnavailable("numba has no writable folder for compiled code; set the environment variable NUMBA_CACHE_DIR to one") from error
-    return drawing
+        importlib.import_module("mipmap_plugin.backends.cpu_kernels.drawing")
+    except Exception as error:  # numba built for another numpy, or without its compiler, may fail in any way
+        return NO_FOLDER if "cannot cache" in str(error) else f"numba does not load: {type(error).__name__}: {brief(error).rstrip('.')}; {REINSTALL}"
+    return ""
+
+
+def _drawing() -> ModuleType:
+    """The kernels. Imported at use. Raises BackendUnavailable if they do not load."""
+    if reason := missing():
+        raise BackendUnavailable(f"backend 'cpu' cannot do this: {reason}")
+    return importlib.import_module("mipmap_plugin.backends.cpu_kernels.drawing")
 
 
 def _ahead() -> ModuleType:

@@ -142,7 +142,7 @@ def _save_all(base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: Adapt
         if not json:
             show_before_and_after(base, adapted)
         if page:
-            page.add(base, adapted)
+            page.add(base, adapted.as_written(Path(reports[-1]["file"])))
     if page:
         page.write(reports)
     if json:

@@ -142,7 +142,7 @@ def _below(manifest: dict[str, Any]) -> list[str]:
 
 
 def _left_out(manifest: dict[str, Any]) -> list[str]:
-    """A line for each reason why levels are left out, which those of a ladder by distance are not."""
+    """A line for each reason why levels are left out."""
     scales = dict[str, list[str]]()
     for level in manifest.get("left_out", []):
         scales.setdefault(level["reason"], []).append(f"x{level['scale']:.3g}")

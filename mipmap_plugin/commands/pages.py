@@ -68,7 +68,7 @@ class AdaptationPage:
         refuse_unwritable(self.path)
 
     def add(self, base: Wrapped, adapted: Adapted) -> None:
-        """Draw the pictures of an adapted file."""
+        """Draw the pictures of an adapted file, as it is written."""
         from mipmap_plugin.pages.reports import adaptation_zoom
 
         self._zooms.append(adaptation_zoom(base, adapted))

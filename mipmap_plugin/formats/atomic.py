@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.errors import MipmapPluginError, OutputError, OutputExists, of_system
-from mipmap_plugin.formats.staging import Staging, settle
+from mipmap_plugin.formats.staging import Staging, missing_folders, remove_empty, settle
 
 # Files that systems leave in folders, and that nobody misses.
 OF_SYSTEMS = {".DS_Store", "Thumbs.db", "desktop.ini"}
@@ -38,18 +38,28 @@ def together(path: Path) -> Iterator[None]:
         if holding is not None and holding.inside(place) is not None:
             yield
             return
-        place.parent.mkdir(parents=True, exist_ok=True)
-        staging = Staging(place)
-        token = _open.set(staging)
+        missing = missing_folders(place.parent)
         try:
-            yield
-            staging.commit()
-        except MipmapPluginError as error:  # which may name the hidden place
-            error.args = tuple(str(each).replace(str(staging.new), str(staging.place)) for each in error.args)
-            raise
+            place.parent.mkdir(parents=True, exist_ok=True)
+            with _staged(place):
+                yield
         finally:
-            _open.reset(token)
-            staging.close()
+            remove_empty(missing)
+
+
+@contextlib.contextmanager
+def _staged(place: Path) -> Iterator[None]:
+    staging = Staging(place)
+    token = _open.set(staging)
+    try:
+        yield
+        staging.commit()
+    except MipmapPluginError as error:  # which may name the hidden place
+        error.args = tuple(str(each).replace(str(staging.new), str(staging.place)) for each in error.args)
+        raise
+    finally:
+        _open.reset(token)
+        staging.close()
 
 
 @contextlib.contextmanager

@@ -13,6 +13,9 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Iterable
+from contextlib import suppress
+from itertools import takewhile
 from pathlib import Path
 
 # The most runs that may write to one output at the same time.
@@ -97,6 +100,18 @@ def release(folder: Path, lock: int) -> None:
     finally:
         if lock >= 0:
             os.close(lock)
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """The folder and those around it, as far as they are missing, the innermost first."""
+    return list(takewhile(lambda each: not os.path.lexists(each), (folder, *folder.parents)))
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove those folders, the innermost first, that have nothing in them: an output that failed leaves none behind."""
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
 
 
 def exchange(one: Path, other: Path) -> bool:

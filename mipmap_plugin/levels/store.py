@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -14,9 +15,10 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import MipmapPluginError, SettingsError
+from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
 from mipmap_plugin.formats.atomic import json_text, write_json
 from mipmap_plugin.formats.json_file import read_json
+from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
@@ -30,27 +32,42 @@ class LevelStore:
     """Finished levels of one ladder in a folder; without a folder nothing is kept."""
 
     def __init__(self, folder: Path | None, base: FrozenBase, request: LadderRequest) -> None:
-        """Raises SettingsError for a folder with levels of another ladder, SceneError for a damaged one, OutputError if it cannot be written."""
+        """Raises SettingsError for a folder with levels of another ladder, SceneError for a damaged one."""
         self._folder, self._base, self._target = folder, base, base.target(request.viewer)
         if folder is None:
             return
-        facts, file = json.loads(json_text(_facts(base, request))), folder / REQUEST
+        self._facts, file = json.loads(json_text(_facts(base, request))), folder / REQUEST
         if folder.exists() and any(each.name != REQUEST for each in folder.iterdir()):
             if not file.is_file():
                 raise SettingsError(f"{folder}: unfinished ladders are kept there, but it has other things in it; choose another output")
-            if read_json(file) != facts:
+            if read_json(file) != self._facts:
                 others = "levels of another base, viewer or settings, or of another version"
                 raise SettingsError(f"{folder}: holds {others}; repeat the run with those, or delete it")
-        write_json(file, facts, overwrite=True)
 
     def level(self, name: str, make: Callable[[Path | None], Adapted]) -> Adapted:
-        """The level of that name from the folder, or else the one that `make` returns for the path of the state of its run, kept from now on."""
+        """The level of that name from the folder, or else the one that `make` returns for the path of the state of its run, kept from now on.
+
+        Raises OutputError.
+        """
         if self._folder is None:
             return make(None)
         file = self._folder / f"{name}.ply"
         if not file.with_name(file.name + REPORT).is_file():
-            make(state_path(file)).save(file, overwrite=True)
+            with self._used(self._folder):
+                make(state_path(file)).save(file, overwrite=True)
         return self._loaded(file)
+
+    @contextmanager
+    def _used(self, folder: Path) -> Iterator[None]:
+        """Mark the folder as this ladder's. One that has neither a level nor a state of one after the block goes away."""
+        around = missing_folders(folder.parent)
+        write_json(folder / REQUEST, self._facts, overwrite=True)
+        try:
+            yield
+        finally:
+            if [each.name for each in folder.iterdir()] == [REQUEST]:
+                (folder / REQUEST).unlink()
+                remove_empty([folder, *around])
 
     def remove(self) -> None:
         """Delete the folder, whose levels have been saved elsewhere."""
@@ -65,7 +82,7 @@ class LevelStore:
                 warnings.simplefilter("ignore")  # what there is to say of its splats was said of the base's
                 read = load_model(file)
         except (ValueError, MipmapPluginError) as error:
-            raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({error}); delete its folder to start anew") from error
+            raise SettingsError(f"{file}: this level of an unfinished ladder is damaged ({brief(error)}); delete its folder to start anew") from error
         plain: SplatModel = cast(Filtered, read).bare() if read.traits.filtered else read  # the filter of a file for Mip-Splatting is 0
         model = plain.to(self._base.model.parameters()["means"].device)
         model.trained = _trained(self._base, self._target)

@@ -21,6 +21,7 @@ import torch
 from corpus import SAMPLES
 
 from mipmap_plugin.adaptation.optimization import resume
+from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputError, SettingsError
 from mipmap_plugin.formats import staging
 from mipmap_plugin.formats.torch_file import load_torch
@@ -77,6 +78,21 @@ def test_a_full_disk_leaves_the_old_output_and_nothing_else(tmp_path, name):
     assert load_model(out)
     new.save(out, overwrite=True)
     assert contents(out.parent) != before
+
+
+@pytest.mark.parametrize("words", [["render", "--backend", "reference"], ["tradeoff", "--scale", "1/4", "--recipe", "instant", "--no-picture"]])
+def test_a_full_disk_leaves_no_empty_folders(tmp_path, capsys, words):
+    command, *options = words
+    base = tiny.folder(tmp_path / "base", tiny.cameras(1, width=8, height=6), count=10)
+    with disk_that_holds(10):
+        assert main([command, str(base), "--output", str(tmp_path / "new" / "out"), *options]) == 2
+    assert "cannot be written" in capsys.readouterr().err and not (tmp_path / "new").exists()
+
+
+def test_a_run_that_is_not_kept_leaves_no_empty_folders(tmp_path):
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    model.adapt(1 / 4, steps=1, resume=tmp_path / "new" / "out" / "state")
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_full_disk_while_a_run_is_kept_does_not_end_it(tmp_path, monkeypatch):

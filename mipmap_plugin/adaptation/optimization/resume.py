@@ -57,7 +57,6 @@ class StateKeeper:
         refuse_output(self._requested, overwrite=True, is_file=True)
         states: list[dict[str, Any]] = []
         try:
-            self._requested.parent.mkdir(parents=True, exist_ok=True)
             self.file = claim_state_file(self._requested, lambda path: self._whose(path, states))
         except OSError as error:
             warnings.warn(f"{self._requested} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)

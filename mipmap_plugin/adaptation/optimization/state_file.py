@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mipmap_plugin.errors import SettingsError
-from mipmap_plugin.formats.staging import SLOTS, claim, release
+from mipmap_plugin.formats.staging import SLOTS, claim, missing_folders, release, remove_empty
 
 
 class StateFile:
     """A locked state file: no other run touches it until this run removes or releases it, or its process ends."""
 
-    def __init__(self, path: Path, lock: int) -> None:
-        self.path = path
+    def __init__(self, path: Path, lock: int, made: Sequence[Path] = ()) -> None:
+        """`made`: folders around it that were made for it, the innermost first."""
+        self.path, self._made = path, made
         self._lock: int | None = lock
 
     def remove(self) -> None:
@@ -26,6 +27,7 @@ class StateFile:
         """Unlock the state, if there is one, for the next run."""
         if self._lock is not None:
             release(_lock_of(self.path), self._lock)
+            remove_empty(self._made)
             self._lock = None
 
     def __del__(self) -> None:
@@ -36,8 +38,10 @@ def claim_state_file(requested: Path, whose: Callable[[Path], str]) -> StateFile
     """Lock and return the state to resume, at `requested`, `requested`.2 and so on, or else the first of these that is free.
 
     `whose` says whose a state is and what to do with it; "" if it is of this run. Raises SettingsError if there are only states of other runs that
-    have ended, which stay where they are.
+    have ended, which stay where they are, and OSError.
     """
+    missing = missing_folders(requested.parent)
+    requested.parent.mkdir(parents=True, exist_ok=True)
     free: StateFile | None = None
     foreign = list[tuple[Path, str]]()
     for path in (requested, *(requested.with_name(f"{requested.name}.{number}") for number in range(2, SLOTS + 1))):
@@ -46,7 +50,7 @@ def claim_state_file(requested: Path, whose: Callable[[Path], str]) -> StateFile
             continue
         if (lock := claim(_lock_of(path))) is None:
             continue  # a run that is still going on keeps its state there
-        file = StateFile(path, lock)
+        file = StateFile(path, lock, missing)
         others = whose(path) if exists else ""
         if exists and not others:
             return file

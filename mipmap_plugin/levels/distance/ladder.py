@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -11,8 +12,9 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.adaptation.start.pixel_size import seen_pixel_size
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
+from mipmap_plugin.levels.contents import LeftOut
 from mipmap_plugin.levels.distance.chunks import Chunks
-from mipmap_plugin.levels.distance.level import LevelRun, Scene
+from mipmap_plugin.levels.distance.level import AS_FINER, LevelRun, Scene
 from mipmap_plugin.levels.distance.manifest import Contents, write
 from mipmap_plugin.levels.distance.rule import DistanceRule, is_unbounded, nearest
 from mipmap_plugin.levels.distance.walks import focal_of, foreground
@@ -29,6 +31,9 @@ from mipmap_plugin.splatting.viewers import own_name
 # one world unit: splat-transform takes whole numbers.
 CHUNK = 0.5
 
+# Why a level at the end of a ladder is left out.
+REPEATED = "nothing was better than the finer level as it is"
+
 
 def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: str | Path | None = None) -> Ladder:
     """Make the levels. `resume`: as for `levels.ladder.make_levels`. Raises what that raises, and SettingsError for a model whose splats cannot be
@@ -43,9 +48,20 @@ def make_levels_by_distance(base: FrozenBase, request: LadderRequest, resume: st
         for number in range(1, scene.rule.count):
             run = LevelRun(scene, number, [level.model for level in levels])
             levels.append(store.level(f"level_{number}", run.run))
+        scene, levels, left_out = without_repeats(scene, levels)
         with announced("measuring the levels"):
             curve = measured(scene, [level.model for level in levels])
-    return Ladder(Contents(scene, levels, curve), store, write)
+    return Ladder(Contents(scene, levels, curve, left_out), store, write)
+
+
+def without_repeats(scene: Scene, levels: list[Adapted]) -> tuple[Scene, list[Adapted], list[LeftOut]]:
+    """A ladder without the levels at its end that are the finer one again, which a viewer shows in their place: the same picture, at fewer bytes.
+
+    One before another level stays: the distances at which a viewer changes are in a fixed proportion, so that each level needs the one before.
+    """
+    own = next(number for number in range(len(levels), 0, -1) if levels[number - 1].report.returned != f"the start, {AS_FINER}")
+    left_out = [LeftOut(scene.scale(number), levels[number].report.gaussians_after, REPEATED) for number in range(own, len(levels))]
+    return replace(scene, rule=replace(scene.rule, count=own, left_out=len(left_out))), levels[:own], left_out
 
 
 def by_distance(base: FrozenBase, request: LadderRequest) -> bool:

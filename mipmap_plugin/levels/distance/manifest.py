@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
@@ -9,6 +10,7 @@ from typing import Any
 
 from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.formats.atomic import new_folder, sha256, write_json
+from mipmap_plugin.levels.contents import LeftOut
 from mipmap_plugin.levels.distance.level import Scene
 from mipmap_plugin.levels.distance.yardstick import TRUTH, WalkPoint
 from mipmap_plugin.levels.manifest import FORMAT, MANIFEST, level_name, refuse_ladder
@@ -24,6 +26,7 @@ class Contents:
     scene: Scene
     levels: list[Adapted]
     curve: list[WalkPoint]
+    left_out: Sequence[LeftOut] = ()  # beyond the last level, by falling scale
 
 
 def write(ladder: Contents, folder: Path, overwrite: bool) -> Path:
@@ -48,6 +51,7 @@ def manifest(ladder: Contents, files: list[Path]) -> dict[str, Any]:
         "base_pixel": scene.near,
         "levels": [_entry(ladder, number, file) for number, file in enumerate(files)],
         "switches": [{"pixel": size, "zoom": scene.near / size} for size in switches],
+        "left_out": [asdict(level) for level in ladder.left_out],
         "lodBaseDistance": distance,
         "lodMultiplier": multiplier,
         "canvas": CANVAS,

@@ -33,6 +33,7 @@ class DistanceRule:
     first: float  # level 0 is shown up to this size of a pixel
     ratio: float  # level k up to first · ratio^k
     count: int  # of levels, level 0 included; the last is shown at any larger size
+    left_out: int = 0  # of further levels, in whose places the last is shown
 
     @classmethod
     def of(cls, pixels: Tensor, request: LadderRequest, band: Band) -> DistanceRule:

@@ -93,8 +93,8 @@ class Walks:
 
 
 def places(rule: DistanceRule) -> list[float]:
-    """The middle and the end of each level: sizes of a pixel at what is nearest, rising."""
-    return [size for number in range(rule.count) for size in (rule.middle(number), rule.ends(number)[1] * WITHIN)]
+    """The middle and the end of each level, left out or not: sizes of a pixel at what is nearest, rising."""
+    return [size for number in range(rule.count + rule.left_out) for size in (rule.middle(number), rule.ends(number)[1] * WITHIN)]
 
 
 def measured(scene: Scene, levels: Sequence[SplatModel]) -> list[WalkPoint]:
