@@ -256,12 +256,17 @@ class Steering:
         self.ceiling = self.best_factor if lower else RATE_REDUCTION * rate_factor
 
     def dare(self, progress: float, config: AdaptConfig) -> None:
-        """Limit no rates and take nothing back any more if limited ones gained nothing while new views came: there is nothing to lose.
+        """Limit no rates and take nothing back any more if limited ones hardly gained while new views came: there is little to lose.
 
         Where few views show a splat, any rate does harm at first, and high ones gain in the end, as they fall.
         """
-        if config.warm_up and config.gathering and self.ceiling < 1 and progress >= config.gathering and self.best_db - self.start_db <= TIE_DB:
+        if config.warm_up and config.gathering and self.ceiling < 1 and progress >= config.gathering and self._gained_db() <= LOST_DB:
             self.ceiling, self.bold = 1.0, True
+
+    def _gained_db(self) -> float:
+        """What was gained, of the whole error: of a start that is good in itself the visible one hardly changes, and there is more to lose."""
+        start, best = (max(10 ** (-db / 10) - VISIBLE_ERROR, INVISIBLE_ERROR) for db in (self.start_db, self.best_db))
+        return decibel(best) - decibel(start)
 
     def update_best(self, psnr: float, step: int, student: SplatModel, rows_changed: bool = False, rate_factor: float = 1.0) -> None:
         """Keep the student's state, to which steps of `rate_factor` led, as the best one, unless it is worse."""
