@@ -121,9 +121,8 @@ class Scene:
         size = self.rule.middle(level)
         scales, opacities = shaped(finest, self.pixel_of(finest.means).clamp_max(size), size, self.target)
         changes = self.pixel_of(finest.means) < size
-        return replace(
-            finest, scales=torch.where(changes[:, None], scales, finest.scales), opacities=torch.where(changes, opacities, finest.opacities)
-        )
+        scales, opacities = torch.where(changes[:, None], scales, finest.scales), torch.where(changes, opacities, finest.opacities)
+        return replace(finest, scales=scales, opacities=opacities)
 
     def walked(self, view: Camera, level: int, number: int) -> Camera:
         """The view from as far back as the level is seen from: of one in three views anywhere up to there, of the others right there."""
