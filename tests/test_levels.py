@@ -446,6 +446,14 @@ def test_levels_of_generated_views_are_said_to_be(tmp_path, capsys, has_cameras)
     assert ("no cameras are known" in capsys.readouterr().err) is not has_cameras
 
 
+def test_the_size_of_a_small_level_is_told_in_kilobytes(tmp_path, capsys):
+    base, ladder = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "ladder"
+    words = ["levels", str(base), "--viewer", "classic", "--output", str(ladder), "--coarsest", "1"]
+    assert cli.main([*words, "--backend", "cpu", "--threads", "1"]) == 0
+    size = json.loads((ladder / "levels.json").read_text())["levels"][0]["bytes"]
+    assert f" splats, {size / 1e3:.0f} kB, " in capsys.readouterr().out
+
+
 def interrupt():
     raise Interrupted("Ctrl-C")
 

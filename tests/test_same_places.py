@@ -71,3 +71,10 @@ def test_a_report_without_an_orbit_is_taken_as_one_of_before(files, orbit):
     report = adapted.with_name(adapted.name + ".adaptation.json")
     report.write_text(json.dumps(json.loads(report.read_text()) | {"orbit": orbit}))
     assert adapted_orbit(adapted) is None and len(poses(adapted)) > 1
+
+
+@pytest.mark.parametrize(("comment", "up"), [("Vertical Axis: z", (0.0, 0.0, 1.0)), ("Vertical axis: y", None)], ids=["nerfstudio", "Brush"])
+def test_a_header_tells_the_vertical_but_for_what_a_program_writes_into_every_file(tmp_path, comment, up):
+    base = tiny.ply(tmp_path / "base.ply")
+    base.write_bytes(base.read_bytes().replace(b"element vertex", f"comment {comment}\nelement vertex".encode(), 1))
+    assert views.orbit_of(wrap_model(base, backend="reference").model).up == up

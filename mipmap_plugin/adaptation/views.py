@@ -18,13 +18,13 @@ from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import derived_seed
-from mipmap_plugin.models.adapted_scale import adapted_orbit
+from mipmap_plugin.models.adapted_scale import adapted_orbit, stated_up
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
 from mipmap_plugin.render_settings import MIN_ALPHA
 from mipmap_plugin.scenes import unread_cameras
-from mipmap_plugin.scenes.trajectories import FRAMED, ORBIT_FOV, Orbit, jittered
+from mipmap_plugin.scenes.trajectories import FRAMED, GOLDEN, ORBIT_FOV, Orbit, jittered
 
 # A checkpoint without cameras does not say at what resolution it was trained: this many px across 50 degrees is NeRF-Synthetic's.
 ORBIT_PIXELS = 800
@@ -51,8 +51,6 @@ UNLIKE = 3.0
 # Standard deviations of a splat that are seen of it; and near planes at which views keep clear of a scene (`orbit`).
 SEEN, CLEAR = 3, 2
 
-# Views take their places in a band at multiples of the golden ratio, so that any number of consecutive ones is spread evenly.
-GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class ViewSchedule:
@@ -141,9 +139,9 @@ def orbit_of(model: SplatModel, means: Tensor | None = None) -> Orbit:
     """
     recorded = adapted_orbit(model.source)
     if recorded is None:
-        return Orbit.around(model.parameters()["means"] if means is None else means)
+        return Orbit.around(model.parameters()["means"] if means is None else means, stated_up(model.source))
     center, up, distance = recorded
-    return Orbit((center[0], center[1], center[2]), (up[0], up[1], up[2]), distance)
+    return Orbit((center[0], center[1], center[2]), (up[0], up[1], up[2]) if up else None, distance)
 
 
 def choose_views(cameras: Sequence[Camera], around: Tensor | Orbit, config: AdaptConfig) -> tuple[list[Camera], str]:

@@ -175,4 +175,5 @@ def _counted(manifest: dict[str, Any]) -> str:
 
 
 def _size(level: dict[str, Any]) -> str:
-    return f"{level['splats']:,} splats, {level['bytes'] / 1e6:,.1f} MB, {level['seconds']:.0f} s"
+    size = f"{level['bytes'] / 1e6:,.1f} MB" if level["bytes"] >= 1e6 else f"{level['bytes'] / 1e3:.0f} kB"
+    return f"{level['splats']:,} splats, {size}, {level['seconds']:.0f} s"

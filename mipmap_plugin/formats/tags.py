@@ -15,6 +15,9 @@ PROVENANCE = "mipmap_plugin"
 _RENDER_MODE = re.compile(r"SplatRenderMode:\s*(\w+)", re.IGNORECASE)
 _ANTIALIASED = re.compile(r"antialiased\s+([01])\b", re.IGNORECASE)
 
+# nerfstudio names its vertical so; Brush's exports have the same comment with y, whatever is up in them.
+_Z_UP = re.compile(r"vertical axis:\s*z\b", re.IGNORECASE)
+
 _MODES = {"default": "classic", "0": "classic", "mip": "antialiased", "1": "antialiased", "2dgs": "2dgs"}
 
 # The tag of each screen filter. Filters that integrate over the pixel have none, as no other project's files name them.
@@ -28,6 +31,11 @@ def render_mode(comments: Iterable[str]) -> str | None:
         tag = _tag(comment)
         mode = _MODES.get(tag[1].lower(), mode) if tag else mode
     return mode
+
+
+def vertical_of(comments: Iterable[str]) -> tuple[float, float, float] | None:
+    """What is up in a file that says so; None in any other."""
+    return (0.0, 0.0, 1.0) if any(map(_Z_UP.match, comments)) else None
 
 
 def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any], eps2d: float | None = None) -> list[str]:

@@ -9,7 +9,7 @@ from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.json_file import read_json
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.tags import provenance_of
+from mipmap_plugin.formats.tags import provenance_of, vertical_of
 from mipmap_plugin.models.places import REPORT
 
 
@@ -25,15 +25,20 @@ def adapted_viewer(source: Path | None) -> str | None:
     return viewer if isinstance(viewer, str) else None
 
 
-def adapted_orbit(source: Path | None) -> tuple[list[float], list[float], float] | None:
+def adapted_orbit(source: Path | None) -> tuple[list[float], list[float] | None, float] | None:
     """Center, up and distance of the orbit around the base of the file `source`; None if it is a base, or of an older version.
 
     Raises as `adapted_scale`.
     """
     match _record(source).get("orbit"):
-        case {"center": [float(), float(), float()] as center, "up": [float(), float(), float()] as up, "distance": float() as distance}:
+        case {"center": [float(), float(), float()] as center, "up": [float(), float(), float()] | None as up, "distance": float() as distance}:
             return center, up, distance
     return None
+
+
+def stated_up(source: Path | None) -> tuple[float, float, float] | None:
+    """What is up in the file `source`, where its header says so. Raises CheckpointError for a damaged file."""
+    return vertical_of(_comments(source))
 
 
 def report_beside(source: Path | None) -> dict[str, Any]:
@@ -47,8 +52,13 @@ def _record(source: Path | None) -> dict[str, Any]:
     """What this package wrote into a file, or beside it. Raises CheckpointError for a damaged file, SceneError for a damaged report."""
     if source is None or not source.is_file():  # made in memory, gone since, or a folder of another family
         return {}
-    record = (provenance_of(read_header(source).comments) or {}) if kind_of(source) == "ply" else {}
+    record = provenance_of(_comments(source)) or {}
     return record if "scale" in record else report_beside(source)
+
+
+def _comments(source: Path | None) -> tuple[str, ...]:
+    """The comments of a PLY's header; () of anything else. Raises CheckpointError for a damaged file."""
+    return read_header(source).comments if source is not None and source.is_file() and kind_of(source) == "ply" else ()
 
 
 def refuse_adapted(source: Path | None) -> None:

@@ -20,8 +20,14 @@ ORBIT_ELEVATIONS = (math.radians(10), math.radians(50))  # above the horizon, ty
 # Fraction of the splats that an orbit frames; the farthest tenth are mostly floaters and background.
 FRAMED = 0.9
 
-# Largest ratio of the extents along y and z at which y is assumed to be vertical.
+# Largest ratio of the extent along y to those along x and z at which y is assumed to be vertical.
 FLATTER = 0.8
+
+# What pictures have upwards where nothing tells the vertical: as in most files, whose y is down (COLMAP).
+Y_DOWN = (0.0, -1.0, 0.0)
+
+# Places at multiples of the golden ratio are spread evenly, however many there are.
+GOLDEN = (math.sqrt(5) - 1) / 2
 
 # A generated view lies between a camera and one of its NEIGHBORS nearest, or beyond either end by up to this fraction of the way. With 4
 # neighbors and 0 beyond, views fill the gaps between cameras so poorly that lego's test views at x1/8 lose 0.8 dB.
@@ -50,10 +56,10 @@ SAME_DIRECTION = math.radians(60)
 
 @dataclass(frozen=True)
 class Orbit:
-    """What an orbit goes around, in world units: `center`, the vertical `up`, and how far away its cameras are."""
+    """What an orbit goes around, in world units: `center`, the vertical `up` (None: not known), and how far away its cameras are."""
 
     center: tuple[float, float, float]
-    up: tuple[float, float, float]
+    up: tuple[float, float, float] | None
     distance: float
 
     @classmethod
@@ -67,19 +73,19 @@ class Orbit:
         if len(means) == 0:
             raise SettingsError("an orbit needs splats, but got 0 finite splats")
         center = means.median(dim=0).values
-        vertical = guess_up(means) if up is None else torch.tensor(up, dtype=torch.float64)
         radius = _quantile((means - center).norm(dim=1), FRAMED).item()
         distance = max(radius / math.sin(ORBIT_FOV / 2), radius + 2 * NEAR_PLANE)  # a small scene must not lie in front of the near plane
         x, y, z = center.tolist()
-        right, forward, upward = vertical.tolist()
-        return cls((x, y, z), (right, forward, upward), distance)
+        vertical = guess_up(means) if up is None else (up[0], up[1], up[2])
+        return cls((x, y, z), vertical, distance)
 
     def views(self, size: tuple[int, int], count: int, generator: torch.Generator) -> list[Camera]:
-        """`count` views of `size` (height, width) px; azimuths are evenly spaced from a random start, elevations are random."""
+        """`count` views of `size` (height, width) px: from above the horizon, or from all around where no vertical is known."""
         if count < 1:
             raise SettingsError(f"an orbit needs views, but got {count}")
-        center, vertical = (torch.tensor(vector, dtype=torch.float64) for vector in (self.center, self.up))
-        directions = _sky_directions(vertical / vertical.norm(), count, generator)
+        center, vertical = (torch.tensor(vector, dtype=torch.float64) for vector in (self.center, self.up or Y_DOWN))
+        vertical = vertical / vertical.norm()
+        directions = (_sky_directions if self.up else _all_directions)(vertical, count, generator)
         return [_looking_at(center, center + self.distance * way, vertical, size, f"orbit_{i:04d}") for i, way in enumerate(directions)]
 
 
@@ -94,13 +100,13 @@ def orbit(
     return Orbit.around(means.means if isinstance(means, Gaussians) else means, up).views(size, count, generator)
 
 
-def guess_up(means: Tensor) -> Tensor:
-    """The likely vertical [3] of the splats at `means` [N, 3]: +z (Blender, nerfstudio), or -y (COLMAP) for a scene clearly flatter along y.
+def guess_up(means: Tensor) -> tuple[float, float, float] | None:
+    """The likely vertical of the splats at `means` [N, 3]: -y (COLMAP) for a scene clearly flatter along y, as scenes are usually wider than high.
 
-    Scenes are usually wider than high. It is right for flowers of mip-NeRF 360 (-y), and lego and chair (+z).
+    None for any other: of single objects neither the shape nor the light tells what is up, and files have y down, y up and z up.
     """
-    spread = _quantile(means, FRAMED) - _quantile(means, 1 - FRAMED)
-    return means.new_tensor((0.0, -1.0, 0.0) if spread[1] < FLATTER * spread[2] else (0.0, 0.0, 1.0))
+    x, y, z = (_quantile(means, FRAMED) - _quantile(means, 1 - FRAMED)).tolist()
+    return Y_DOWN if y < FLATTER * min(x, z) else None
 
 
 def jittered(
@@ -219,14 +225,25 @@ def _farthest(places: Tensor, taken: Tensor, count: int) -> list[int]:
 
 def _sky_directions(up: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Unit vectors [count, 3] at evenly spaced azimuths and random elevations above the horizon whose normal is `up` (unit)."""
+    start, chance = torch.rand((), generator=generator, dtype=up.dtype), torch.rand(count, 1, generator=generator, dtype=up.dtype)
+    low, high = ORBIT_ELEVATIONS
+    return _directions(up, torch.arange(count, dtype=up.dtype)[:, None] / count + start, torch.sin(low + (high - low) * chance))
+
+
+def _all_directions(up: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Unit vectors [count, 3] evenly spread over all directions, on a spiral from `up` (unit) down."""
+    start, chance = torch.rand((), generator=generator, dtype=up.dtype), torch.rand(count, 1, generator=generator, dtype=up.dtype)
+    number = torch.arange(count, dtype=up.dtype)[:, None]
+    return _directions(up, number * GOLDEN + start, 1 - 2 * (number + chance) / count)
+
+
+def _directions(up: Tensor, turns: Tensor, height: Tensor) -> Tensor:
+    """Unit vectors [count, 3] after `turns` [count, 1] around `up` (unit), at `height` [count, 1] along it (-1 to 1)."""
     east: Tensor = torch.linalg.cross(up, torch.eye(3, dtype=up.dtype)[up.abs().argmin()])
     east = east / east.norm()
     north: Tensor = torch.linalg.cross(up, east)
-    start, chance = torch.rand((), generator=generator, dtype=up.dtype), torch.rand(count, 1, generator=generator, dtype=up.dtype)
-    azimuth = (torch.arange(count, dtype=up.dtype)[:, None] / count + start) * 2 * math.pi
-    low, high = ORBIT_ELEVATIONS
-    elevation = low + (high - low) * chance
-    return elevation.cos() * (azimuth.cos() * east + azimuth.sin() * north) + elevation.sin() * up
+    azimuth = turns * 2 * math.pi
+    return (1 - height**2).sqrt() * (azimuth.cos() * east + azimuth.sin() * north) + height * up
 
 
 def _looking_at(target: Tensor, eye: Tensor, up: Tensor, size: tuple[int, int], name: str) -> Camera:

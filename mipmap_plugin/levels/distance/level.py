@@ -27,7 +27,7 @@ from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size, 
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import GOLDEN, choose_views, orbit_of
+from mipmap_plugin.adaptation.views import choose_views, orbit_of
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Backend, Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
@@ -47,6 +47,7 @@ from mipmap_plugin.models.health import doubts_in
 from mipmap_plugin.process.clock import now
 from mipmap_plugin.progress import announced
 from mipmap_plugin.recipes import recipe as make_config
+from mipmap_plugin.scenes.trajectories import GOLDEN
 
 # Samples of the truth per pixel along each side, to adapt to and to measure by. In walks over flowers, three agree with six to 67 dB.
 SAMPLES, MEASURED_SAMPLES = 2, 3
@@ -120,9 +121,8 @@ class Scene:
         size = self.rule.middle(level)
         scales, opacities = shaped(finest, self.pixel_of(finest.means).clamp_max(size), size, self.target)
         changes = self.pixel_of(finest.means) < size
-        return replace(
-            finest, scales=torch.where(changes[:, None], scales, finest.scales), opacities=torch.where(changes, opacities, finest.opacities)
-        )
+        scales, opacities = torch.where(changes[:, None], scales, finest.scales), torch.where(changes, opacities, finest.opacities)
+        return replace(finest, scales=scales, opacities=opacities)
 
     def walked(self, view: Camera, level: int, number: int) -> Camera:
         """The view from as far back as the level is seen from: of one in three views anywhere up to there, of the others right there."""
