@@ -14,6 +14,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, load_model, recipes, wrap_model
+from mipmap_plugin.adaptation.optimization.run import Run
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start import candidates
@@ -464,6 +465,13 @@ def test_a_ladder_that_failed_before_its_first_level_leaves_nothing(tmp_path, mo
     monkeypatch.setattr(base, "adapt", lambda *_, **__: interrupt())
     with pytest.raises(Interrupted):
         make_levels(base, request(by=by), resume=tmp_path / "new" / "state")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_first_level_that_is_broken_off_before_its_state_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(Run, "start", lambda *_: interrupt())
+    with pytest.raises(Interrupted):
+        make_levels(wrapped(), request(), resume=tmp_path / "new" / "state")
     assert not (tmp_path / "new").exists()
 
 
