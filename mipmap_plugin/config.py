@@ -70,7 +70,7 @@ class AdaptConfig(BaseModel):
     crispness: float = Field(0.0, ge=0, le=1, description="Zoom-in: from 0 (highest PSNR) to 1 (splats as small as the base's, but more opaque).")
     merge_to: float = Field(1.0, gt=0, le=1, description="Fraction of the splats to keep when similar splats that share pixels are merged.")
     merging_costs: float = Field(
-        0.3, ge=0, description="Maximum loss of merging in dB on validation views before the first step; for another renderer 0.6, unless 0."
+        0.3, ge=0, description="Maximum loss of merging in dB on validation views before the first step; for another renderer at least 0.6, unless 0."
     )
     most_splats: int | None = Field(None, gt=0, description="Merge to at most this many splats, whatever it costs, in place of `merge_to`.")
     rates: LearningRates = LearningRates()

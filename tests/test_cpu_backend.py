@@ -355,3 +355,10 @@ def test_without_numba_the_error_says_what_to_install(monkeypatch):
         BACKEND.render(g, camera(), Effects(1))
     with pytest.warns(UserWarning, match="it needs numba; .* until then the backend reference does, many times slower"):
         assert choose_backend("auto", needs)[0].name == "reference"
+
+
+@pytest.mark.filterwarnings("error")
+def test_numba_is_not_missed_where_it_would_not_do(monkeypatch):
+    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: NO_NUMBA)
+    usual = Needs.of(gaussians(2, dtype=torch.float32), Effects(1), gradients=True)
+    assert choose_backend("auto", usual, replace(usual, screen_filter="surfel"))[0].name == "reference"

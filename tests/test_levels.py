@@ -14,6 +14,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, load_model, recipes, wrap_model
+from mipmap_plugin.adaptation.optimization.run import Run
 from mipmap_plugin.adaptation.optimization.validation import Quality
 from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start import candidates
@@ -27,7 +28,7 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.commands.ladders import print_summary
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
-from mipmap_plugin.errors import OutputExists, SceneError, SettingsError
+from mipmap_plugin.errors import OutputError, OutputExists, SceneError, SettingsError
 from mipmap_plugin.evaluation.tradeoff.points import on_backend
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.levels.contents import Contents, LeftOut, Level
@@ -472,6 +473,24 @@ def test_a_ladder_that_failed_before_its_first_level_leaves_nothing(tmp_path, mo
     monkeypatch.setattr(base, "adapt", lambda *_, **__: interrupt())
     with pytest.raises(Interrupted):
         make_levels(base, request(by=by), resume=tmp_path / "new" / "state")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_first_level_that_is_broken_off_before_its_state_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(Run, "start", lambda *_: interrupt())
+    with pytest.raises(Interrupted):
+        make_levels(wrapped(), request(), resume=tmp_path / "new" / "state")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_first_level_whose_state_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
+    def full(*_):
+        raise OutputError("no space")
+
+    monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.save_run", full)
+    monkeypatch.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, task, config, on_interrupt, observe: on_interrupt(run))
+    with pytest.raises(OutputError, match="no space"):
+        make_levels(wrapped(), request(), resume=tmp_path / "new" / "state")
     assert not (tmp_path / "new").exists()
 
 

@@ -24,6 +24,7 @@ from mipmap_plugin.formats.images import data_uri
 from mipmap_plugin.pages.gallery import Gallery
 from mipmap_plugin.pages.html import LARGEST, html, write_page
 from mipmap_plugin.pages.in_viewers import made_for_viewers, viewer_pictures, why_not
+from mipmap_plugin.pages.levels import lead
 from mipmap_plugin.pages.record import Page, Picture, Zoom, zoom_name
 from mipmap_plugin.pages.reports import adaptation_zoom, evaluation_page
 
@@ -272,6 +273,13 @@ def test_the_page_of_levels_has_the_figures_of_their_manifest(model_folder, tmp_
     shown = next(picture for picture in at_switch["pictures"] if picture["name"] == "level shown")
     assert shown["mean"]["psnr_db"] == pytest.approx(switch["psnr_db"]) and shown["note"] == "level_0.ply"
     assert f"at worst {manifest['worst_db']:.1f} dB" in record["lead"]
+
+
+def test_the_lead_of_a_ladder_counts_its_levels():
+    level, curve = dict(splats=1000, bytes=2_000_000), [dict(base_db=20.0)]
+    facts = dict(viewer="classic", curve=curve, worst_db=20.0, mean_db=21.0)
+    assert lead(dict(facts, levels=[level]), "at any zoom").startswith("1 level for classic, 1,000 splats, 2.0 MB: at any zoom at worst 20.0 dB")
+    assert lead(dict(facts, levels=[level, level]), "at any zoom").startswith("2 levels for classic, 2,000 splats, 4.0 MB")
 
 
 def test_viewers_show_the_base_and_the_file_beside_the_truth(monkeypatch):

@@ -32,7 +32,7 @@ SH = 5
 
 
 class CpuBackend:
-    """Renders and differentiates Gaussians on a CPU. numba is imported, and the kernels are compiled, at the first image."""
+    """Renders and differentiates Gaussians on a CPU. numba is imported at the first request that it may serve, and compiles at the first image."""
 
     name = "cpu"
     api_version = API_VERSION

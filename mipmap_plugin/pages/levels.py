@@ -74,6 +74,6 @@ def lead(manifest: dict[str, Any], where: str) -> str:
     splats, megabytes = sum(level["splats"] for level in levels), sum(level["bytes"] for level in levels) / 1e6
     base = min(point["base_db"] for point in curve)
     return (
-        f"{len(levels)} levels for {manifest['viewer']}, {splats:,} splats, {megabytes:.1f} MB: {where} at worst {manifest['worst_db']:.1f} dB, "
-        f"{manifest['mean_db']:.1f} dB on average; the base alone falls to {base:.1f} dB."
+        f"{len(levels)} level{'s' * (len(levels) > 1)} for {manifest['viewer']}, {splats:,} splats, {megabytes:.1f} MB: {where} at worst "
+        f"{manifest['worst_db']:.1f} dB, {manifest['mean_db']:.1f} dB on average; the base alone falls to {base:.1f} dB."
     )

@@ -11,7 +11,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.evaluation.metrics import psnr
 from mipmap_plugin.levels.distance.manifest import Contents
 from mipmap_plugin.levels.distance.walks import focal_of
-from mipmap_plugin.levels.distance.yardstick import Seen, WalkPoint, Walks, places
+from mipmap_plugin.levels.distance.yardstick import Seen, WalkPoint, Walks
 from mipmap_plugin.levels.yardstick import VIEWS
 from mipmap_plugin.pages.gallery import effects_of_base
 from mipmap_plugin.pages.levels import lead, rounded
@@ -25,7 +25,8 @@ def walks_page(title: str, ladder: Contents, manifest: dict[str, Any], commands:
     """The page of a ladder and its manifest (`levels.distance.manifest`): pictures of a walk where it begins, where what is nearest is in the middle
     of each level, and at the end."""
     scene, walks, zooms = ladder.scene, Walks(ladder.scene, [level.model for level in ladder.levels]), dict[float, Zoom]()
-    curve, middles = list(zip(walks.places(), ladder.curve, strict=True)), set(places(scene.rule)[::2])
+    curve = list(zip(walks.places(), ladder.curve, strict=True))
+    middles = {scene.rule.middle(number) for number in range(scene.rule.count + scene.rule.left_out)}
     for size, point in [curve[0], *(each for each in curve if each[0] in middles), curve[-1]]:
         seen = walks.seen(walks.views[0], size)
         if seen.way not in zooms:  # the first levels may end before the walk begins

@@ -67,7 +67,6 @@ def claim(jobs: Sequence[Job], tiles: int) -> None:
         elif folder.exists() and any(folder.iterdir()):
             raise SettingsError(f"{folder} is needed for the tiles, but holds other things; move it, or choose another output")
     for folder, plan in plans.items():
-        folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / PLAN, plan, overwrite=True)
 
 

@@ -80,7 +80,10 @@ def test_a_full_disk_leaves_the_old_output_and_nothing_else(tmp_path, name):
     assert contents(out.parent) != before
 
 
-@pytest.mark.parametrize("words", [["render", "--backend", "reference"], ["tradeoff", "--scale", "1/4", "--recipe", "instant", "--no-picture"]])
+@pytest.mark.parametrize("words", [
+    ["render", "--backend", "reference"], ["tradeoff", "--scale", "1/4", "--recipe", "instant", "--no-picture"],
+    ["adapt", "--scale", "1/4", "--tiles", "2"],
+])  # fmt: skip
 def test_a_full_disk_leaves_no_empty_folders(tmp_path, capsys, words):
     command, *options = words
     base = tiny.folder(tmp_path / "base", tiny.cameras(1, width=8, height=6), count=10)

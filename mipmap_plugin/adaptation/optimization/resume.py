@@ -61,7 +61,11 @@ class StateKeeper:
         except OSError as error:
             warnings.warn(f"{self._requested} cannot be written ({error.strerror}), so that this run could not be resumed", stacklevel=2)
         if not states:
-            return Run.start(student, task, config, spent)
+            try:
+                return Run.start(student, task, config, spent)
+            except BaseException:  # Ctrl-C too: its traceback would hold the lock, so that a folder without a state would stay
+                self._release()
+                raise
         try:
             return load_run(states[0], student, config)
         except (KeyError, IndexError, TypeError, ValueError, AttributeError, RuntimeError) as error:
@@ -101,17 +105,22 @@ class StateKeeper:
     def remaining_file(self) -> StateFile | None:
         """The state file of a run that has ended, which is needed until its model is saved; None if none was written."""
         if self.file is not None and not self.file.path.exists():
-            self.file.release()
+            self._release()
             self.file = None
         return self.file
+
+    def _release(self) -> None:
+        if self.file is not None:
+            self.file.release()
 
     def save_and_stop(self, run: Run) -> NoReturn:
         """Save the state and raise Interrupted. Raises OutputError if the state cannot be written."""
         if self._path is None:
             raise Interrupted(f"interrupted at step {run.step}; nothing was written, because no file to resume from was named")
-        save_run(run, self._path, self._fingerprint)
-        assert self.file is not None  # since `_path` is its path
-        self.file.release()
+        try:
+            save_run(run, self._path, self._fingerprint)
+        finally:
+            self._release()
         raise Interrupted(f"interrupted at step {run.step}; run the same command again to continue from {self._path}")
 
 

@@ -32,7 +32,7 @@ from mipmap_plugin.screen_filters import INTEGRATED
 POWERS = (1, 1 / 2, 1 / 4)
 
 # dB that the mildest may cost before steps for a renderer that draws otherwise than the training did, also where other merging may cost less: fewer
-# splats learn that sooner, and better. Lego at x1/8 gains 0.9 dB for spark, as many with the `thorough` recipe, and 1.0 for three.js, chair 0.8 for
+# splats learn that sooner, and better. Lego at x1/8 gains 0.9 dB for spark, 0.8 with the `thorough` recipe, and 1.0 for three.js, chair 0.8 for
 # three.js; bird has as much with three fifths of its splats. What stronger ones cost does not come back: 0.3 to 1.2 dB of chair, 0.4 of flowers.
 MILD_COSTS = 0.6
 
