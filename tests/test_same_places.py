@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import pytest
 import tiny
 import torch
+from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation import views
 from mipmap_plugin.cli import main
+from mipmap_plugin.models import load_model
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 
 SCALE = 0.125
@@ -78,3 +81,12 @@ def test_a_header_tells_the_vertical_but_for_what_a_program_writes_into_every_fi
     base = tiny.ply(tmp_path / "base.ply")
     base.write_bytes(base.read_bytes().replace(b"element vertex", f"comment {comment}\nelement vertex".encode(), 1))
     assert views.orbit_of(wrap_model(base, backend="reference").model).up == up
+
+
+@pytest.mark.parametrize(
+    ("make", "up"),
+    [(splatfacto_folder, (0.0, 0.0, 1.0)), (gsplat_folder, (0.0, 0.0, 1.0)), (partial(gsplat_folder, normalized="false"), None)],
+    ids=["nerfstudio", "gsplat", "gsplat, as COLMAP has it"],
+)
+def test_a_project_that_turns_its_scenes_tells_the_vertical(tmp_path, make, up):
+    assert views.orbit_of(load_model(make(tmp_path / "r", splats()))).up == up

@@ -139,7 +139,7 @@ def orbit_of(model: SplatModel, means: Tensor | None = None) -> Orbit:
     """
     recorded = adapted_orbit(model.source)
     if recorded is None:
-        return Orbit.around(model.parameters()["means"] if means is None else means, stated_up(model.source))
+        return Orbit.around(model.parameters()["means"] if means is None else means, model.trained.up or stated_up(model.source))
     center, up, distance = recorded
     return Orbit((center[0], center[1], center[2]), (up[0], up[1], up[2]) if up else None, distance)
 

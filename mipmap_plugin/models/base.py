@@ -41,6 +41,7 @@ class TrainedScale:
         background: RGB, 0..1; None: the checkpoint does not say.
         near_plane: Depth up to which splats were not drawn, world units.
         keeps_filter: Files of the family need this filter, so that without a viewer they are for the original project only.
+        up: The vertical of the world, where the project turns its scenes; None: not known.
     """
 
     screen_filter: str = "classic"
@@ -49,6 +50,7 @@ class TrainedScale:
     background: tuple[float, float, float] | None = None
     near_plane: float = NEAR_PLANE
     keeps_filter: bool = False
+    up: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)

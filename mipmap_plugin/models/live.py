@@ -100,9 +100,9 @@ def adopt(model: Any) -> SplatModel:
     tensors = _mapping(tensors["splats"]) if isinstance(tensors.get("splats"), Mapping | torch.nn.ParameterDict) else tensors
     if set(splatfacto.NAMES) <= set(tensors):
         raw = splatfacto.to_parameters(_copied(model, {name: tensors[name] for name in splatfacto.NAMES}))
-        return _adopted(model, raw, TrainedScale(near_plane=splatfacto.NEAR_PLANE), Origin())
+        return _adopted(model, raw, TrainedScale(near_plane=splatfacto.NEAR_PLANE, up=splatfacto.UP), Origin())
     if set(gsplat.NAMES) == set(tensors):
-        return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE), Origin(host=gsplat.GsplatHost()))
+        return _adopted(model, _copied(model, tensors), TrainedScale(near_plane=gsplat.NEAR_PLANE, up=gsplat.UP), Origin(host=gsplat.GsplatHost()))
     content = f" with {', '.join(map(str, list(tensors)[:8]))}" if tensors else ""
     raise SettingsError(f"a {_name(model)}{content} is not a known kind of model; give a path, a GaussianModel, or gsplat's dictionary of splats")
 

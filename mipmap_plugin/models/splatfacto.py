@@ -37,6 +37,9 @@ NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities"
 # World units (models/splatfacto.py passes it to gsplat).
 NEAR_PLANE = 0.01
 
+# nerfstudio turns its scenes so that the cameras' mean vertical is z (`orientation_method: up`).
+UP = (0.0, 0.0, 1.0)
+
 # Background of renders by option `background_color`; after training on "random" colors it is the last one.
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "random": (0.1490, 0.1647, 0.2157)}
 
@@ -126,7 +129,7 @@ def load_splatfacto(path: str | Path, *, iteration: int | None = None) -> Vanill
     origin = Origin(checkpoint.path, sha256(checkpoint.path), checkpoint.folder, checkpoint.iteration, comments, host=host)
     antialiased = "antialiased" if options.get("rasterize_mode") == "antialiased" else "classic"
     background = BACKGROUNDS.get(str(options.get("background_color")))
-    trained = as_tagged(TrainedScale(antialiased, background=background, near_plane=NEAR_PLANE), comments)
+    trained = as_tagged(TrainedScale(antialiased, background=background, near_plane=NEAR_PLANE, up=UP), comments)
     try:
         model = VanillaModel(to_parameters(stored), trained, origin, _unusual_options(content["pipeline"], options))
     except (ShapeError, RuntimeError, IndexError) as error:  # what torch raises for a tensor with too few axes

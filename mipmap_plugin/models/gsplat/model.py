@@ -35,6 +35,9 @@ NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
 # World units, the trainer's default.
 NEAR_PLANE = 0.01
 
+# simple_trainer turns its scenes so that they are least extended along z, and most points lie low (`normalize_world_space`).
+UP = (0.0, 0.0, 1.0)
+
 UNKNOWN = (
     "cfg.yml is not beside the checkpoint, so that it is taken to be trained with the classic screen filter, and not by the trainer of flat"
     " splats (2DGS), whose files look the same; if it was trained antialiased, say so (--screen-filter antialiased)"
@@ -189,7 +192,8 @@ def _options(folder: Path | None) -> tuple[dict[str, Any], list[str]]:
 def _trained(options: dict[str, Any]) -> TrainedScale:
     antialiased = "antialiased" if options.get("antialiased") else "classic"
     resolution, near = _positive(options, "data_factor", TrainedScale.resolution), _positive(options, "near_plane", NEAR_PLANE)
-    return TrainedScale(antialiased, resolution=resolution, near_plane=near)
+    up = UP if options.get("normalize_world_space", True) else None
+    return TrainedScale(antialiased, resolution=resolution, near_plane=near, up=up)
 
 
 def _positive(options: dict[str, Any], key: str, default: float) -> float:
