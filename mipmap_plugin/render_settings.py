@@ -83,7 +83,7 @@ class RenderSettings:
     min_contribution: float = 0.0  # px², after dilation: splats whose opacity · sqrt(det) is less are culled,
     rooted: bool = False  # or, if this is set, whose sqrt(opacity · det) is less
     least_spread: float = 0.0  # px², after dilation: minimum distance of variances from their mean; splats whose smaller one becomes 0 are culled
-    max_half_axis: float = math.inf  # px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat is shrunk
+    max_half_axis: float = math.inf  # px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat shrinks before
     fits_picture: bool = False  # half-axes are also limited to the picture's shorter side
     packing: Packing | None = None  # quantization of splats in memory
     frozen_beyond: float = FRUSTUM_MARGIN  # where the Jacobian is frozen; infinity: nowhere

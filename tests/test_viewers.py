@@ -247,6 +247,16 @@ def test_webgpu_makes_the_whole_splat_smaller(backend):
 
 
 @BOTH
+def test_webgpu_shortens_the_axis_of_a_smaller_splat_that_lies_askew(backend):
+    # Of 452 px² across and down, 21²/8 are left; 110 px² along the axis are still longer than the picture.
+    rendered, end = alpha(backend, "playcanvas-webgpu", splat(900.0, 4.0, 0.8, turn=math.pi / 4)), math.exp(-4)
+    share = SIZE**2 / 8 / 452.075
+    for x, y in ((3, 3), (5, 5), (1, 1)):
+        whole = weight(math.hypot(x, y), 0, SIZE**2 / 8, 4.075 * share) / 0.8
+        assert rendered[MIDDLE + y, MIDDLE + x].item() == pytest.approx(0.8 * (whole - end) / (1 - end), abs=1e-5)
+
+
+@BOTH
 def test_a_half_axis_at_its_limit_has_no_gradient(backend):
     leaves, splats = differentiable(splat(900.0, 4.0, 0.8))
     alpha(backend, "playcanvas", splats)[MIDDLE + 2, MIDDLE + 4].backward()

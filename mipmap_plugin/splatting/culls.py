@@ -63,21 +63,25 @@ def stretched(shape: tuple[Tensor, Tensor, Tensor, Tensor], drawn: Tensor, least
 
 
 def limited(shape: tuple[Tensor, Tensor, Tensor, Tensor], most: float, whole: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Clamp the variances along each splat's axes to `most` px². `whole`: scale the splat uniformly until its variances along x and y fit.
+    """Clamp the variances along each splat's axes to `most` px². `whole`: shrink the splat before, until its variances along x and y fit.
 
     A change of a matrix M's eigenvalues that keeps its eigenvectors is a·M + b·1 (Cayley and Hamilton). For variances
     long > most > short: a = (most - short) / (long - short), b = short · (long - most) / (long - short), sums without cancellation.
     """
-    xx, xy, yy, det = shape
-    if whole:
-        a, b = most / torch.maximum(xx, yy).clamp_min(most), torch.zeros_like(xx)
-    else:
-        long = (xx + yy) / 2 + spread(shape)
-        short = det / torch.where(long > 0, long, 1.0)
-        one, both = (long > most) & (short < most), (long > most) & (short >= most)
-        apart = torch.where(one, long - short, 1.0)
-        a = torch.where(one, (most - short) / apart, torch.where(both, 0.0, 1.0))
-        b = torch.where(one, short * (long - most) / apart, torch.where(both, most, 0.0))
+    xx, xy, yy, det = shape = _shrunk(shape, most) if whole else shape
+    long = (xx + yy) / 2 + spread(shape)
+    short = det / torch.where(long > 0, long, 1.0)
+    one, both = (long > most) & (short < most), (long > most) & (short >= most)
+    apart = torch.where(one, long - short, 1.0)
+    a = torch.where(one, (most - short) / apart, torch.where(both, 0.0, 1.0))
+    b = torch.where(one, short * (long - most) / apart, torch.where(both, most, 0.0))
     new = a * xx + b, a * xy, a * yy + b, a.square() * det + a * b * (xx + yy) + b.square()
     changed = (a < 1) | (b > 0)
     return tuple(torch.where(changed, limit, old) for limit, old in zip(new, shape, strict=True))  # type: ignore[return-value]
+
+
+def _shrunk(shape: tuple[Tensor, Tensor, Tensor, Tensor], most: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The shapes, shrunk until the variances along x and y are at most `most` px²; one that lies askew may still be longer along its axis."""
+    xx, xy, yy, det = shape
+    factor = most / torch.maximum(xx, yy).clamp_min(most)
+    return factor * xx, factor * xy, factor * yy, factor.square() * det

@@ -113,9 +113,19 @@ def grad_stretched(view, shape, changed, d_shape):
 
 @inner
 def limited(view, shape):
-    """The shapes, with variances clamped to `max_variance`: a·shape + b·1."""
+    """The shapes, with variances clamped to `max_variance`: a·shape + b·1; a boxed view shrinks whole splats before."""
+    if view.boxed:
+        shape = shrunk(view, shape)
     a, b, _, _, _ = coefficients(view, shape)
     return affine(shape, a, b)
+
+
+@inner
+def shrunk(view, shape):
+    """The shapes, shrunk until their variances along x and y fit."""
+    xx, _, yy, _ = shape
+    larger = maximum(xx, yy)
+    return affine(shape, select(larger > view.max_variance, view.max_variance / larger, 1.0), xx * 0)
 
 
 @inner
@@ -130,12 +140,10 @@ def coefficients(view, shape):
     """The factors a and b of `limited`; where only the longer axis is clamped; and the variances along both axes."""
     xx, xy, yy, det = shape
     max_variance, half = view.max_variance, 0.5 * (xx - yy)
-    long = maximum(xx, yy) if view.boxed else 0.5 * (xx + yy) + sqrt(half * half + xy * xy)
+    long = 0.5 * (xx + yy) + sqrt(half * half + xy * xy)
     short = det / long
     too_long = long > max_variance
     zero = xx * 0
-    if view.boxed:
-        return select(too_long, max_variance / long, 1.0), zero, too_long, long, short
     one_axis = both(too_long, short < max_variance)
     per_difference = 1 / select(one_axis, long - short, 1.0)
     a = select(one_axis, (max_variance - short) * per_difference, select(too_long, zero, 1.0))
@@ -145,6 +153,28 @@ def coefficients(view, shape):
 @inner
 def grad_limited(view, shape, d_limited):
     """The gradient of a shape before `limited`."""
+    if view.boxed:
+        return grad_shrunk(view, shape, grad_clamped(view, shrunk(view, shape), d_limited))
+    return grad_clamped(view, shape, d_limited)
+
+
+@inner
+def grad_shrunk(view, shape, d_shrunk):
+    """The gradient of a shape before `shrunk`."""
+    xx, xy, yy, det = shape
+    d_xx, d_xy, d_yy, d_det = d_shrunk
+    larger = maximum(xx, yy)
+    too_large = larger > view.max_variance
+    factor = select(too_large, view.max_variance / larger, 1.0)
+    d_factor = d_xx * xx + d_xy * xy + d_yy * yy + d_det * (2 * factor * det)
+    d_larger = select(too_large, 0 - d_factor * factor / larger, 0.0)
+    d_xx, d_yy = factor * d_xx + select(xx >= yy, d_larger, 0.0), factor * d_yy + select(xx >= yy, 0.0, d_larger)
+    return d_xx, factor * d_xy, d_yy, factor * factor * d_det
+
+
+@inner
+def grad_clamped(view, shape, d_limited):
+    """The gradient of a shape before its variances are clamped along its axes."""
     xx, xy, yy, det = shape
     d_xx, d_xy, d_yy, d_det = d_limited
     max_variance, half = view.max_variance, 0.5 * (xx - yy)
@@ -152,9 +182,6 @@ def grad_limited(view, shape, d_limited):
     d_a = d_xx * xx + d_xy * xy + d_yy * yy + d_det * (2 * a * det + b * (xx + yy))
     d_b = d_xx + d_yy + d_det * (a * (xx + yy) + 2 * b)
     d_xx, d_xy, d_yy, d_det = a * (d_xx + b * d_det), a * d_xy, a * (d_yy + b * d_det), a * a * d_det
-    if view.boxed:
-        d_long = select(one_axis, 0 - d_a * a / long, 0.0)
-        return d_xx + select(xx >= yy, d_long, 0.0), d_xy, d_yy + select(xx >= yy, 0.0, d_long), d_det
     per_difference = 1 / select(one_axis, long - short, 1.0)
     d_short = select(one_axis, (d_b * long - d_a) * (long - max_variance) * per_difference * per_difference, 0.0)
     d_long = select(one_axis, (d_b * short - d_a) * a * per_difference, 0.0) - d_short * short / long

@@ -107,21 +107,31 @@ def stretched_back(view, xx, xy, yy, drawn, d_xx, d_xy, d_yy, d_det):
 @triton.jit
 def coefficients(view, xx, xy, yy, det):
     """The factors a and b of `limited`, a·shape + b·1; where only the longer axis is clamped; and the variances along both axes."""
-    most, boxed = tl.load(view + MAX_VARIANCE), tl.load(view + BOXED) > 0
-    long = tl.where(boxed, tl.maximum(xx, yy), 0.5 * (xx + yy) + spread_of(xx, xy, yy))
+    most = tl.load(view + MAX_VARIANCE)
+    long = 0.5 * (xx + yy) + spread_of(xx, xy, yy)
     short = det / long
     too_long = long > most
-    one_axis = tl.where(boxed, too_long, too_long & (short < most))
+    one_axis = too_long & (short < most)
     most = tl.where(too_long, most, 0.0)  # which may be infinite
     per_difference = 1 / tl.where(one_axis & (long > short), long - short, 1.0)
-    a = tl.where(boxed, most / long, tl.where(one_axis, (most - short) * per_difference, 0.0))
-    b = tl.where(boxed, 0.0, tl.where(one_axis, short * (long - most) * per_difference, most))
+    a = tl.where(one_axis, (most - short) * per_difference, 0.0)
+    b = tl.where(one_axis, short * (long - most) * per_difference, most)
     return tl.where(too_long, a, 1.0), tl.where(too_long, b, 0.0), one_axis, long, short, per_difference
 
 
 @triton.jit
+def shrinking(view, xx, yy):
+    """The factor by which a boxed view shrinks whole splats until their variances along x and y fit."""
+    most, larger = tl.where(tl.load(view + BOXED) > 0, tl.load(view + MAX_VARIANCE), float("inf")), tl.maximum(xx, yy)
+    too_large = larger > most
+    return tl.where(too_large, tl.where(too_large, most, 0.0) / larger, 1.0), too_large, larger
+
+
+@triton.jit
 def limited(view, xx, xy, yy, det):
-    """The shapes, with the variances along their axes clamped to the largest; a boxed view shrinks the whole splat instead."""
+    """The shapes, with the variances along their axes clamped to the largest; a boxed view shrinks whole splats before."""
+    factor, _too_large, _larger = shrinking(view, xx, yy)
+    xx, xy, yy, det = factor * xx, factor * xy, factor * yy, factor * factor * det
     a, b, _one_axis, _long, _short, _per_difference = coefficients(view, xx, xy, yy, det)
     return a * xx + b, a * xy, a * yy + b, a * a * det + a * b * (xx + yy) + b * b
 
@@ -129,16 +139,24 @@ def limited(view, xx, xy, yy, det):
 @triton.jit
 def limited_back(view, xx, xy, yy, det, d_xx, d_xy, d_yy, d_det):
     """The gradient of a shape before `limited`."""
-    boxed = tl.load(view + BOXED) > 0
+    factor, too_large, larger = shrinking(view, xx, yy)
+    d_xx, d_xy, d_yy, d_det = clamped_back(view, factor * xx, factor * xy, factor * yy, factor * factor * det, d_xx, d_xy, d_yy, d_det)
+    d_factor = d_xx * xx + d_xy * xy + d_yy * yy + d_det * (2 * factor * det)
+    d_larger = tl.where(too_large, -d_factor * factor / larger, 0.0)
+    d_xx, d_yy = factor * d_xx + tl.where(xx >= yy, d_larger, 0.0), factor * d_yy + tl.where(xx >= yy, 0.0, d_larger)
+    return d_xx, factor * d_xy, d_yy, factor * factor * d_det
+
+
+@triton.jit
+def clamped_back(view, xx, xy, yy, det, d_xx, d_xy, d_yy, d_det):
+    """The gradient of a shape before its variances are clamped along its axes."""
     a, b, one_axis, long, short, per_difference = coefficients(view, xx, xy, yy, det)
     over_most = tl.where(one_axis, long - tl.load(view + MAX_VARIANCE), 0.0)
     d_a = d_xx * xx + d_xy * xy + d_yy * yy + d_det * (2 * a * det + b * (xx + yy))
     d_b = d_xx + d_yy + d_det * (a * (xx + yy) + 2 * b)
     d_xx, d_xy, d_yy, d_det = a * (d_xx + b * d_det), a * d_xy, a * (d_yy + b * d_det), a * a * d_det
-    d_short = tl.where(boxed, 0.0, (d_b * long - d_a) * over_most * per_difference * per_difference)
-    d_long = tl.where(one_axis, tl.where(boxed, -d_a * a / long, (d_b * short - d_a) * a * per_difference - d_short * short / long), 0.0)
+    d_short = (d_b * long - d_a) * over_most * per_difference * per_difference
+    d_long = tl.where(one_axis, (d_b * short - d_a) * a * per_difference - d_short * short / long, 0.0)
     d_spread = tl.where(one_axis, 2 * d_long * per_difference, 0.0)
     d_half = d_spread * 0.25 * (xx - yy)
-    along_x = tl.where(boxed, tl.where(xx >= yy, d_long, 0.0), 0.5 * d_long + d_half)
-    along_y = tl.where(boxed, tl.where(xx >= yy, 0.0, d_long), 0.5 * d_long - d_half)
-    return d_xx + along_x, d_xy + tl.where(boxed, 0.0, d_spread * xy), d_yy + along_y, d_det + d_short / long
+    return d_xx + 0.5 * d_long + d_half, d_xy + d_spread * xy, d_yy + 0.5 * d_long - d_half, d_det + d_short / long
