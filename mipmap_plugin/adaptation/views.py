@@ -52,7 +52,6 @@ UNLIKE = 3.0
 SEEN, CLEAR = 3, 2
 
 
-
 class ViewSchedule:
     """The views that each step uses. It has no state, so that a run can be resumed at any step."""
 
