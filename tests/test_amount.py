@@ -19,6 +19,7 @@ from mipmap_plugin.adaptation.optimization.amount import (
     as_taken,
     splats_in_view,
 )  # fmt: skip
+from mipmap_plugin.adaptation.optimization.validation import MIN_VIEWS
 from mipmap_plugin.models.base import Traits
 from mipmap_plugin.recipes import MOST_DRAWS, recipe
 
@@ -65,6 +66,16 @@ def test_a_time_budget_bounds_the_moments_of_a_moving_scene_alike_on_each_machin
     assert budgets == [LEAST_IN_BUDGET, 6, 24]
     still = SimpleNamespace(traits=Traits(), parameters=base.parameters)
     assert affordable_moments(recipe("default", 1 / 4, time_budget_s=1.0), still) == 24
+
+
+@pytest.mark.parametrize(("seconds", "views"), [(0.5, MIN_VIEWS), (2.0, 10), (1e4, 16)])
+def test_a_time_budget_bounds_the_views_for_validation_alike_on_each_machine(seconds, views):
+    base = SimpleNamespace(traits=Traits(), parameters=lambda: {"means": torch.tensor([[0.0, 0.0, 2.0]]).expand(20_000, 3)})
+    view, asked = replace(tiny.cameras(1)[0], viewmat=torch.eye(4)), recipe("default", 1 / 4, time_budget_s=seconds)
+    taken = affordable_for_model(asked, base, [view], near=0.2)
+    assert taken.validation_views == views == affordable_for_model(asked, base, [], near=0.2).validation_views
+    assert as_taken(asked, taken) == taken
+    assert affordable_for_model(recipe("default", 1 / 4, steps=9), base, [view], near=0.2).validation_views == 16
 
 
 def test_steps_that_somebody_asks_for_are_taken():

@@ -7,6 +7,7 @@ import tiny
 import torch
 
 from mipmap_plugin.adaptation.optimization.estimate import Costs
+from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.candidates import _Clock
 from mipmap_plugin.process.clock import now
 
@@ -42,3 +43,12 @@ def test_a_start_counts_the_work_of_a_gpu(waited):
     with clock.timing("weights"):
         pass
     assert clock.allows("weights") and waited == [GPU] * 4
+
+
+def test_a_start_expects_a_candidate_of_fewer_splats_to_take_less_time(monkeypatch):
+    seconds = iter([0.0, 0.0, 2.0, 2.0, 2.0])  # of a candidate of half of the splats, in a start of three
+    monkeypatch.setattr(candidates, "now", lambda device: next(seconds))
+    clock = _Clock(3.0, torch.device("cpu"))
+    with clock.timing("candidate", 0.5):
+        pass
+    assert clock.allows("candidate", 0.25) and not clock.allows("candidate", 0.3)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import torch
 
+from mipmap_plugin.adaptation.optimization.validation import MIN_VIEWS
 from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.effects import Effects
@@ -26,6 +27,10 @@ DRAWS_A_SECOND = 3e6
 # 32.5 dB on views and moments held out with 24, 12 and 6 moments, and loses 0.8 dB with half of the steps. In a time budget steps are worth more.
 FOR_MOMENTS, ROUNDS, LEAST_MOMENTS = 1 / 2, 5, 6
 FOR_MOMENTS_IN_BUDGET, LEAST_IN_BUDGET = 1 / 6, 2
+
+# Splats in all views for validation, for each second of a time budget: a view is drawn by many checks, or in every state that is chosen from. Sixteen
+# views, as without a budget, take a quarter of a run of two seconds, which costs lego and chair 0.6 dB.
+VALIDATED_A_SECOND = 1e5
 
 # The base is drawn so many times finer than the target at most.
 OVERSAMPLING = 3
@@ -64,7 +69,14 @@ def takes_steps(config: AdaptConfig, scale: float, base: Effects, targets: Itera
 
 
 def affordable_for_model(config: AdaptConfig, base: SplatModel, views: Sequence[Camera], near: float) -> AdaptConfig:
-    """`affordable_for` a model's splats; of one that moves, what its moments take is no longer there for steps."""
+    """`affordable_for` a model's splats; of one that moves, what its moments take is no longer there for steps.
+
+    In a time budget, which has its own steps, there are as many views for validation as it allows.
+    """
+    if config.time_budget_s is not None:
+        means = base.parameters()["means"]
+        most = VALIDATED_A_SECOND * config.time_budget_s / max(1.0, splats_in_view(means, views, near) if views else len(means))
+        config = config.model_copy(update={"validation_views": min(config.validation_views, max(MIN_VIEWS, int(most)))})
     if config.most_draws is None or not (base.traits.moves or base.traits.same_for_all_views):
         return config
     moments = ROUNDS * (affordable_moments(config, base) or 0) * _evaluation(base)
@@ -108,6 +120,8 @@ def as_taken(config: AdaptConfig, taken: AdaptConfig) -> AdaptConfig:
     """
     if config.resize == "fitting":
         config = config.model_copy(update={"resize": taken.resize})
+    if config.time_budget_s is not None and taken.validation_views >= MIN_VIEWS:
+        config = config.model_copy(update={"validation_views": min(config.validation_views, taken.validation_views)})
     if config.most_draws is None or not LEAST_FRACTION * config.steps <= taken.steps < config.steps:
         return config
     least, most = (_fewer(config, steps / config.steps) for steps in (taken.steps - 1, taken.steps))

@@ -137,17 +137,17 @@ class StartSearch:
         that gains, and the base as it is looks better still, a stronger one may be better than both.
         """
         for power in COARSE_POWERS if coarse_bounds else ():
-            if not self._clock.allows("candidate"):
+            if not self._clock.allows("candidate", self._fraction(power)):
                 break
             coarse, quality = self._tried(weights, power, coarsely=True)
             if coarse_bounds and coarse_bounds.hold_for(quality):
                 return coarse
-        if not self._clock.allows("candidate"):
+        if not self._clock.allows("candidate", self._fraction(POWERS[-1])):
             return None
         mildest, quality = self._tried(weights, POWERS[-1])
         suits = bounds.hold_for(quality, self._more_costs)
         for power in POWERS[:-1] if suits or quality.psnr >= bounds.formed else ():
-            if not self._clock.allows("candidate"):
+            if not self._clock.allows("candidate", self._fraction(power)):
                 break
             merged, quality = self._tried(weights, power)
             if bounds.hold_for(quality):
@@ -156,8 +156,14 @@ class StartSearch:
 
     def _tried(self, weights: Tensor | None, power: float, coarsely: bool = False) -> tuple[SplatModel, Quality]:
         """A candidate and its quality."""
-        candidate = self._candidate(weights, max(self._least, self._problem.config.merge_to**power), coarsely)
-        return candidate, self._problem.quality(candidate)
+        fraction = self._fraction(power)
+        with self._clock.timing("candidate", fraction):
+            candidate = self._candidate(weights, fraction, coarsely)
+            return candidate, self._problem.quality(candidate)
+
+    def _fraction(self, power: float) -> float:
+        """Of the splats, that is left by a power of `merge_to`."""
+        return max(self._least, math.pow(self._problem.config.merge_to, power))
 
     def _coarse_bounds(self, bounds: Bounds, finer: Quality) -> Bounds | None:
         """The bounds of a coarsely merged candidate; None where there are none of these. `finer`: the quality of the finer level."""
@@ -269,11 +275,11 @@ class _Clock:
         self._end = now(device) + seconds
 
     @contextmanager
-    def timing(self, work: str) -> Iterator[None]:
+    def timing(self, work: str, amount: float = 1.0) -> Iterator[None]:
         began = now(self._device)
         yield
-        self._took[work] = now(self._device) - began
+        self._took[work] = (now(self._device) - began) / amount
 
-    def allows(self, work: str, times: int = 1) -> bool:
-        """Whether there is time to do a work again, as long as the last time."""
-        return now(self._device) + times * self._took.get(work, 0.0) <= self._end
+    def allows(self, work: str, amount: float = 1.0) -> bool:
+        """Whether there is time for an amount of a work, each unit of which takes as long as the last time."""
+        return now(self._device) + amount * self._took.get(work, 0.0) <= self._end
