@@ -45,6 +45,10 @@ LEAST_ZOOM_IN = 1.1
 # What a run ends by at the user's wish: then `most_draws` does not, and there are steps at any zoom.
 ENDS = ("steps", "time_budget_s", "target_db")
 
+# A time budget mostly leaves too few steps to make a crisp start as good as a soft one: with half of the crispness photographs of lego and chair gain
+# 1 dB in a second, 0.6 in two, and lose none in four, at x2 and x4.
+CRISPNESS_IN_BUDGET = 0.5
+
 # In a time budget with room for more, 720 steps gain 0.6 dB on lego at x1/4, and 1440 1.2 dB.
 DEFAULT_OUT = dict(
     steps=360, most_steps=2500, most_draws=MOST_DRAWS, loss="psnr", decay=0.02, betas=(0.9, 0.95), nesterov=True, truth_oversampling=4,
@@ -128,6 +132,8 @@ def recipe(name: str, scale: float, **overrides: Any) -> AdaptConfig:
         asked = all(each["loc"][0] in overrides for each in error.errors())
         told = dict.fromkeys(_told(each, given) for each in error.errors())  # of a pair, whose parts may both be wrong, once
         raise SettingsError(f"{'' if asked else f'recipe {name}: '}{'; '.join(told)}") from None
+    if config.time_budget_s is not None and "crispness" not in overrides:
+        config = config.model_copy(update={"crispness": CRISPNESS_IN_BUDGET * config.crispness})
     if config.band != (1, 1) and scale * config.band[1] > HIGHEST:
         raise SettingsError(f"band: x{scale:g} would be shown up to x{scale * config.band[1]:g}, but a band ends at the base's scale, x1")
     return config
