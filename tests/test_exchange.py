@@ -415,8 +415,10 @@ def test_real_splats_survive_each_format(shared_data, tmp_path, ending):
     base, path = load_model(shared_data / "checkpoints/yashica-t4/yashica-t4-top8192.ply"), tmp_path / f"a.{ending}"
     try:
         refuse_exchange(path)
-    except SettingsError as old:
-        pytest.skip(str(old))
+    except SettingsError as error:
+        if "is too old for it" not in str(error):
+            raise
+        pytest.skip(str(error))
     saved = base.save(path, provenance={})
     assert (agree(base, load_model(saved), nearest=True) > 0.95).all()
 

@@ -69,20 +69,22 @@ def takes_steps(config: AdaptConfig, scale: float, base: Effects, targets: Itera
 
 
 def affordable_for_model(config: AdaptConfig, base: SplatModel, views: Sequence[Camera], near: float) -> AdaptConfig:
-    """`affordable_for` a model's splats; of one that moves, what its moments take is no longer there for steps.
-
-    In a time budget, which has its own steps, there are as many views for validation as it allows.
-    """
-    if config.time_budget_s is not None:
-        means = base.parameters()["means"]
-        most = VALIDATED_A_SECOND * config.time_budget_s / max(1.0, splats_in_view(means, views, near) if views else len(means))
-        config = config.model_copy(update={"validation_views": min(config.validation_views, max(MIN_VIEWS, int(most)))})
+    """`affordable_for` a model's splats, and `validated_in_budget`; of one that moves, what its moments take is no longer there for steps."""
+    config = validated_in_budget(config, base.parameters()["means"], views, near)
     if config.most_draws is None or not (base.traits.moves or base.traits.same_for_all_views):
         return config
     moments = ROUNDS * (affordable_moments(config, base) or 0) * _evaluation(base)
     left = config.model_copy(update={"most_draws": max(config.most_draws - moments, (1 - FOR_MOMENTS) * config.most_draws)})
     fewer = affordable_for(left, base.parameters()["means"], views, near)
     return fewer.model_copy(update={"most_draws": config.most_draws})
+
+
+def validated_in_budget(config: AdaptConfig, means: torch.Tensor, views: Sequence[Camera], near: float) -> AdaptConfig:
+    """The settings with as many views for validation as a time budget allows for splats at `means` [N, 3]; without views all of them count."""
+    if config.time_budget_s is None:
+        return config
+    most = VALIDATED_A_SECOND * config.time_budget_s / max(1.0, splats_in_view(means, views, near) if views else len(means))
+    return config.model_copy(update={"validation_views": min(config.validation_views, max(MIN_VIEWS, int(most)))})
 
 
 def affordable_for(config: AdaptConfig, means: torch.Tensor, views: Sequence[Camera], near: float) -> AdaptConfig:
@@ -114,7 +116,7 @@ def _fewer(config: AdaptConfig, fraction: float) -> AdaptConfig:
 
 
 def as_taken(config: AdaptConfig, taken: AdaptConfig) -> AdaptConfig:
-    """What `affordable` and `fitting` make of the settings for the scene of which they made `taken`, if they did so of the same settings.
+    """What `affordable`, `validated_in_budget` and `fitting` make of the settings for the scene of which they made `taken`, if of the same settings.
 
     The fraction is known by the steps, which are rounded up, and so the extra views up to one or a few.
     """
