@@ -30,7 +30,7 @@ from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.limits import check_image, check_kinds, check_scale
+from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
@@ -40,6 +40,7 @@ from mipmap_plugin.process import threads
 from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.recipes import recipe as make_config
 from mipmap_plugin.scenes import Scene
+from mipmap_plugin.scenes.trajectories import Orbit
 from mipmap_plugin.screen_filters import DILATION, USUAL_EPS2D
 from mipmap_plugin.splatting.filters import INTEGRALS
 from mipmap_plugin.splatting.viewers import find_viewer, own_name, viewers_for
@@ -133,8 +134,7 @@ class FrozenBase:
         [camera], outputs = checked([camera]), options.get("outputs") or ()
         if isinstance(outputs, str):
             raise SettingsError(f"outputs must be a sequence of names, such as [{outputs!r}], got {outputs!r}")
-        if unknown := options.keys() - RenderOptions.__annotations__.keys():
-            raise TypeError(f"render() got unknown options: {', '.join(sorted(unknown))}; there are {', '.join(RenderOptions.__annotations__)}")
+        check_names("render", options, RenderOptions)
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
         scale = check_scale(scale)
         if not isinstance(supersampling, SupportsIndex) or supersampling < 1:
@@ -203,7 +203,7 @@ class FrozenBase:
             raise SettingsError(f"start: x{start.scale:g} is not finer than x{scale:g}; leave it out")
         base_in_viewer = model if (in_viewer := self.read_by(viewer)) is self.model else in_viewer
         base_images = self._base_images(model, backend, self.keeps_images or first is not None)
-        request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs)
+        request = AdaptationRequest(base_images, targets, viewer, note, has_gradients, base_in_viewer, start, inputs, self.trained.up)
         family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
         alone = threads.limited_for(backend, self.threads)
         with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
@@ -270,7 +270,11 @@ class FrozenBase:
     @usual_modes()
     def views(self) -> list[Camera]:
         """The checkpoint's cameras, or a generated orbit, for an adapted file that of its base, if it came without any."""
-        return self.cameras or choose_views([], orbit_of(self.model), AdaptConfig())[0]
+        return self.cameras or choose_views([], self.orbit(), AdaptConfig())[0]
+
+    def orbit(self) -> Orbit:
+        """What views without cameras go around. Raises SettingsError without splats."""
+        return orbit_of(self.model, self.trained.up)
 
     def refuse_undrawn(self, views: Sequence[Camera] | None = None) -> None:
         """Raise SettingsError if none of the views, by default the base's own, shows anything of it (`refuse_blind`)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.errors import SettingsError
@@ -40,6 +40,12 @@ def check_kinds(**given: tuple[Any, Any]) -> None:
     for name, (value, kind) in given.items():
         if value is not None and not isinstance(value, kind):
             raise SettingsError(f"{name} must be a {getattr(kind, '__name__', kind)}, got {type(value).__name__}")
+
+
+def check_names(function: str, options: Mapping[str, Any], kind: type) -> None:
+    """Raise TypeError for options that are not among those of `kind`, a TypedDict, as Python does for arguments that a function lacks."""
+    if unknown := options.keys() - kind.__annotations__.keys():
+        raise TypeError(f"{function}() got unknown options: {', '.join(sorted(unknown))}; there are {', '.join(kind.__annotations__)}")
 
 
 def derived_seed(seed: int, number: int) -> int:

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
+from warnings import warn
 
 from mipmap_plugin.adaptation.adapted import Adapted as Adapted
 from mipmap_plugin.adaptation.cameras_of_base import own_cameras, where
@@ -19,17 +20,29 @@ from mipmap_plugin.camera import Camera, digest_of, of_base_scale
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.frozen_base import RenderOptions as RenderOptions
-from mipmap_plugin.limits import check_background
+from mipmap_plugin.limits import check_background, check_names
 from mipmap_plugin.models import load_model
+from mipmap_plugin.models.adapted_scale import known_up
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.inria_folder import read_options
 from mipmap_plugin.models.live import adopt
 from mipmap_plugin.process.torch_modes import usual_modes
 from mipmap_plugin.scenes import Scene
+from mipmap_plugin.scenes.trajectories import AXES
 from mipmap_plugin.screen_filters import USUAL_EPS2D
 
 if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
     from mipmap_plugin.levels.finished import Ladder
+
+
+class WrapOptions(TypedDict, total=False):
+    """What is said of a checkpoint, where its files do not say it. None: as they say, or as is usual."""
+
+    background: tuple[float, float, float] | None  # linear RGB; else black
+    screen_filter: str | None  # that it was trained with: "classic", "antialiased", "mip", "analytic"; else classic
+    up: str | None  # the axis that is up, for views that are generated: "x", "y", "z", "-x", "-y", "-z"; else these look from all around
 
 
 class Wrapped(FrozenBase):
@@ -50,9 +63,8 @@ def wrap_model(
     *,
     cameras: Sequence[Camera] | Scene | None = None,
     backend: str = "auto",
-    background: tuple[float, float, float] | None = None,
-    screen_filter: str | None = None,
     threads: int | None = None,
+    **options: Unpack[WrapOptions],
 ) -> Wrapped:
     """Wrap a loaded model, the checkpoint at a path, or another project's live model, which is copied (`models.live.adopt`).
 
@@ -60,25 +72,38 @@ def wrap_model(
 
     `cameras`: views of the scale of its training, or the scene that it was trained on; by default those beside the checkpoint, or
     those of the base of an adapted file.
-    `background`: linear RGB; by default that of the checkpoint, or else black. `screen_filter`: the filter that it was trained with, if
-    its files do not say ("classic", "antialiased", "mip", "analytic"). `threads`: to adapt with; by default as many as torch
-    has. With the backend cpu the result does not depend on it. Raises CheckpointError, SceneError, and SettingsError for an unknown filter
-    or an object that is not a model.
+    `threads`: to adapt with; by default as many as torch has. With the backend cpu the result does not depend on it.
+    `options`: `background`, linear RGB, by default that of the checkpoint, or else black; `screen_filter`, that it was trained with, if its
+    files do not say ("classic", "antialiased", "mip", "analytic"); `up`, the axis that is up ("z", "-y", ...), if they do not say: views that
+    are generated, as there are no cameras, then look from above the horizon. Raises CheckpointError, SceneError, and SettingsError for an
+    unknown filter or axis, or an object that is not a model.
     """
+    check_names("wrap_model", options, WrapOptions)
+    background, screen_filter, up = options.get("background"), options.get("screen_filter"), options.get("up")
     color = None if background is None else check_background(background)
     began = time.perf_counter()
     model = _loaded(model, backend) if isinstance(model, (str, Path)) else adopt(model)
     loading_s = time.perf_counter() - began
-    trained = replace(model.trained, background=color or model.trained.background)
+    vertical = known_up(model.source, model.trained.up) if up is None else axis_of(up)
+    trained = replace(model.trained, background=color or model.trained.background, up=vertical)
     if screen_filter is not None:
         if not isinstance(screen_filter, str) or screen_filter not in USUAL_EPS2D:
             raise SettingsError(f"there is no screen filter {screen_filter!r}; choose from {', '.join(USUAL_EPS2D)}")
         trained = replace(trained, screen_filter=screen_filter, eps2d=USUAL_EPS2D[screen_filter])
     found, read_from = _found(model, cameras)
     given = found.cameras if isinstance(found, Scene) else found
+    if up is not None and given:
+        warn(f"up {up}: there are cameras, whose views are taken; it is of use only where an orbit is asked for (views 'orbit')", stacklevel=3)
     wrapped = Wrapped(model, placed(model, found).cameras if isinstance(found, Scene) else given, backend, trained, threads)
-    wrapped.loading_s, wrapped.asked, wrapped.cameras_from = loading_s, asked_for(model.folder, given, color, screen_filter), read_from
+    wrapped.loading_s, wrapped.asked, wrapped.cameras_from = loading_s, asked_for(model.folder, given, color, screen_filter, up), read_from
     return wrapped
+
+
+def axis_of(up: str) -> tuple[float, float, float]:
+    """The unit vector of an axis by name, such as "z" or "-y". Raises SettingsError."""
+    if not isinstance(up, str) or up not in AXES:
+        raise SettingsError(f"up must be the axis of the scene that is up, one of {', '.join(AXES)}, got {up!r}")
+    return AXES[up]
 
 
 def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | None) -> tuple[Sequence[Camera] | Scene, dict[str, str]]:
@@ -91,7 +116,7 @@ def _found(model: SplatModel, cameras: Sequence[Camera] | Scene | None) -> tuple
 
 
 def asked_for(
-    folder: Path | None, cameras: Sequence[Camera], background: tuple[float, float, float] | None, screen_filter: str | None
+    folder: Path | None, cameras: Sequence[Camera], background: tuple[float, float, float] | None, screen_filter: str | None, up: str | None
 ) -> dict[str, str]:
     """What is given beside a checkpoint, as its adaptations record it (`Report.inputs`). `cameras`: before they are placed in the model's frame.
 
@@ -100,7 +125,8 @@ def asked_for(
     color = "" if background is None else " ".join(f"{channel:g}" for channel in background)
     options = {name: value for name, value in read_options(folder)[0].items() if not isinstance(value, str)}  # but paths
     digest = sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest() if options else ""
-    return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or "", "options": digest}
+    vertical = {} if up is None else {"up": up}  # files of before the option stay those of a job without it
+    return {"cameras": digest_of(cameras), "background": color, "screen filter": screen_filter or "", "options": digest} | vertical
 
 
 def _loaded(path: str | Path, backend: str) -> SplatModel:

@@ -47,10 +47,11 @@ import gc
 collections = []
 gc.callbacks.append(lambda phase, info: collections.append(info["generation"]))
 from mipmap_plugin.commands.common import wrap
+from mipmap_plugin.jobs.base import Base
 from pathlib import Path
 gc.collect()
 collections.clear()
-wrap(Path({str(tiny.folder(tmp_path / 'base', tiny.cameras()))!r}), None, None, "auto", None, 1)
+wrap(Base(Path({str(tiny.folder(tmp_path / 'base', tiny.cameras()))!r})), 1)
 print(len(collections), gc.get_freeze_count() > 100_000)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

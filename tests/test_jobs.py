@@ -257,6 +257,15 @@ def test_other_cameras_background_or_photographs_are_not_finished(tmp_path):
     assert finished(job) is not None
 
 
+def test_another_vertical_is_not_finished(tmp_path):
+    job = job_of(tmp_path)
+    job = replace(job, base=replace(job.base, cameras=None, up="z"))
+    assert run_job(job).status == "done" and finished(job) is not None
+    for up in ("-z", None):
+        assert finished(replace(job, base=replace(job.base, up=up))) is None
+    assert "up" not in Base(job.base.checkpoint).asked()  # so that files of before the option are still finished
+
+
 def test_other_options_of_the_training_are_not_finished(tmp_path):
     folder = tiny.folder(tmp_path / "scene", count=30)
     job = replace(job_of(tmp_path), base=Base(folder))

@@ -13,10 +13,11 @@ from torch_checkpoints import gsplat_folder, splatfacto_folder, splats
 from mipmap_plugin import wrap_model
 from mipmap_plugin.adaptation import views
 from mipmap_plugin.cli import main
-from mipmap_plugin.models import load_model
+from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.models.adapted_scale import adapted_orbit
 
 SCALE = 0.125
+Z = (0.0, 0.0, 1.0)
 
 
 @pytest.fixture(autouse=True)
@@ -24,8 +25,13 @@ def _small_pictures(monkeypatch):
     monkeypatch.setattr(views, "ORBIT_PIXELS", 16)
 
 
-def poses(path) -> torch.Tensor:
-    return torch.stack([view.viewmat for view in wrap_model(path, backend="reference").views()])
+def poses(path, **options) -> torch.Tensor:
+    return torch.stack([view.viewmat for view in wrap_model(path, backend="reference", **options).views()])
+
+
+def heights(views, along: int = 2) -> list[float]:
+    """How far views look from above what they look at, along an axis: sines of elevations."""
+    return [-float(view.viewmat[2, along]) for view in views]
 
 
 @pytest.fixture
@@ -76,17 +82,89 @@ def test_a_report_without_an_orbit_is_taken_as_one_of_before(files, orbit):
     assert adapted_orbit(adapted) is None and len(poses(adapted)) > 1
 
 
-@pytest.mark.parametrize(("comment", "up"), [("Vertical Axis: z", (0.0, 0.0, 1.0)), ("Vertical axis: y", None)], ids=["nerfstudio", "Brush"])
+@pytest.mark.parametrize(("comment", "up"), [("Vertical Axis: z", Z), ("Vertical axis: y", None)], ids=["nerfstudio", "Brush"])
 def test_a_header_tells_the_vertical_but_for_what_a_program_writes_into_every_file(tmp_path, comment, up):
     base = tiny.ply(tmp_path / "base.ply")
     base.write_bytes(base.read_bytes().replace(b"element vertex", f"comment {comment}\nelement vertex".encode(), 1))
-    assert views.orbit_of(wrap_model(base, backend="reference").model).up == up
+    assert wrap_model(base, backend="reference").orbit().up == up
 
 
 @pytest.mark.parametrize(
     ("make", "up"),
-    [(splatfacto_folder, (0.0, 0.0, 1.0)), (gsplat_folder, (0.0, 0.0, 1.0)), (partial(gsplat_folder, normalized="false"), None)],
+    [(splatfacto_folder, Z), (gsplat_folder, Z), (partial(gsplat_folder, normalized="false"), None)],
     ids=["nerfstudio", "gsplat", "gsplat, as COLMAP has it"],
 )
 def test_a_project_that_turns_its_scenes_tells_the_vertical(tmp_path, make, up):
-    assert views.orbit_of(load_model(make(tmp_path / "r", splats()))).up == up
+    base = wrap_model(make(tmp_path / "r", splats()), backend="reference")
+    assert base.orbit().up == up
+    adapted = base.adapt(SCALE, recipe="instant", extra_views=40)
+    assert (min(heights(adapted.adapted_to)) > -0.2) == bool(up) and (", with z up," in adapted.report.views) == bool(up)
+
+
+# What the user says is up
+
+
+def test_with_what_is_up_as_many_views_look_from_above_the_horizon(files):
+    base, _ = files
+    around, above = (wrap_model(base, backend="reference", **up) for up in ({}, {"up": "-x"}))
+    assert len(above.views()) == len(around.views()) and -1 < min(heights(around.views(), 0)) < -0.9
+    seen = [-height for height in heights(above.views(), 0)]
+    assert -0.18 < min(seen) < 0 and 0.9 < max(seen) < 0.99
+    assert max(abs(float(view.viewmat[0, 0])) for view in above.views()) < 1e-9  # no picture is rolled
+    adapted = above.adapt(SCALE, recipe="instant", extra_views=8)
+    assert min(-height for height in heights(adapted.adapted_to, 0)) > -0.18
+    assert adapted.report.views == "8 views of a generated orbit from above the horizon, with -x up, at 16 px (the checkpoint came without cameras)"
+
+
+def test_an_adapted_file_keeps_what_was_up_unless_it_is_said_anew(tmp_path, files):
+    base, _ = files
+    adapted = wrap_model(base, backend="reference", up="y").adapt(SCALE, recipe="instant", extra_views=4).save(tmp_path / "up.ply")
+    assert torch.equal(poses(adapted), poses(base, up="y")) and not torch.equal(poses(adapted), poses(base))
+    assert torch.equal(poses(adapted, up="x"), poses(base, up="x"))
+
+
+@pytest.mark.filterwarnings("ignore:no cameras")
+def test_tiles_and_pictures_are_of_what_is_up(tmp_path, files):
+    base, _ = files
+    words = ["--up", "-y", "--backend", "reference", "--overwrite"]
+    assert main(["adapt", str(base), "--output", str(tmp_path / "tiled.ply"), "--scale", "1/4", "--recipe", "instant", "--tiles", "2", *words]) == 0
+    assert torch.equal(poses(tmp_path / "tiled.ply"), poses(base, up="-y"))
+    report = json.loads((tmp_path / "tiled.ply.adaptation.json").read_text())
+    assert ", with -y up," in report["views"] and report["inputs"]["up"] == "-y"
+    for name, up in (("told", ["--up", "-y"]), ("kept", [])):
+        assert main(["render", str(tmp_path / "tiled.ply"), "--output", str(tmp_path / name), "--view", "orbit_0001", *up, *words[2:]]) == 0
+    assert (tmp_path / "told" / "train_orbit_0001.png").read_bytes() == (tmp_path / "kept" / "train_orbit_0001.png").read_bytes()
+
+
+def test_without_cameras_it_is_told_where_views_look_from(files, recwarn):
+    for up in ({}, {"up": "z"}):
+        wrap_model(files[0], backend="reference", **up).adapt(SCALE, recipe="instant", extra_views=2)
+    around, above = [str(each.message) for each in recwarn if str(each.message).startswith("no cameras")]
+    assert "from all around" in around and "say what is up (--up" in around
+    assert "from above the horizon, with z up" in above and "--up" not in above
+
+
+def test_cameras_leave_what_is_up_to_orbits_that_are_asked_for(tmp_path):
+    folder = tiny.folder(tmp_path / "base")
+    with pytest.warns(UserWarning, match="^up z: there are cameras, whose views are taken"):
+        base = wrap_model(folder, backend="reference", up="z")
+    assert base.adapt(SCALE, recipe="instant").report.views.startswith("4 train views")
+    adapted = base.adapt(SCALE, recipe="instant", views="orbit", extra_views=40)
+    assert min(heights(adapted.adapted_to)) > -0.18 and ", with z up," in adapted.report.views
+
+
+def test_inspect_tells_what_is_up(files, capsys):
+    assert main(["inspect", str(files[0]), "--no-viewers", "--up", "z"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "none beside the checkpoint; it is looked at from above the horizon, with z up" in said and "--scale 1/4 --up z" in said
+
+
+@pytest.mark.parametrize("up", ["Z", "up", 2, (0, 0, 1)])
+def test_what_is_no_axis_is_refused(files, up):
+    with pytest.raises(SettingsError, match=r"^up must be the axis of the scene that is up, one of x, y, z, -x, -y, -z, got "):
+        wrap_model(files[0], up=up)
+
+
+def test_an_unknown_option_is_refused(files):
+    with pytest.raises(TypeError, match=r"^wrap_model\(\) got unknown options: upwards; there are background, screen_filter, up$"):
+        wrap_model(files[0], upwards="z")

@@ -16,6 +16,7 @@ from mipmap_plugin import progress
 from mipmap_plugin.adaptation.target.base_images import BaseImages
 from mipmap_plugin.commands.common import wrap
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.models import load_model
 from mipmap_plugin.process import threads
 from mipmap_plugin.wrap import wrap_model
@@ -185,7 +186,7 @@ def test_numbers_of_threads_that_are_none_are_refused(wrong):
 def test_what_a_command_measures_has_the_threads_that_were_asked_for(tmp_path):
     before = torch.get_num_threads()
     try:
-        wrap(tiny.folder(tmp_path / "base"), None, None, "auto", threads=before + 1)
+        wrap(Base(tiny.folder(tmp_path / "base")), threads=before + 1)
         assert torch.get_num_threads() == before + 1
     finally:
         torch.set_num_threads(before)

@@ -20,7 +20,7 @@ from mipmap_plugin.adaptation.report import Report
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
-from mipmap_plugin.adaptation.views import orbited
+from mipmap_plugin.adaptation.views import orbit_of, orbited
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.config import AdaptConfig
@@ -66,7 +66,7 @@ class Stages:
         """Adapt to `scale`; `first`: the settings of a conversion before. Raises as `Session.run` does."""
         refuse_adapted(self.request.images.model.source)
         if not self.cameras and config.views != "orbit":
-            warn(orbited(self.request.images.model.source))
+            warn(orbited(self.request.images.model.source, orbit_of(self.request.images.model, self.request.up)))
         refuse_broken(self.request.images.model, next(iter(self.cameras), ONE_PIXEL), steps=config.steps > 0)
         if first is None:
             return Session(self.request, scale, config, self.cameras, self.photographs).run(self.resume, self.observe)

@@ -52,7 +52,6 @@ from mipmap_plugin.progress import announced
 # -> True (Python's, NumPy's or torch's) to end the run with this step, and anything else to go on. Its time is not counted.
 Observer = Callable[[int, float, Callable[[Camera], Tensor]], object]
 
-
 # A zoom-in is validated against the base's own image, whatever it is adapted to.
 COMPARED_WITH_BASE = {"compare_at": "base", "quantize_truth": False}
 
@@ -69,6 +68,7 @@ class AdaptationRequest:
     base_in_viewer: SplatModel  # what the viewer reads of the base's own file: mostly the base itself
     finer: FinerLevel | None = None  # what the run starts from instead of the base
     inputs: Mapping[str, str] = field(default_factory=dict)  # `Report.inputs`
+    up: tuple[float, float, float] | None = None  # the vertical of generated views; None: not known
     budget_share: float = 1.0  # of the time budget that was asked for, which the settings have
 
 
@@ -88,7 +88,7 @@ class Session:
         self.asked_steps, config = config.steps, affordable_for_model(asked, self.base, cameras, near)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs, self.budget_share = request.finer, dict(request.inputs), request.budget_share
-        self.device = self.base.parameters()["means"].device
+        self.device, self.orbit = self.base.parameters()["means"].device, orbit_of(self.base, request.up)
         self.seconds, self.peak = {"optimization": 0.0, "total": 0.0}, PeakMemory(self.device)
         self._has_photographs, self._orbits = real is not None, not cameras or config.views == "orbit"
         self.base_views, validation, self.views_note = self._choose_views(cameras)
@@ -109,12 +109,12 @@ class Session:
 
     def _choose_views(self, cameras: list[Camera]) -> tuple[list[Camera], list[Camera], str]:
         """The views to adapt to, the views for validation, and a description of the former."""
-        means = self.base.parameters()["means"]
-        chosen, note = choose_views(cameras, means, self.config)
-        views, validation = split_validation(cameras, chosen, means, self.scale, self.config)
+        chosen, note = choose_views(cameras, self.orbit, self.config)
+        views, validation = split_validation(cameras, chosen, self.orbit, self.scale, self.config)
         note += f", {len(chosen) - len(views)} of them kept for validation" if len(views) < len(chosen) else ""
-        if len(shown := showing(validation, means, self.base_effects.near_plane)) > 1:  # one to steer by, and one to choose by
-            validation = shown  # others are the same in every state
+        shown = showing(validation, self.base.parameters()["means"], self.base_effects.near_plane)
+        if len(shown) > 1:  # one to steer by, and one to choose by; others are the same in every state
+            validation = shown
         if self.base.traits.moves:
             moments = None if self._has_photographs else affordable_moments(self.config, self.base)  # a photograph shows no moment but its own
             views, validation, note = at_their_moments(views, validation, self.config.model_copy(update={"moments": moments}), note)
@@ -295,6 +295,6 @@ class Session:
             curve=curve,
             versions=versions(),
             inputs=self.inputs,
-            orbit=orbit_of(self.base),
+            orbit=self.orbit,
             notes=[*doubts_in(self.base.notes), *notes, *changes(self.base, student)],
         )

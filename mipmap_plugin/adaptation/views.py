@@ -18,7 +18,7 @@ from mipmap_plugin.camera import Camera, evenly
 from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.limits import derived_seed
-from mipmap_plugin.models.adapted_scale import adapted_orbit, stated_up
+from mipmap_plugin.models.adapted_scale import adapted_orbit
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.models.contract import row_opacities
 from mipmap_plugin.models.health import units
@@ -41,7 +41,7 @@ LEAST_PIXELS, LEAST_SHARE = 16, 0.25
 
 # What is said where there are no cameras: with those of an object all is well, but a capture was never seen from there, and loses 10 dB and more.
 ORBITED = (
-    "no cameras are known: views of a generated orbit are adapted to, and all dB are of such; that suits an object, and no capture; "
+    "no cameras are known: views of a generated orbit are adapted to, {told}, and all dB are of such; that suits an object, and no capture; "
     "give the scene's cameras (--cameras)"
 )
 
@@ -131,16 +131,15 @@ def extent(views: Sequence[Camera]) -> float:
     return radius if radius > 0 else 1.0
 
 
-def orbit_of(model: SplatModel, means: Tensor | None = None) -> Orbit:
+def orbit_of(model: SplatModel, up: tuple[float, float, float] | None, means: Tensor | None = None) -> Orbit:
     """What an orbit around a model goes around. That of an adapted file is its base's, so that both are seen from the same places.
 
-    `means` [N, 3]: of all splats, where the model has but some of its file.
+    `up`: the vertical, as the user or the base's files say (`wrap.Wrapped.trained`); None: they do not. `means` [N, 3]: of all splats,
+    where the model has but some of its file.
     """
     recorded = adapted_orbit(model.source)
-    if recorded is None:
-        return Orbit.around(model.parameters()["means"] if means is None else means, model.trained.up or stated_up(model.source))
-    center, up, distance = recorded
-    return Orbit((center[0], center[1], center[2]), (up[0], up[1], up[2]) if up else None, distance)
+    orbit = Orbit.around(model.parameters()["means"] if means is None else means) if recorded is None else Orbit(**recorded)
+    return orbit if up is None else replace(orbit, up=up, said=True)
 
 
 def choose_views(cameras: Sequence[Camera], around: Tensor | Orbit, config: AdaptConfig) -> tuple[list[Camera], str]:
@@ -154,7 +153,8 @@ def choose_views(cameras: Sequence[Camera], around: Tensor | Orbit, config: Adap
         found = around if isinstance(around, Orbit) else Orbit.around(around)
         views = found.views((pixels, pixels), config.extra_views or ORBIT_VIEWS, generator)
         reason = "as requested" if cameras else "the checkpoint came without cameras"
-        return views, f"{len(views)} views of a generated orbit at {pixels} px ({reason})"
+        told = f" {found.told()}," if found.up else ""
+        return views, f"{len(views)} views of a generated orbit{told} at {pixels} px ({reason})"
     if config.views == "given":
         return list(cameras), f"the {len(cameras)} given views"
     split = "test" if config.views == "test" else "train"
@@ -245,10 +245,11 @@ def too_small(views: Sequence[Camera], model: SplatModel, near: float, least: fl
     return f"the scene is {units(width, 2)} units wide, and no view shows it larger than {units(most, 2)} px: {wrong}"
 
 
-def orbited(source: Path | None) -> str:
+def orbited(source: Path | None, orbit: Orbit) -> str:
     """`ORBITED`, with the cameras.json that lies beside the file of the splats."""
     file = unread_cameras(source)
-    return f"{ORBITED}, such as {file}, if it is of this scene" if file else ORBITED
+    beside = f", such as {file}, if it is of this scene" if file else ""
+    return f"{ORBITED.format(told=orbit.told())}{beside}{'' if orbit.up else ', or say what is up (--up z, for one)'}"
 
 
 def remarks(views: Sequence[Camera], model: SplatModel, near: float, *, orbit: bool) -> list[str]:

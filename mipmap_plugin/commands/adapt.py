@@ -15,7 +15,7 @@ from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.pages import AdaptationPage, look_at
 from mipmap_plugin.commands.terminal_picture import show_before_and_after
 from mipmap_plugin.commands.tiled import adapt_tiled
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoints, Scale, ScreenFilter, Seed, Threads, unique_scales
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoints, Scale, ScreenFilter, Seed, Threads, Up, unique_scales
 from mipmap_plugin.commands.voice import detail, say
 from mipmap_plugin.config import ResizeFilter, ViewPolicy
 from mipmap_plugin.errors import SettingsError
@@ -54,6 +54,7 @@ def adapt(
     recipe: str = "default",
     viewer: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     cameras: Cameras = None,
+    up: Up = None,
     splats: int | None = None,
     bytes: str | None = None,
     images: Path | None = None,
@@ -88,9 +89,9 @@ def adapt(
         _refuse_for_many(many.holds(checkpoints), scale, bytes, report)
         request = Request(_requests(scale, viewer), output, settings | without_none(most_splats=splats), images, overwrite)
         adapt_jobs = adapt_many if many.tiles is None else adapt_tiled
-        return adapt_jobs(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter), threads, json)
+        return adapt_jobs(many, checkpoints, request, Base(Path(), cameras, background, backend, screen_filter, up), threads, json)
     [checkpoint] = checkpoints
-    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    wrapped = wrap(Base(checkpoint, cameras, background, backend, screen_filter, up), threads)
     most = _most(wrapped, splats, bytes, adapted_path(checkpoint, output, 1.0, several=False), (scale, viewer), settings)
     settings, requests = settings | without_none(most_splats=most), _requests(scale or _fitting(wrapped.model, most), viewer)
     targets = [adapted_path(checkpoint, output, *request, several=len(requests) > 1) for request in requests]

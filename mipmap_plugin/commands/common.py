@@ -16,6 +16,7 @@ from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
     from mipmap_plugin.camera import Camera
+    from mipmap_plugin.jobs.base import Base
     from mipmap_plugin.scenes import Scene
     from mipmap_plugin.wrap import Wrapped
 
@@ -32,15 +33,10 @@ def this_command() -> str:
     return shlex.join(["mipmap-plugin", *WORDS.get()])
 
 
-def wrap(
-    checkpoint: Path, cameras: Path | None, background: str | None, backend: str, screen_filter: str | None = None,
-    threads: int | None = None,
-) -> Wrapped:  # fmt: skip
+def wrap(base: Base, threads: int | None = None) -> Wrapped:
     """Load and wrap a checkpoint, for whatever is done in this process. `threads`: for torch too. Raises what `Base.load` raises."""
-    from mipmap_plugin.jobs.base import Base
-
-    with announced(f"reading {checkpoint.name}"), uncollected():
-        wrapped = Base(checkpoint, cameras, background, backend, screen_filter).load(threads)
+    with announced(f"reading {base.checkpoint.name}"), uncollected():
+        wrapped = base.load(threads)
         leave_loaded()
         if threads is not None:
             from mipmap_plugin.process.threads import limit_torch  # here, for it imports torch

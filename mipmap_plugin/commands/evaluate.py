@@ -18,6 +18,7 @@ from mipmap_plugin.commands.types import BackendName, Background, Scales, Screen
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
+from mipmap_plugin.jobs.base import Base
 
 if TYPE_CHECKING:
     from mipmap_plugin.evaluation.perceptual import Perceptual
@@ -74,7 +75,7 @@ def evaluate(
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with results.resumable():
         for path, folder in zip(checkpoint, images, strict=True):
-            wrapped, photographs = wrap(path, None, background, backend, screen_filter, threads), _scene(folder, appearance)
+            wrapped, photographs = wrap(Base(path, None, background, backend, screen_filter), threads), _scene(folder, appearance)
             results.measure(wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, output, overwrite)
     print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import base_cameras, print_facts, summary
-from mipmap_plugin.commands.types import Checkpoint, ScreenFilter
+from mipmap_plugin.commands.types import Checkpoint, ScreenFilter, Up
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
 
@@ -21,6 +21,7 @@ def inspect(
     checkpoint: Checkpoint,
     iteration: int | None = None,
     screen_filter: ScreenFilter = None,
+    up: Up = None,
     viewers: bool = True,
     all: bool = False,
     json: bool = False,
@@ -45,7 +46,7 @@ def inspect(
         from mipmap_plugin.wrap import wrap_model
 
         model = load_model(checkpoint, iteration=iteration)
-        wrapped = wrap_model(model, screen_filter=screen_filter)
+        wrapped = wrap_model(model, screen_filter=screen_filter, up=up)
     facts = _facts(checkpoint, wrapped, whole=all or json)
     asked = [note for note in model.notes if "--screen-filter" in note and screen_filter]  # which is answered
     if not json:
@@ -68,6 +69,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
     from mipmap_plugin.scenes import unread_cameras
 
     model, place = wrapped.model, base_cameras(wrapped, None)
+    orbit = f"; it is looked at {wrapped.orbit().told()}" if not wrapped.cameras and wrapped.orbit().up else ""
     with announced("examining"):
         gaussians = model.gaussians(wrapped.views()[0])
         health = examine(model if holds_splats(model) else VanillaModel.from_gaussians(gaussians, model.trained))
@@ -79,7 +81,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
-        "cameras": summary(wrapped.cameras, unread_cameras(model.source)) + (f", of its base, in {place}" if place else ""),
+        "cameras": summary(wrapped.cameras, unread_cameras(model.source)) + (f", of its base, in {place}" if place else "") + orbit,
         "effects": [str(effect) for effect in effects if effect.on or whole] + _off(effects, shown=whole),
         "health": told or ["nothing found"],
     }
@@ -96,8 +98,8 @@ def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: 
     if lost := next((note for note in notes if DROPPED in note), None):
         return f"doubtful: {lost}; train or export it again, or adapt what is left"
     place, cameras = shlex.quote(str(checkpoint)), unread_cameras(wrapped.model.source)
-    views = "" if seen else f" --cameras {shlex.quote(str(cameras or 'SCENE'))}"
-    told = wrapped.asked["screen filter"]
+    told, up = wrapped.asked["screen filter"], wrapped.asked.get("up")
+    views = "" if seen else f" --up {up}" if up else f" --cameras {shlex.quote(str(cameras or 'SCENE'))}"
     advice = f"mipmap-plugin adapt {place} --scale 1/4" + (f" --screen-filter {told}" if told else "") + views
     if scale not in (None, 1.0):
         advice = f"mipmap-plugin render {place}, at x{scale:g}, which it was adapted to and looks right at"

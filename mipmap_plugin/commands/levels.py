@@ -6,8 +6,9 @@ from pathlib import Path
 
 from mipmap_plugin.commands.common import without_none, wrap
 from mipmap_plugin.commands.ladders import Exports, print_summary, saved
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Way
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, Scale, ScreenFilter, Seed, Threads, Up, Way
 from mipmap_plugin.config import ViewPolicy
+from mipmap_plugin.jobs.base import Base
 
 
 def levels(
@@ -25,6 +26,7 @@ def levels(
     recipe: str = "default",
     views: ViewPolicy | None = None,
     cameras: Cameras = None,
+    up: Up = None,
     steps: int | None = None,
     background: Background = None,
     screen_filter: ScreenFilter = None,
@@ -62,5 +64,6 @@ def levels(
     exports = Exports(streamed_sog, tiles, canvas, checkpoint.resolve().name if report else None)
     exports.check(output)
     request = LadderRequest(viewer, coarsest, ratio, least_db, until_splats, recipe, {"seed": seed, **without_none(views=views, steps=steps)}, by)
-    manifest, files = saved(wrap(checkpoint, cameras, background, backend, screen_filter, threads), request, output, exports, overwrite)
+    base = Base(checkpoint, cameras, background, backend, screen_filter, up)
+    manifest, files = saved(wrap(base, threads), request, output, exports, overwrite)
     print_summary(output, manifest, files, json)

@@ -12,10 +12,11 @@ import tyro
 
 from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import picture_names
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, OwnScale, Up
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable
+from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.progress import counted
 from mipmap_plugin.screen_filters import Name
 
@@ -39,6 +40,7 @@ def render(
     normals: bool = False,
     exposure: bool = False,
     cameras: Cameras = None,
+    up: Up = None,
     background: Background = None,
     backend: BackendName = "auto",
     overwrite: bool = False,
@@ -61,7 +63,7 @@ def render(
         exposure: Apply the exposure of each view's photograph, if the training learned one (exposure.json of 3DGS).
         overwrite: Replace pictures that exist.
     """
-    wrapped = wrap(checkpoint, cameras, background, backend)
+    wrapped = wrap(Base(checkpoint, cameras, background, backend, up=up))
     zoom, views = _zoom(wrapped, scale), _at_times(wrapped, _named(wrapped, view), time)
     filter_name = None if screen_filter == "trained" else screen_filter
     own_viewer = _own_viewer(wrapped) if viewer is None and filter_name is None else None

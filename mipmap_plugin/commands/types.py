@@ -60,6 +60,10 @@ ScreenFilter = Annotated[
         help="The filter that the checkpoint was trained with, if its files do not say: mip for a fused file of Mip-Splatting, for example."
     ),
 ]
+Up = Annotated[
+    Literal["x", "y", "z", "-x", "-y", "-z"] | None,
+    tyro.conf.arg(help="What is up, if the checkpoint has no cameras: views of it are then generated above the horizon, not from all around."),
+]
 BackendName = Annotated[str, tyro.conf.arg(help="Name of a backend; auto chooses the fastest one that can serve the request.")]
 Threads = Annotated[
     int | None,

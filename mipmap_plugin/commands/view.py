@@ -14,10 +14,11 @@ import tyro
 
 from mipmap_plugin.commands.common import base_cameras, wrap
 from mipmap_plugin.commands.outputs import adapted_path
-from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Checkpoint, ScreenFilter, Up
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_unwritable
+from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.progress import announced
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def view(
     viewer: str | None = None,
     output: Path | None = None,
     cameras: Cameras = None,
+    up: Up = None,
     background: Background = None,
     screen_filter: ScreenFilter = None,
     backend: BackendName = "auto",
@@ -63,7 +65,7 @@ def view(
         raise SettingsError(f"{output} is no folder, which the page could save to; give --output a folder")
     if output is not None:
         refuse_unwritable(output / checkpoint.name)
-    wrapped = wrap(checkpoint, cameras, background, backend, screen_filter, threads)
+    wrapped = wrap(Base(checkpoint, cameras, background, backend, screen_filter, up), threads)
     if viewer is not None:
         wrapped.target(viewer)  # raises before any work
     with all_threads.limited(threads, shared=False):

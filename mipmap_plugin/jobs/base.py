@@ -26,6 +26,7 @@ class Base:
     background: str | None = None  # "white" or "black"; None: as the checkpoint says
     backend: str = "auto"
     screen_filter: str | None = None
+    up: str | None = None  # such as "z"; None: as the checkpoint says, if it does
 
     def asked(self) -> dict[str, str]:
         """What is given beside the checkpoint, as its adaptations record it, without loading it. Raises CheckpointError, SceneError."""
@@ -41,7 +42,7 @@ class Base:
         else:
             own, _ = own_cameras(detect(self.checkpoint).path, folder)
             cameras = own if isinstance(own, list) else own.cameras
-        return asked_for(folder, cameras, COLORS[self.background], self.screen_filter)
+        return asked_for(folder, cameras, COLORS[self.background], self.screen_filter, self.up)
 
     def unpacked(self) -> Base:
         """The same checkpoint, for another process: this one removes what it unpacked when it ends, but a worker that is killed does not."""
@@ -69,12 +70,10 @@ class Base:
         from mipmap_plugin.backends import BACKENDS
         from mipmap_plugin.models.inria_folder import read_options
         from mipmap_plugin.scenes import load_scene
-        from mipmap_plugin.wrap import wrap_model
+        from mipmap_plugin.wrap import WrapOptions, wrap_model
 
         if self.backend != "auto":
             BACKENDS.get(self.backend)
         scene = None if self.cameras is None else load_scene(self.cameras, read_options(folder)[0])
-        color = COLORS[self.background]
-        return wrap_model(
-            self.checkpoint, cameras=scene, backend=self.backend, background=color, screen_filter=self.screen_filter, threads=threads
-        )
+        told: WrapOptions = {"background": COLORS[self.background], "screen_filter": self.screen_filter, "up": self.up}
+        return wrap_model(self.checkpoint, cameras=scene, backend=self.backend, threads=threads, **told)

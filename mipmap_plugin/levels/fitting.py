@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from mipmap_plugin.adaptation.report import provenance, versions
-from mipmap_plugin.adaptation.views import orbit_of
 from mipmap_plugin.errors import TEMPORARY, SettingsError
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.formats.splat_transform import WRITTEN
@@ -60,7 +59,7 @@ def recorded(base: FrozenBase, requests: Sequence[tuple[float, str | None]], set
     """
     further = {**settings, "most_splats": len(base.model.parameters()["means"])}
     name, digest = further.pop("recipe"), base.model.digest or digest_of_parameters(base.model)
-    made_from = {"base": digest, "inputs": base.asked, "orbit": asdict(orbit_of(base.model))}
+    made_from = {"base": digest, "inputs": base.asked, "orbit": asdict(base.orbit())}
     records = [provenance({"scale": scale, "viewer": viewer, **made_from}, recipe(name, scale, **further), versions()) for scale, viewer in requests]
     return max(records, key=lambda record: (wants_filter(record["viewer"]), len(json.dumps(record, default=str))))
 

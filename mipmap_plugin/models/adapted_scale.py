@@ -25,20 +25,23 @@ def adapted_viewer(source: Path | None) -> str | None:
     return viewer if isinstance(viewer, str) else None
 
 
-def adapted_orbit(source: Path | None) -> tuple[list[float], list[float] | None, float] | None:
-    """Center, up and distance of the orbit around the base of the file `source`; None if it is a base, or of an older version.
+def adapted_orbit(source: Path | None) -> dict[str, Any] | None:
+    """The orbit around the base of the file `source`, by the fields of `Orbit`; None if it is a base, or of an older version.
 
     Raises as `adapted_scale`.
     """
     match _record(source).get("orbit"):
-        case {"center": [float(), float(), float()] as center, "up": [float(), float(), float()] | None as up, "distance": float() as distance}:
-            return center, up, distance
+        case {"center": [float(), float(), float()] as center, "up": [float(), float(), float()] | None as up, "distance": float() as far, **more}:
+            return {"center": tuple(center), "up": up and tuple(up), "distance": far, "said": more.get("said") is True}
     return None
 
 
-def stated_up(source: Path | None) -> tuple[float, float, float] | None:
-    """What is up in the file `source`, where its header says so. Raises CheckpointError for a damaged file."""
-    return vertical_of(_comments(source))
+def known_up(source: Path | None, by_family: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    """What is up in a base, as its family or its header says; None: not known, or an adapted file, whose base's orbit is recorded.
+
+    Raises as `adapted_scale`.
+    """
+    return None if adapted_orbit(source) else by_family or vertical_of(_comments(source))
 
 
 def report_beside(source: Path | None) -> dict[str, Any]:

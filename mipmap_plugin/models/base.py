@@ -41,7 +41,7 @@ class TrainedScale:
         background: RGB, 0..1; None: the checkpoint does not say.
         near_plane: Depth up to which splats were not drawn, world units.
         keeps_filter: Files of the family need this filter, so that without a viewer they are for the original project only.
-        up: The vertical of the world, where the project turns its scenes; None: not known.
+        up: The vertical of the world, where the project turns its scenes, or as the user says; None: not known.
     """
 
     screen_filter: str = "classic"

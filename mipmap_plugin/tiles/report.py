@@ -9,7 +9,6 @@ from pathlib import Path
 from mipmap_plugin.adaptation.curve import CurvePoint
 from mipmap_plugin.adaptation.optimization.amount import fewer_note
 from mipmap_plugin.adaptation.report import Report, filters, versions
-from mipmap_plugin.adaptation.views import orbit_of
 from mipmap_plugin.effects import explain
 from mipmap_plugin.formats.ply import read_header
 from mipmap_plugin.models.base import effects_of
@@ -31,7 +30,7 @@ def make_report(scene: TiledScene, files: Sequence[Path], seconds: dict[str, flo
         base=scene.digest,
         inputs=scene.wrapped.asked,
         cameras_from=scene.wrapped.cameras_from,
-        orbit=orbit_of(scene.wrapped.model, scene.base.places[:, :3]),
+        orbit=scene.orbit,
         settings=config,
         backend=scene.backend_note,
         views=f"{scene.views.note}, in {len(files)} tiles",

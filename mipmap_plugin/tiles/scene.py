@@ -16,7 +16,7 @@ from torch import Tensor
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.optimization.validation import split_validation
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, orbited
+from mipmap_plugin.adaptation.views import choose_views, orbit_of, orbited
 from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.camera import Camera
@@ -35,6 +35,7 @@ from mipmap_plugin.models.inria_folder import read_options, trained_scale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.scenes import load_scene
+from mipmap_plugin.scenes.trajectories import Orbit
 from mipmap_plugin.tiles.cut import Tree, cut
 from mipmap_plugin.tiles.folder import BASE, CUT
 from mipmap_plugin.tiles.slabs import Painter
@@ -175,7 +176,7 @@ class TiledScene:
         model = self.kind(self.base.parameters(sample), trained, origin)
         scene = None if base.cameras is None else load_scene(base.cameras, options)
         color = COLORS[base.background]
-        return wrap_model(model, cameras=scene, backend="auto", background=color, screen_filter=base.screen_filter)
+        return wrap_model(model, cameras=scene, backend="auto", background=color, screen_filter=base.screen_filter, up=base.up)
 
     def _backend(self, name: str) -> tuple[Any, str]:
         splats = self.wrapped.model.gaussians(self.wrapped.any_camera())
@@ -192,15 +193,18 @@ class TiledScene:
         return self.wrapped.effects()
 
     @cached_property
+    def orbit(self) -> Orbit:
+        """What views without cameras go around: all splats."""
+        return orbit_of(self.wrapped.model, self.wrapped.trained.up, self.base.places[:, :3])
+
+    @cached_property
     def views(self) -> Views:
         """The views of the whole scene, the same as without tiles."""
-        cameras, means = self.wrapped.cameras, self.base.places[:, :3]
-        if not cameras or self.config.views == "orbit":  # which surrounds the splats
-            means = means[means.isfinite().all(1)]
+        cameras, orbit = self.wrapped.cameras, self.orbit
         if not cameras and self.config.views != "orbit":
-            warnings.warn(orbited(self.checkpoint.path), stacklevel=1)
-        chosen, note = choose_views(cameras, means, self.config)
-        adapted, validation = split_validation(cameras, chosen, means, self.scale, self.config)
+            warnings.warn(orbited(self.checkpoint.path, orbit), stacklevel=1)
+        chosen, note = choose_views(cameras, orbit, self.config)
+        adapted, validation = split_validation(cameras, chosen, orbit, self.scale, self.config)
         note += f", {len(chosen) - len(adapted)} of them kept for validation" if len(adapted) < len(chosen) else ""
         named = [replace(view, name=str(number)) for number, view in enumerate([*adapted, *validation])]
         judged = named[len(adapted) :]

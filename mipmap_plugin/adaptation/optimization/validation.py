@@ -27,7 +27,7 @@ from mipmap_plugin.config import AdaptConfig
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import SplatModel
 from mipmap_plugin.process.threads import side_by_side
-from mipmap_plugin.scenes.trajectories import jittered
+from mipmap_plugin.scenes.trajectories import Orbit, jittered
 
 # At most one in this many of the given cameras is kept for validation, where the policy leaves the choice of views to us.
 VALIDATION_EVERY = 16
@@ -169,17 +169,17 @@ def no_validation(truth: Callable[[Camera], Tensor], render: Callable[[Gaussians
 
 
 def split_validation(
-    cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, scale: float, config: AdaptConfig
+    cameras: Sequence[Camera], views: Sequence[Camera], around: Tensor | Orbit, scale: float, config: AdaptConfig
 ) -> tuple[list[Camera], list[Camera]]:
     """Return the views to adapt to, out of `views`, and the views for validation.
 
     For validation: some of the given cameras, where a policy chooses among enough of them, and random views from the region that they
     span; without cameras, the views of another orbit. Of large images only the middle is used; there are no validation views if one
-    pixel of the base is larger than that.
+    pixel of the base is larger than that. `around`: as of `choose_views`.
     """
     if scale > WINDOW:
         return list(views), []
-    adapted, validation = _validation_views(cameras, views, means, config)
+    adapted, validation = _validation_views(cameras, views, around, config)
     size = round(WINDOW / max(1.0, scale))
     return adapted, [view.window(size, size) for view in validation]
 
@@ -189,13 +189,15 @@ def count_of_views(config: AdaptConfig) -> int:
     return min(config.validation_views, max(MIN_VIEWS, config.steps * config.views_per_step // RENDERS_PER_VIEW))
 
 
-def _validation_views(cameras: Sequence[Camera], views: Sequence[Camera], means: Tensor, config: AdaptConfig) -> tuple[list[Camera], list[Camera]]:
+def _validation_views(
+    cameras: Sequence[Camera], views: Sequence[Camera], around: Tensor | Orbit, config: AdaptConfig
+) -> tuple[list[Camera], list[Camera]]:
     """`split_validation` with whole images. Random views come first in each pair, so that they steer and kept cameras choose."""
     count = count_of_views(config)
     generator = torch.Generator().manual_seed(config.seed + SEED_OFFSET)
     if config.views == "orbit" or not cameras:
         changes = {"views": "orbit", "extra_views": count, "seed": config.seed + SEED_OFFSET}
-        validation, _ = choose_views(cameras, means, config.model_copy(update=changes))
+        validation, _ = choose_views(cameras, around, config.model_copy(update=changes))
         return list(views), validation
     originals = [view for view in views if view in set(cameras)]
     kept: list[Camera] = []

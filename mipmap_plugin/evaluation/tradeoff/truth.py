@@ -94,7 +94,7 @@ def _held_out(model: Wrapped) -> tuple[list[Camera], list[Camera]]:
     generator = torch.Generator().manual_seed(EVALUATION_SEED)
     test, train = ([camera for camera in model.cameras if camera.split == split] for split in ("test", "train"))
     if not model.cameras:
-        judged = choose_views([], model.model.parameters()["means"], AdaptConfig(seed=EVALUATION_SEED, extra_views=HELD_OUT_EVERY))[0]
+        judged = choose_views([], model.orbit(), AdaptConfig(seed=EVALUATION_SEED, extra_views=HELD_OUT_EVERY))[0]
     elif test and (rest := _others(train, test)):
         judged, train = test, rest
     elif rest := _others(model.cameras, model.cameras[::HELD_OUT_EVERY]):

@@ -27,7 +27,7 @@ from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size, 
 from mipmap_plugin.adaptation.target.image_store import ImageStore
 from mipmap_plugin.adaptation.target.pseudo_truth import LIMIT
 from mipmap_plugin.adaptation.target.resize import fitting
-from mipmap_plugin.adaptation.views import choose_views, orbit_of
+from mipmap_plugin.adaptation.views import choose_views
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.backends.base import Backend, Calls
 from mipmap_plugin.camera import Camera, digest_of, evenly
@@ -145,9 +145,10 @@ class LevelRun:
     def __post_init__(self) -> None:
         scene, self.config = self.scene, self.scene.config(self.number)
         self.size = scene.rule.middle(self.number)
-        chosen, note = choose_views(scene.base.cameras, scene.splats.means, self.config)
+        orbit = scene.base.orbit()
+        chosen, note = choose_views(scene.base.cameras, orbit, self.config)
         chosen = evenly(chosen, _most_views(self.config))
-        views, held_out = split_validation(scene.base.cameras, chosen, scene.splats.means, 1.0, self.config)
+        views, held_out = split_validation(scene.base.cameras, chosen, orbit, 1.0, self.config)
         begins: dict[Camera, Camera] = {}
 
         def walked(starts: Sequence[Camera]) -> list[Camera]:
@@ -282,7 +283,7 @@ class LevelRun:
             versions=versions(),
             inputs=scene.base.asked,
             cameras_from=scene.base.cameras_from,
-            orbit=orbit_of(scene.base.model),
+            orbit=scene.base.orbit(),
             notes=[*doubts_in(scene.base.model.notes), *self._worse(best, psnrs)],
         )
 
