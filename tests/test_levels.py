@@ -238,6 +238,14 @@ def test_levels_of_other_cameras_are_not_gone_on_with(tmp_path, change):
         make_levels(base, request(coarsest=0.9), tmp_path / "state")
 
 
+def test_levels_of_another_vertical_are_not_gone_on_with(tmp_path):
+    base, other = (wrap_model(tiny.model(), backend="reference", up=up) for up in ("z", None))
+    asked = request(coarsest=0.9, steps=0, extra_views=2)
+    make_levels(base, asked, tmp_path / "state")
+    with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
+        make_levels(other, asked, tmp_path / "state")
+
+
 def test_levels_of_another_model_are_not_gone_on_with(tmp_path):
     """One whose parameters have the same sums."""
     first, other = wrapped(), wrapped()

@@ -410,6 +410,20 @@ class TestMoving:
         assert adapting.alike(replace(screen, time=0.5), replace(screen, time=0.5)) and not adapting.alike(replace(screen, time=0.5), screen)
 
 
+class TestWithoutCameras:
+    """A base of which only is said what is up."""
+
+    @pytest.fixture
+    def base(self):
+        return wrap_model(tiny.model(), backend="reference", up="-x")
+
+    def test_it_stands_upright_from_the_beginning(self, page):
+        server = page._server
+        assert server.scene.set_up_direction.call_args.args == ((-1.0, 0.0, 0.0),)
+        position, target = server.initial_camera.position, server.initial_camera.look_at
+        assert 0.2 < (target[0] - position[0]) / math.dist(position, target) < 0.7  # neither from the horizon nor from high above
+
+
 def test_a_scene_in_which_nothing_moves_has_no_slider_of_moments(page):
     assert page._controls.time is None and page._controls.look().time is None
 

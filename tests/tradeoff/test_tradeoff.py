@@ -78,6 +78,11 @@ def test_without_photographs_no_view_that_is_judged_on_is_adapted_to(views, judg
     assert bool(yardstick.adapt_on) == bool(views)
 
 
+def test_without_cameras_the_views_that_are_judged_on_look_from_above_what_is_said_to_be_up():
+    views = base_itself(wrap_model(tiny.model(30), backend="reference", up="x"), 1 / 4, None).views
+    assert all(view.viewmat[2, 0] < 0.18 and view.viewmat[0, 0].abs() < 1e-9 for view in views)
+
+
 def test_without_photographs_the_label_says_what_the_truth_is():
     out, in_ = (base_itself(wrapped(), scale, 1).label for scale in (1 / 4, 4))
     assert out == "dB against the base supersampled 4 x 4 (no photographs), 1 views"
