@@ -58,7 +58,7 @@ CONFINED = {
     "tqdm": ["adaptation/", "evaluation/", "progress.py"],
     "triton": ["backends/triton"],
     "tyro": ["cli.py", "commands/"],
-    "typing_extensions": ["frozen_base.py"],
+    "typing_extensions": ["frozen_base.py", "wrap.py"],
     "viser": ["viewing/server.py"],
 }
 

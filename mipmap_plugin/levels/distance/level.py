@@ -143,9 +143,8 @@ class LevelRun:
     seconds: dict[str, float] = field(default_factory=lambda: {"optimization": 0.0})
 
     def __post_init__(self) -> None:
-        scene, self.config = self.scene, self.scene.config(self.number)
+        scene, self.config, orbit = self.scene, self.scene.config(self.number), self.scene.base.orbit()
         self.size = scene.rule.middle(self.number)
-        orbit = scene.base.orbit()
         chosen, note = choose_views(scene.base.cameras, orbit, self.config)
         chosen = evenly(chosen, _most_views(self.config))
         views, held_out = split_validation(scene.base.cameras, chosen, orbit, 1.0, self.config)
