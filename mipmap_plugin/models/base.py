@@ -143,7 +143,7 @@ class SplatModel(Protocol):
         """A copy on another device."""
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool) -> None:
-        """Raise what `save` would raise for `path`, as far as it can be known before the work begins."""
+        """Raise what `save` would raise for `path`, as far as it can be known before the work begins: OutputError, OutputExists or SettingsError."""
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
         """Write the model in the format that it was read from, atomically; return the file written. Raises OutputExists.
