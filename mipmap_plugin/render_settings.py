@@ -26,15 +26,25 @@ TILE = 16  # px
 
 @dataclass(frozen=True)
 class Packing:
-    """Quantization of splats in a viewer's memory: values are rounded to the nearest multiple of a step. None: not rounded."""
+    """Quantization of splats in a viewer's memory: values are rounded to the nearest multiple of a step. None: not rounded.
 
-    opacity: tuple[float, ...] = (1 / 255,)  # steps of successive roundings
-    color: float | None = None  # step of the color of SH degree 0, which is clamped to 0..1
-    downwards: bool = False  # opacities and colors are rounded down
-    bands: tuple[float, ...] = ()  # steps of the coefficients of SH degree 1, 2, ..., clamped to -1..1
-    log_scales: tuple[float, float, float] | None = None  # minimum, maximum and step of the natural logarithms
-    quats: Literal["octahedral", "stereographic"] | None = None  # `splatting.packing`
-    half_means: bool = False  # float16, in the world and again relative to the eye
+    Attributes:
+        opacity: Steps of successive roundings.
+        color: Step of the color of SH degree 0, which is clamped to 0..1.
+        downwards: Opacities and colors are rounded down.
+        bands: Steps of the coefficients of SH degree 1, 2, ..., clamped to -1..1.
+        log_scales: Minimum, maximum and step of the natural logarithms.
+        quats: How rotations are stored (`splatting.packing`).
+        half_means: Means are float16, in the world and again relative to the eye.
+    """
+
+    opacity: tuple[float, ...] = (1 / 255,)
+    color: float | None = None
+    downwards: bool = False
+    bands: tuple[float, ...] = ()
+    log_scales: tuple[float, float, float] | None = None
+    quats: Literal["octahedral", "stereographic"] | None = None
+    half_means: bool = False
 
     def __post_init__(self) -> None:
         check("packing", self, OF_PACKING, optional=frozenset({"color", "log_scales", "quats"}))
@@ -65,30 +75,54 @@ class RenderSettings:
     """How splats are rasterized, and which are left out. `tile` affects only the time. Viewers' own settings are in `splatting.viewers`.
 
     A splat that is culled (by `min_variance`, `min_contribution` or `least_spread`) is not rendered, but has a gradient (`splatting.culls`).
+
+    Attributes:
+        min_alpha: A splat of lower alpha is skipped in a pixel.
+        min_transmittance: A pixel ends before the splat that would leave less.
+        radius: Standard deviations at which a splat ends; None: where its alpha falls below `min_alpha`.
+        tile: px: pixels that share a list of splats.
+        max_alpha: Alpha of a splat in a pixel is clamped to this.
+        fades: A splat falls to 0 at `radius`: its weight w becomes (w - w_end) / (1 - w_end), where w_end is the weight at `radius`.
+        max_color: Limit of a splat's color, in each channel.
+        color_steps: A splat's red, green and blue are rounded to multiples of these.
+        radial: Splats are sorted by their distance to the eye instead of by depth.
+        bucketed: Splats are sorted by PlayCanvas's buckets of depth (`splatting.buckets`).
+        even_buckets: Splats are sorted by buckets that are all of one length.
+        min_variance: px², after dilation: splats whose variance along their longer axis is less are culled.
+        boxed: `min_variance` is compared with the larger variance along x and y instead; `max_half_axis` then limits those too.
+        min_contribution: px², after dilation: splats whose opacity · sqrt(det) is less are culled.
+        rooted: `min_contribution` is compared with sqrt(opacity · det) instead.
+        least_spread: px², after dilation: minimum distance of variances from their mean; splats whose smaller one becomes 0 are culled.
+        max_half_axis: px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat shrinks before.
+        fits_picture: Half-axes are also limited to the picture's shorter side.
+        packing: Quantization of splats in memory.
+        frozen_beyond: The Jacobian is frozen so far outside the picture, in halves of its width and height; infinity: nowhere.
+        frame: In halves of the picture from its middle: splats whose center lies farther out along x or y are not rendered.
+        picture_step: The picture is rounded to multiples after each splat, back to front; the gradient ignores the rounding.
     """
 
-    min_alpha: float = MIN_ALPHA  # a splat of lower alpha is skipped in a pixel
-    min_transmittance: float = MIN_TRANSMITTANCE  # a pixel ends before the splat that would leave less
-    radius: float | None = None  # standard deviations at which a splat ends; None: where its alpha falls below `min_alpha`
-    tile: int = TILE  # px: pixels that share a list of splats
-    max_alpha: float = MAX_ALPHA  # alpha of a splat in a pixel is clamped to this
-    fades: bool = False  # a splat falls to 0 at `radius`: its weight w becomes (w - w_end) / (1 - w_end), where w_end is the weight at `radius`
-    max_color: float | None = None  # limit of a splat's color, in each channel
-    color_steps: tuple[float, float, float] | None = None  # a splat's red, green and blue are rounded to multiples of these
-    radial: bool = False  # splats are sorted by their distance to the eye instead of by depth
-    bucketed: bool = False  # splats are sorted by PlayCanvas's buckets of depth (`splatting.buckets`),
-    even_buckets: EvenBuckets | None = None  # or by buckets that are all of one length
-    min_variance: float = 0.0  # px², after dilation: splats whose variance along their longer axis is less are culled,
-    boxed: bool = False  # or, if this is set, whose larger variance along x and y is less; `max_half_axis` then limits those too
-    min_contribution: float = 0.0  # px², after dilation: splats whose opacity · sqrt(det) is less are culled,
-    rooted: bool = False  # or, if this is set, whose sqrt(opacity · det) is less
-    least_spread: float = 0.0  # px², after dilation: minimum distance of variances from their mean; splats whose smaller one becomes 0 are culled
-    max_half_axis: float = math.inf  # px, at `radius`: longer half-axes are shortened to this; with `boxed` the whole splat shrinks before
-    fits_picture: bool = False  # half-axes are also limited to the picture's shorter side
-    packing: Packing | None = None  # quantization of splats in memory
-    frozen_beyond: float = FRUSTUM_MARGIN  # where the Jacobian is frozen; infinity: nowhere
-    frame: float = math.inf  # in halves of the picture from its middle: splats whose center lies farther out along x or y are not rendered
-    picture_step: float | None = None  # the picture is rounded to multiples after each splat, back to front; the gradient ignores the rounding
+    min_alpha: float = MIN_ALPHA
+    min_transmittance: float = MIN_TRANSMITTANCE
+    radius: float | None = None
+    tile: int = TILE
+    max_alpha: float = MAX_ALPHA
+    fades: bool = False
+    max_color: float | None = None
+    color_steps: tuple[float, float, float] | None = None
+    radial: bool = False
+    bucketed: bool = False
+    even_buckets: EvenBuckets | None = None
+    min_variance: float = 0.0
+    boxed: bool = False
+    min_contribution: float = 0.0
+    rooted: bool = False
+    least_spread: float = 0.0
+    max_half_axis: float = math.inf
+    fits_picture: bool = False
+    packing: Packing | None = None
+    frozen_beyond: float = FRUSTUM_MARGIN
+    frame: float = math.inf
+    picture_step: float | None = None
 
     def __post_init__(self) -> None:
         check("render settings", self, OF_SETTINGS, optional=frozenset({"radius", "max_color", "color_steps", "picture_step"}))

@@ -35,4 +35,4 @@ def test_torch_takes_its_place(run):
 
 
 def test_the_backend_that_needs_it_ends_in_a_sentence(run):
-    assert run("cpu") == (2, [f"mipmap-plugin: backend 'cpu' cannot do this: {REMEDY}"])
+    assert run("cpu") == (2, [f"mipmap-plugin: backend 'cpu' cannot do this, but reference can: {REMEDY}"])

@@ -13,15 +13,16 @@ from unittest import mock
 import pytest
 import torch
 
-from mipmap_plugin.backends import get_backend, reference
+from mipmap_plugin.backends import get_backend, reference, register_backend
 from mipmap_plugin.backends.base import Capabilities, Rendered
-from mipmap_plugin.backends.conformance import CASES, MORE, TOLERANCE, check_backend, summary
+from mipmap_plugin.backends.conformance import CASES, MORE, TOLERANCE, Outcome, check_backend, summary
 from mipmap_plugin.backends.conformance.cases import random_scene
 from mipmap_plugin.backends.conformance.checks import check_steps, check_views
 from mipmap_plugin.backends.conformance.suite import BackendSuite
 from mipmap_plugin.backends.conformance.tolerance import PIXEL_BAND, differing_gradients, differing_images
 from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.errors import SettingsError
+from mipmap_plugin.evaluation import backends as tables
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.splatting.rotations import unit_quaternions
 
@@ -192,6 +193,29 @@ def test_a_backend_of_degree_0_is_run_and_its_faults_are_found():
     assert {each.case for each in check_backend(IgnoresTheNearPlane(), near) if not each.passed} == {
         "on-the-near-plane-classic", "just-behind-the-near-plane-classic",
     }  # fmt: skip
+
+
+class OfDoubles(OfDegree0):
+    capabilities = replace(OfDegree0.capabilities, dtypes=frozenset({torch.float64}))
+
+
+def test_a_suite_in_which_all_is_skipped_does_not_pass():
+    suite = type("Suite", (BackendSuite,), {"backend": OfDoubles()})
+    with pytest.raises(AssertionError, match=r"can draw 0 of \d+ cases, .*; of the others it says: it computes in torch.float64, not"):
+        suite().test_can_be_checked()
+    type("OfDoubles", (suite,), {"dtype": torch.float64})().test_can_be_checked()
+
+
+def test_a_backend_of_float64_alone_is_checked_in_it(monkeypatch):
+    monkeypatch.setattr(tables, "CASES", FEW)
+    register_backend("doubles", OfDoubles)
+    outcomes = tables.check("doubles")
+    assert {each.case for each in outcomes if not each.skipped} and all(each.passed for each in outcomes)
+
+
+def test_a_long_message_does_not_widen_the_lines_of_others():
+    lines = tables.check_table([Outcome("a", 0, True, True, ""), Outcome("b", 0, True, False, 500 * "x")]).splitlines()
+    assert len(lines[-1]) > 500 and max(map(len, lines[:-1])) < 100
 
 
 def test_the_summary_counts_what_was_run():

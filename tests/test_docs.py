@@ -127,6 +127,20 @@ def test_modules_of_the_reference_are_there():
         assert hasattr(importlib.import_module(module), attribute), name
 
 
+def undescribed(kind):
+    """The public fields of a class that its docstring does not describe."""
+    fields = [name for name in vars(kind).get("__annotations__", {}) if not name.startswith("_")]
+    return [name for name in fields if not re.search(rf"^ +{name}: \S", kind.__doc__ or "", re.MULTILINE)]
+
+
+def test_the_reference_describes_every_field_of_a_record():
+    """Comments in the source are not on the site. Settings have descriptions of their own."""
+    places = [name.rpartition(".") for name in re.findall(r"^::: (\S+)$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)]
+    kinds = [getattr(importlib.import_module(module), name) for module, _, name in places]
+    records = [kind for kind in kinds if isinstance(kind, type) and not hasattr(kind, "model_fields")]
+    assert {kind.__name__: names for kind in records if (names := undescribed(kind))} == {}
+
+
 def test_all_that_is_exported_is_in_the_reference():
     text = (ROOT / "docs/api.md").read_text(encoding="utf-8")
     assert [name for name in mipmap_plugin.__all__ if f"::: mipmap_plugin.{name}\n" not in text] == []

@@ -97,7 +97,7 @@ def test_asking_by_name():
     register_backend("fussy", Fussy)
     backend, why = choose_backend("reference", NEEDS)
     assert (type(backend), why) == (ReferenceBackend, "reference: requested")
-    with pytest.raises(BackendUnavailable, match="backend 'fussy' cannot do this: it is not in the mood; nor will it be"):
+    with pytest.raises(BackendUnavailable, match="backend 'fussy' cannot do this, but reference can: it is not in the mood; nor will it be"):
         choose_backend("fussy", NEEDS)
     with pytest.raises(SettingsError, match=r"^there is no backend 'gpu'; choose from fussy, reference$"):
         choose_backend("gpu", NEEDS)

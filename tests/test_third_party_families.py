@@ -13,7 +13,7 @@ import torch
 from mipmap_plugin import load_model, register_model, wrap_model
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import CheckpointError, PluginError, SettingsError
-from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, detect
+from mipmap_plugin.models import API_VERSION, CERTAIN, PLAIN, Family, Match, contract, detect
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.models.conformance import ModelSuite
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family
@@ -45,7 +45,6 @@ def ply(path, *columns):
 class TestOfTheExample(ModelSuite):
     family = "npz"
     cameras = tuple(tiny.cameras())
-    saved_as = "saved.ply"
 
     @pytest.fixture
     def checkpoint(self, tmp_path):
@@ -56,7 +55,6 @@ class TestOfTheExample(ModelSuite):
 class TestOfAFamilyWithFilesOfItsOwn(ModelSuite):
     family = "cholesky"
     cameras = tuple(tiny.cameras())
-    saved_as = "saved.npz"
 
     @pytest.fixture
     def checkpoint(self, tmp_path):
@@ -83,8 +81,28 @@ def test_a_numpy_archive_that_nobody_claims_is_told_to_be_one(tmp_path):
 def test_an_adapted_file_of_a_family_that_is_absent_says_so(tmp_path):
     np.savez(tmp_path / "scene_x0.25.npz", means=np.zeros((1, 3)))
     (tmp_path / "scene_x0.25.npz.adaptation.json").write_text("{}")
-    with pytest.raises(CheckpointError, match="npz was adapted from a checkpoint of a family that is not installed here; install the package"):
+    with pytest.raises(CheckpointError, match=r"npz was adapted from .* a family that is not installed here, or .* ending; install the package"):
         detect(tmp_path / "scene_x0.25.npz")
+
+
+class OfAnyName(FILES["CholeskyModel"]):
+    """Saves its arrays under any name, though its family knows only .npz."""
+
+    def refuse_output(self, path, *, overwrite, networks_move=False):
+        super().refuse_output(Path(f"{path}.npz"), overwrite=overwrite)
+
+    def save(self, path, *, provenance, overwrite=False):
+        return super().save(f"{path}.npz", provenance=provenance, overwrite=overwrite).rename(path)
+
+
+def test_a_model_is_not_saved_under_a_name_that_its_family_does_not_know(tmp_path):
+    register_model("cholesky", FILES["FAMILY"])
+    model = OfAnyName.from_gaussians(tiny.gaussians(40, degree=0))
+    with pytest.raises(PluginError, match=r"scene could not be read again, for no family .*; give it the ending by which"):
+        contract.save(model, tmp_path / "scene", {})
+    base = wrap_model(model, cameras=tiny.cameras())
+    with pytest.raises(PluginError, match="no family recognizes"):
+        ModelSuite().test_a_name_without_an_ending_is_refused_or_read_again(base, tmp_path)
 
 
 def test_a_file_for_a_viewer_is_a_ply(tmp_path):

@@ -81,16 +81,22 @@ def choose_backend(name: str, *needs: Needs) -> tuple[Backend, str]:
         backend = get_backend(name)
         reasons = _lacking(name, backend, needs)
         if reasons:
-            raise BackendUnavailable(f"backend {name!r} cannot do this: {'; '.join(reasons)}")
+            best = _fastest(survey(*needs))
+            raise BackendUnavailable(f"backend {name!r} cannot do this{f', but {best.name} can' if best else ''}: {'; '.join(reasons)}")
         return backend, f"{name}: requested{_note_in_brackets(backend)}"
     reasons_of = survey(*needs)
-    able = [get_backend(name) for name, reasons in reasons_of.items() if not reasons]
-    if not able:
+    best = _fastest(reasons_of)
+    if best is None:
         raise BackendUnavailable("no backend can do this: " + " | ".join(f"{n}: {'; '.join(r)}" for n, r in reasons_of.items()))
-    best = max(able, key=lambda backend: backend.speed)
     _warn_of_numba(best.name, reasons_of.get("cpu", []))
     others = [f"{n} cannot: {r[0]}" for n, r in reasons_of.items() if r]
     return best, f"{best.name}: the fastest that can serve the request{_note_in_brackets(best)}" + "".join(f"; {reason}" for reason in others)
+
+
+def _fastest(reasons_of: dict[str, list[str]]) -> Backend | None:
+    """The fastest of the backends that lack nothing; None if there is none."""
+    able = [get_backend(name) for name, reasons in reasons_of.items() if not reasons]
+    return max(able, key=lambda backend: backend.speed, default=None)
 
 
 def _warn_of_numba(chosen: str, reasons: Sequence[str]) -> None:

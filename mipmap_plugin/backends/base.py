@@ -56,6 +56,7 @@ class Rendered:
 
     Attributes:
         image: [H, W, 3] RGB, background included, not clamped.
+        alpha: [H, W], 1 - transmittance; may be given as a function, which is called on first access.
         depth: [H, W] world units, on request (`geometry.depth`); this and the following are added by a wrapped model.
         normals: [H, W, 3] unit vectors in the axes of the world, on request (`geometry.normals`).
         effects: The effects that were simulated, and those that were not.
@@ -119,7 +120,7 @@ class Capabilities:
 
     Attributes:
         devices: Torch device types; None: any.
-        dtypes: Of the splats.
+        dtypes: Of the splats; a loaded checkpoint has float32.
         screen_filters: Names of `Effects.screen_filter`.
         gradients: Whether images are differentiable in the splats.
         max_sh_degree: The highest degree of spherical harmonics that is evaluated.
@@ -220,20 +221,33 @@ class Stepper(Protocol):
 
 
 class Backend(Protocol):
-    """Renders Gaussians to an image with one sample per pixel; supersampling, depth and normals are built on top (`supersample`, `geometry`)."""
+    """Renders Gaussians to an image with one sample per pixel; supersampling, depth and normals are built on top (`supersample`, `geometry`).
+
+    A row with NaN or infinity has no effect, and a gradient of 0.
+
+    Attributes:
+        name: As in `--backend`.
+        api_version: `API_VERSION` of the contract that it was written for.
+        speed: Rank for `auto`, which takes the highest of the backends that can serve a request; 0 is that of the reference.
+
+    Optional members:
+
+    - `note: str`, shown wherever the backend is listed or chosen.
+    - `own_threads: bool`: its kernels have threads of their own (`threads.for_kernels`), return the same bytes on any number, and may run in
+      several threads at once; then torch has one while adapting.
+    - `blend_weights(gaussians, camera, effects) -> Tensor | None`: the sum of each splat's blend weights over the image, [N], or None where it
+      has to be found from gradients; `weigh_views(gaussians, shots) -> Tensor`: those of several views, [V, N], each shot a (camera, effects).
+    - `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call; adaptation steps are drawn so.
+    - `stepper(raw) -> Stepper`: for splats of 3DGS, with `raw` as `AdamStep.raw`; it keeps gradients from autograd and hands them to Adam
+      itself, row by row, which takes less time, and far less memory.
+    - `compile_ahead(gaussians, effects, calls)`: compile what such calls need.
+    """
 
     name: str
     api_version: int
-    # Rank for `auto`, which takes the highest of the backends that can serve a request. On a GPU: 50 triton, the fastest and closest to the
-    # reference (`benchmarks/results/gpu`); 40 gsplat; 20 inria, whose footprint and gradients differ most; 0 reference.
+    # On a GPU: 50 triton, the fastest and closest to the reference (`benchmarks/results/gpu`); 40 gsplat; 20 inria, whose footprint and gradients
+    # differ most; 0 reference.
     speed: int
-    # Optional: `note: str`, shown wherever the backend is listed or chosen. `own_threads: bool`: its kernels have threads of their own
-    # (`threads.for_kernels`), return the same bytes on any number, and may run in several threads at once; then torch has one while adapting.
-    # `blend_weights(gaussians, camera, effects) -> Tensor | None`: the sum of each splat's blend weights over the image, [N], or None where it has
-    # to be found from gradients; `weigh_views(gaussians, shots) -> Tensor`: those of several views, [V, N], each shot a (camera, effects).
-    # `render_views(gaussians, shots) -> list[Rendered]`: several views of the same splats in one call; adaptation steps are drawn so.
-    # `stepper(raw) -> Stepper`: for splats of 3DGS, with `raw` as `AdamStep.raw`; it keeps gradients from autograd and hands them to Adam
-    # itself, row by row, which takes less time, and far less memory. `compile_ahead(gaussians, effects, calls)`: compile what such calls need.
 
     def lacking(self, needs: Needs) -> list[str]:
         """The reasons why this backend cannot serve `needs`; empty if it can."""

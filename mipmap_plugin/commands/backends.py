@@ -8,9 +8,6 @@ from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 
-# The share of the cases that has to be run for a backend to pass. One with a single screen filter, degree 0 and no settings runs a sixth.
-LEAST_RUN = 1 / 20
-
 
 def backends(check: str | None = None, full: bool = False, json: bool = False) -> None:
     """List the backends and why each can or cannot adapt on this machine, or check one against the reference.
@@ -21,7 +18,7 @@ def backends(check: str | None = None, full: bool = False, json: bool = False) -
         full: With --check: also run hundreds of random scenes; several minutes.
         json: Print JSON.
     """
-    from mipmap_plugin.backends.conformance import summary
+    from mipmap_plugin.backends.conformance import LEAST_RUN, summary
     from mipmap_plugin.evaluation import backends as tables
 
     if full and check is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from tqdm import tqdm
@@ -33,16 +34,16 @@ def listing() -> list[BackendStatus]:
 
 
 def check(name: str, *, full: bool = False) -> list[Outcome]:
-    """Run the conformance suite on the first device that the backend serves; with `full`, including random cases.
+    """Run the conformance suite on the first device that the backend serves, in float32 if it can; with `full`, including random cases.
 
     Raises SettingsError for an unknown backend, BackendUnavailable for one that serves no device here.
     """
     backend = get_backend(name)
     cases = {**CASES, **MORE} if full else CASES
     with _one_thread():
-        for device in _devices():
+        for device, dtype in product(_devices(), (torch.float32, torch.float64)):
             progress = tqdm(cases.items(), disable=None, desc=f"checking {name} on {device}", unit="case")
-            outcomes = [outcome for case, build in progress for outcome in check_backend(backend, {case: build}, device=device)]
+            outcomes = [outcome for case, build in progress for outcome in check_backend(backend, {case: build}, dtype=dtype, device=device)]
             if not all(outcome.skipped for outcome in outcomes):
                 return outcomes
     raise BackendUnavailable(f"backend {name!r} cannot be checked here: {outcomes[0].message}")

@@ -9,6 +9,8 @@ from typing import Any
 from mipmap_plugin.evaluation.evaluate import Row
 from mipmap_plugin.evaluation.published import LPIPS_LABEL, Published
 
+WIDEST_REMARK = 40  # characters
+
 
 def table(rows: Sequence[Row]) -> str:
     """A Markdown table, legible in a terminal too. Scenes, LPIPS and reasons for ending have columns only where there are any."""
@@ -41,8 +43,9 @@ def _digits(value: float | None, digits: int) -> str:
 
 
 def markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A Markdown table with columns of constant width."""
+    """A Markdown table with columns of constant width. In the last one, long remarks stick out, or all lines would be as long as the longest."""
     widths = [max(len(line[i]) for line in [head, *body]) for i in range(len(head))]
+    widths[-1] = min(widths[-1], WIDEST_REMARK)
     lines = [head, ["-" * width for width in widths], *body]
     return "\n".join("| " + " | ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) + " |" for line in lines)
 

@@ -94,7 +94,7 @@ class SplatModel(Protocol):
     Attributes:
         family: The name of its family: "3dgs", "scaffold", ...
         trained: The screen filter and the sampling rate of the training.
-        notes: Remarks for the user on how it was read, in sentences.
+        notes: A list of remarks for the user on how it was read, in sentences.
         source: The file that was read; None: created in memory.
         folder: The model folder around it, whose cameras.json and cfg_args are read; None: there is none.
         digest: sha256 of the file, hexadecimal; "" for a model created in memory, such as a copy.
@@ -143,7 +143,7 @@ class SplatModel(Protocol):
         """A copy on another device."""
 
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool) -> None:
-        """Raise what `save` would raise for `path`, as far as it can be known before the work begins."""
+        """Raise what `save` would raise for `path`, as far as it can be known before the work begins: OutputError, OutputExists or SettingsError."""
 
     def save(self, path: str | Path, *, provenance: dict[str, Any], overwrite: bool = False) -> Path:
         """Write the model in the format that it was read from, atomically; return the file written. Raises OutputExists.

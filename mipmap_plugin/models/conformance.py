@@ -34,14 +34,22 @@ class ModelSuite:
             @pytest.fixture
             def checkpoint(self, tmp_path):
                 return write_a_small_one(tmp_path / "scene.mine")
+
+    Attributes:
+        family: The name that it is registered under.
+        cameras: Views of the scene; by default small ones of an orbit.
+        saved_as: Name of the file or folder that models are saved to; None: the one that the command line gives.
+        scale: Of the adaptation.
+        device: Second device of the test that moves the model.
+        settings: Of the adaptation.
     """
 
     family: str
-    cameras: Sequence[Camera] = ()  # empty: small views of an orbit
-    saved_as = "saved"  # name of the file or folder that an adapted model is saved to
-    scale = 1 / 2
-    device = "cpu"  # second device of the test that moves the model
-    settings: dict[str, Any] = dict(steps=2, extra_views=2, merge_to=1.0)  # of the adaptation  # noqa: RUF012
+    cameras: Sequence[Camera] = ()
+    saved_as: str | None = None
+    scale: float = 1 / 2
+    device: str = "cpu"
+    settings: dict[str, Any] = dict(steps=2, extra_views=2, merge_to=1.0)  # noqa: RUF012
 
     @pytest.fixture
     def base(self, checkpoint: Path) -> Wrapped:
@@ -64,8 +72,8 @@ class ModelSuite:
         before, copied, view = _tensors(base.model), base.model.copy(), base.cameras[0]
         base.backend(gradients=True)[0].render(copied.gaussians(view), view, base.effects()).image.sum().backward()
         gradients = {name: tensor.grad for name, tensor in copied.parameters().items() if tensor.grad is not None}
-        assert any(gradient.abs().sum() > 0 for gradient in gradients.values())
-        assert all(gradient.isfinite().all() for gradient in gradients.values())
+        assert any(gradient.abs().sum() > 0 for gradient in gradients.values()), "no parameter of a copy has a gradient"
+        assert all(gradient.isfinite().all() for gradient in gradients.values()), "gradients hold NaN or infinity"
         with torch.no_grad():
             for tensor in copied.parameters().values():
                 tensor.add_(1)
@@ -75,7 +83,7 @@ class ModelSuite:
         copied = base.model.copy()
         half = {name: tensor.detach()[: max(1, len(tensor) // 2)].clone().requires_grad_() for name, tensor in copied.parameters().items()}
         copied.replace_parameters(half)
-        assert all(copied.parameters()[name] is tensor for name, tensor in half.items())
+        assert all(copied.parameters()[name] is tensor for name, tensor in half.items()), "replace_parameters() has to keep the tensors themselves"
         assert contract.row_opacities(copied, base.cameras).shape == (len(half["means"]),)
         assert copied.gaussians(base.cameras[0]).means.isfinite().all()
 
@@ -117,24 +125,34 @@ class ModelSuite:
     def test_adapts_and_is_saved_and_loaded_again(self, base: Wrapped, checkpoint: Path, tmp_path: Path) -> None:
         with _untouched(base.model, checkpoint):
             adapted = base.adapt(self.scale, **self.settings)
-            saved = adapted.save(tmp_path / self.saved_as)
-        assert saved.is_file()
-        again = load_model(tmp_path / self.saved_as)
+            saved = adapted.save(path := self._output(checkpoint, tmp_path))
+        assert saved.is_file(), f"save() returned {saved}, where it wrote no file"
+        again = load_model(path)
         view = base.cameras[0].zoomed(self.scale)
         images = [adapted.render(view).image, wrap_model(again, cameras=base.cameras, backend="reference").render(view).image]
-        assert (images[0] - images[1]).abs().max() <= SAME
+        difference = (images[0] - images[1]).abs().max()
+        assert difference <= SAME, f"what is saved looks otherwise when it is read, by up to {difference:.3f}"
+
+    def test_a_name_without_an_ending_is_refused_or_read_again(self, base: Wrapped, tmp_path: Path) -> None:
+        path = tmp_path / "without-an-ending"
+        try:
+            base.model.refuse_output(path, overwrite=False, networks_move=False)
+        except (OutputError, OutputExists, SettingsError):
+            return
+        contract.save(base.model.copy(), path, {})
+        assert load_model(path)
 
     def test_is_read_again_under_the_name_that_the_command_line_gives(self, base: Wrapped, checkpoint: Path) -> None:
         path = checkpoint.with_name(adapted_name(checkpoint, self.scale))
         base.model.copy().save(path, provenance={})
         assert len(load_model(path).parameters()["means"]) == len(base.model.parameters()["means"])
 
-    def test_what_exists_is_not_replaced_unasked(self, base: Wrapped, tmp_path: Path) -> None:
-        saved = base.model.copy().save(tmp_path / self.saved_as, provenance={})
+    def test_what_exists_is_not_replaced_unasked(self, base: Wrapped, checkpoint: Path, tmp_path: Path) -> None:
+        saved = base.model.copy().save(path := self._output(checkpoint, tmp_path), provenance={})
         before = _digests(tmp_path)
         with pytest.raises(OutputExists):
-            base.model.copy().save(tmp_path / self.saved_as, provenance={"again": True})
-        assert saved.is_file() and _digests(tmp_path) == before
+            base.model.copy().save(path, provenance={"again": True})
+        assert saved.is_file() and _digests(tmp_path) == before, "save() without overwrite has changed files"
 
     def test_goes_to_another_device(self, base: Wrapped) -> None:
         moved = base.model.to(self.device)
@@ -142,7 +160,12 @@ class ModelSuite:
         with torch.no_grad():
             for tensor in moved.parameters().values():
                 tensor.zero_()
-        assert any(tensor.abs().sum() > 0 for tensor in base.model.parameters().values())
+        alone = any(tensor.abs().sum() > 0 for tensor in base.model.parameters().values())
+        assert alone, "to() returned tensors of the model itself, as torch's does on the same device; clone them"
+
+    def _output(self, checkpoint: Path, folder: Path) -> Path:
+        """Where a model adapted from the checkpoint is saved."""
+        return folder / "output" / (self.saved_as or adapted_name(checkpoint, self.scale))
 
 
 @contextmanager
@@ -164,7 +187,8 @@ def _assert_same(before: dict[str, Tensor], model: SplatModel) -> None:
 
 def _assert_looks_alike(base: Wrapped, *models: SplatModel) -> None:
     first, second = (Wrapped(model, base.cameras, "reference", base.trained).render(base.cameras[0]).image for model in models)
-    assert (first - second).abs().max() <= SAME
+    difference = (first - second).abs().max()
+    assert difference <= SAME, f"a picture changes by up to {difference:.3f}"
 
 
 def _digests(path: Path) -> dict[Path, str]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.errors import PluginError
+from mipmap_plugin.errors import CheckpointError, PluginError
 from mipmap_plugin.formats.atomic import staged
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.gaussians import Gaussians
@@ -28,6 +28,7 @@ from mipmap_plugin.models.base import (
     Traits,
     checked_splats,
 )
+from mipmap_plugin.models.detect import detect
 from mipmap_plugin.plugin_errors import is_third_party, naming, naming_any
 
 # What a model with a trait provides beside what every model does.
@@ -164,7 +165,8 @@ def _refuse_not_finite(model: SplatModel, call: str) -> None:
 
 
 def save(model: SplatModel, path: Path, provenance: dict[str, Any], *, overwrite: bool = False) -> Path:
-    """Save the model; return the file. Raises PluginError if there is none, or one that is not what its ending says, and what the model raises."""
+    """Save the model; return the file. Raises what the model raises, and PluginError if there is no file, or one that is not what its ending says
+    or that no family knows."""
     saved: Any = model.save(path, provenance=provenance, overwrite=overwrite)
     if not isinstance(saved, (str, Path)):
         wrong = f"save() has to return the path of the file that it wrote; it returned a {type(saved).__name__}"
@@ -182,3 +184,8 @@ def _refuse_unlike(family: str, saved: Path) -> None:
     if wanted and (kind := kind_of(file)) != wanted:
         mend = "write what the ending says, as VanillaModel.save does, or refuse it in refuse_output()"
         raise PluginError(f"{family}: save() wrote a file of the type {kind} to {saved}, which other programs take for a {wanted}; {mend}")
+    try:
+        detect(file)
+    except CheckpointError as error:
+        mend = "give it the ending by which the family knows its files; its author may refuse other names in refuse_output()"
+        raise PluginError(f"{family}: {saved} could not be read again, for no family recognizes what save() wrote under that name; {mend}") from error

@@ -116,8 +116,8 @@ def _most_certain(files: Files, claims: dict[str, tuple[Family, Match]], notes: 
 def _why_not(files: Files) -> str:
     path, kind = files.path, files.kind
     if path.suffix.lower() not in OWN_SUFFIXES and path.with_name(path.name + REPORT).is_file():
-        remedy = "install the package that adds that family (`mipmap-plugin list families` shows which are found)"
-        return f"{path} was adapted from a checkpoint of a family that is not installed here; {remedy}"
+        remedy = "install the package that adds that family (`mipmap-plugin list families` shows which are found), or give the file its ending again"
+        return f"{path} was adapted from a checkpoint of a family that is not installed here, or knows its files by another ending; {remedy}"
     if files.header:
         if len(missing := OF_SPLATS - files.columns) < len(OF_SPLATS) / 2:
             return f"{path} is no whole 3DGS checkpoint: it lacks the columns {', '.join(sorted(missing))}; export it again with them"

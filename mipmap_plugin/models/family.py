@@ -50,11 +50,16 @@ class Files:
     """The file that holds the splats, and the files around it. Each part is read once, on first access.
 
     Raises CheckpointError for files that cannot be read.
+
+    Attributes:
+        path: The file that holds the splats.
+        folder: The model folder around it; None: there is none.
+        iteration: That of the file in a model folder.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.folder, self.iteration = around(path)  # the model folder; None: there is none
+        self.folder, self.iteration = around(path)
 
     @cached_property
     def kind(self) -> str:

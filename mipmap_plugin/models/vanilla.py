@@ -40,16 +40,27 @@ FUSED = "its name says that a 3D filter is fused into it; if Mip-Splatting train
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where a model was read from, and the contents of its file that are kept unchanged."""
+    """Where a model was read from, and the contents of its file that are kept unchanged.
 
-    source: Path | None = None  # the PLY; None: created in memory
-    digest: str = ""  # sha256 of its bytes, hexadecimal
-    folder: Path | None = None  # the model folder around it
+    Attributes:
+        source: The file; None: created in memory.
+        digest: sha256 of its bytes, hexadecimal.
+        folder: The model folder around it, whose cameras.json and cfg_args are read; None: there is none.
+        iteration: Of a model folder, the one that was read.
+        comments: Those of a PLY's header.
+        extras: Columns of a PLY that 3DGS does not define, [N] each.
+        exposures: The trained color transformation of each photograph.
+        host: The other project whose file holds the splats; None: a PLY of 3DGS.
+    """
+
+    source: Path | None = None
+    digest: str = ""
+    folder: Path | None = None
     iteration: int | None = None
     comments: tuple[str, ...] = ()
-    extras: dict[str, np.ndarray] = field(default_factory=dict)  # columns that 3DGS does not define, [N] each
+    extras: dict[str, np.ndarray] = field(default_factory=dict)
     exposures: Exposures = NO_EXPOSURES
-    host: Host | None = None  # the other project whose file holds the splats; None: a PLY of 3DGS
+    host: Host | None = None
 
 
 class VanillaModel:

@@ -9,7 +9,7 @@ import torch
 
 from mipmap_plugin.backends.base import API_VERSION, Backend
 from mipmap_plugin.backends.conformance.cases import CASES
-from mipmap_plugin.backends.conformance.checks import check_case, check_steps, check_views, lowered
+from mipmap_plugin.backends.conformance.checks import LEAST_RUN, check_case, check_steps, check_views, fitted, lowered
 
 
 class BackendSuite:
@@ -17,6 +17,13 @@ class BackendSuite:
 
         class TestMine(BackendSuite):
             backend = MyBackend()
+
+    Cases that it says it lacks something for are skipped.
+
+    Attributes:
+        backend: An instance of your backend.
+        dtype: Of the splats that it is given.
+        device: Where they are.
     """
 
     backend: Backend
@@ -26,6 +33,12 @@ class BackendSuite:
     def test_declares_itself(self) -> None:
         assert self.backend.name and isinstance(self.backend.speed, int)
         assert self.backend.api_version == API_VERSION
+
+    def test_can_be_checked(self) -> None:
+        """Otherwise all is skipped, which looks like a success."""
+        reasons = [reasons for build in CASES.values() if (reasons := fitted(self.backend, build, dtype=self.dtype, device=self.device)[1])]
+        few = f"it can draw {len(CASES) - len(reasons)} of {len(CASES)} cases, too few to tell whether it is right"
+        assert len(CASES) - len(reasons) >= LEAST_RUN * len(CASES), f"{few}; of the others it says: {'; '.join(reasons[0])}"
 
     @pytest.mark.parametrize("case", CASES)
     def test_equals_the_reference(self, case: str) -> None:
