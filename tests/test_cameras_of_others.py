@@ -52,3 +52,16 @@ def test_a_view_has_the_same_name_with_its_photograph_and_without(tmp_path):
     with_photographs = read_transforms(path)
     assert len(with_photographs.images) == 3
     assert names == [camera.name for camera in with_photographs.cameras] == ["a", "b.1", "c"]
+
+
+@pytest.mark.parametrize(("size", "fits"), [((40, 30), True), ((13, 10), True), ((5, 4), True), ((30, 40), False), ((40, 22), False)])
+def test_a_photograph_that_was_turned_or_cropped_is_refused(tmp_path, size, fits):
+    """A camera that followed its shape would show a distorted scene."""
+    path, (width, height) = transforms(tmp_path), size
+    (tmp_path / "images").mkdir()
+    tiny.write_image(tmp_path / "images/a.JPG", tiny.torch.zeros(height, width, 3))
+    if fits:
+        assert read_transforms(path).cameras[0].size == (height, width)
+        return
+    with pytest.raises(SceneError, match=rf"frame 0 \(a\): its camera is of 40 x 30 px, but the photograph has {width} x {height} px"):
+        read_transforms(path)

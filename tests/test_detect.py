@@ -237,7 +237,7 @@ def test_the_suffix_of_a_ply_in_a_folder_may_be_in_capitals(tmp_path):
 
 def test_the_state_of_a_training_is_refused_with_what_to_give_instead(tmp_path):
     torch.save(((3, torch.zeros(2, 3)), 30000), tmp_path / "chkpnt30000.pth")
-    with pytest.raises(CheckpointError, match="the state of a training, .* give the model folder that it lies in"):
+    with pytest.raises(CheckpointError, match=r"the state of a training, .* give the model folder that it lies in"):
         detect(tmp_path / "chkpnt30000.pth")
 
 

@@ -14,7 +14,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
-from mipmap_plugin.scenes.base import ABSENT, Scene
+from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -123,6 +123,8 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
         if actual:
             name = image.stem if image else _stem(listed.replace("\\", "/").rsplit("/", 1)[-1])
             split = split if not isinstance(trained, list) else "train" if listed in trained else "test"
+            if stated:
+                refuse_other_shape(stated, actual, f"{where} ({name})")
             model = _lens_model(values, f"{where} ({name})")
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
             lens = _lens(values, model, camera, f"{where} ({name})")
