@@ -69,6 +69,13 @@ def test_photographs_of_another_folder_keep_the_field_of_view(tmp_path):
     assert scene.points is None
 
 
+def test_photographs_that_were_turned_are_refused(tmp_path):
+    write_text_model(tmp_path / "sparse/0", ["a.png"])
+    write_photographs(tmp_path / "images", ["a.png"], size=(48, 64))
+    with pytest.raises(SceneError, match=r"a.png: its camera is of 64 x 48 px, but the photograph has 48 x 64 px: it was turned or cropped"):
+        load_scene(tmp_path)
+
+
 @pytest.mark.parametrize(("resolution", "size"), [(1, (48, 64)), (2, (24, 32)), (8, (6, 8)), (-1, (48, 64)), (20, (15, 20))])
 def test_the_training_size_follows_r_with_photographs_and_without(tmp_path, resolution, size):
     write_text_model(tmp_path / "sparse/0", names(2))

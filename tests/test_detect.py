@@ -231,6 +231,16 @@ def test_real_companions_are_named(shared_data):
             load_model(folder / path)
 
 
+def test_the_suffix_of_a_ply_in_a_folder_may_be_in_capitals(tmp_path):
+    assert detect(write_splats(tmp_path / "My Scan (1).PLY", count=3).parent).path.name == "My Scan (1).PLY"
+
+
+def test_the_state_of_a_training_is_refused_with_what_to_give_instead(tmp_path):
+    torch.save(((3, torch.zeros(2, 3)), 30000), tmp_path / "chkpnt30000.pth")
+    with pytest.raises(CheckpointError, match=r"the state of a training, .* give the model folder that it lies in"):
+        detect(tmp_path / "chkpnt30000.pth")
+
+
 def test_a_folder_with_one_exchange_file_is_that_file(tmp_path):
     """As is one with one PLY, before which it does not come."""
     for name in ("cameras.json", "scene.SPZ"):

@@ -226,7 +226,7 @@ def test_the_normalized_world_is_found_again_whatever_half_turn_was_taken(tmp_pa
         assert (new.width, new.height, new.fx) == (32, 24, camera.fx / 4)
     with pytest.raises(SceneError, match="give the scene that gsplat was trained on"):
         model.as_trained(cameras, Capture(torch.tensor(points) @ torch.diag(torch.tensor([1.0, 9.0, 1.0])).double()))
-    with pytest.raises(SceneError, match="give the COLMAP scene"):
+    with pytest.raises(SceneError, match=r"give the COLMAP scene .* has to say normalize_world_space: false"):
         model.as_trained(cameras, Capture())
 
 

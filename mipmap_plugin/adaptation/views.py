@@ -185,6 +185,8 @@ def refuse_blind(views: Sequence[Camera], model: SplatModel, near: float, image_
     `near`: the near plane, in world units; `image_of`: a view's image [h, w, 3].
     """
     some, means = evenly(views, LOOKED_AT), model.parameters()["means"]
+    if not showing(some, means, near):  # a few of many cameras may see what is left of a scene that was cut down
+        some = evenly(showing(views, means, near), LOOKED_AT) or some
     if any(_draws(view, model, near) for view in some):
         if small := too_small(views, model, near, min(LEAST_PIXELS, LEAST_SHARE * min(views[0].size))):
             raise SettingsError(small)

@@ -123,6 +123,8 @@ def _why_not(files: Files) -> str:
             return f"{path} is no whole 3DGS checkpoint: it lacks the columns {', '.join(sorted(missing))}; export it again with them"
         columns = ", ".join(files.header.vertex.names[:8])
         return f"{path} is a plain point cloud or a mesh (columns {columns}), not Gaussian splats; give a trained model"
+    if kind == "torch" and re.fullmatch(r"chkpnt\w*\.pth", path.name):
+        return f"{path} is the state of a training, which 3DGS resumes from and which is not read here; give the model folder that it lies in"
     if kind == "torch":
         return f"{path} is a torch file that holds no known checkpoint; give a PLY file or a model folder"
     if path.suffix == ".npz":
@@ -147,7 +149,8 @@ def _detect_folder(folder: Path, iteration: int | None) -> Checkpoint:
         return _detect_step(family, folder, steps, iteration)
     if iteration is not None:
         raise CheckpointError(f"{folder} has no point_cloud/iteration_{iteration}; give the model folder above it, or no iteration")
-    clouds = sorted(folder.glob("*.ply")) or sorted(file for file in folder.glob("*") if _is_exchanged(file))
+    files = sorted(folder.iterdir())
+    clouds = [file for file in files if file.suffix.lower() == ".ply"] or [file for file in files if _is_exchanged(file)]
     clouds = [cloud for cloud in clouds if not cloud.with_name(cloud.name + REPORT).exists()] or clouds  # no adaptations, where there is a base
     if len(clouds) > 1 and folder / "point_cloud.ply" in clouds:
         clouds = [folder / "point_cloud.ply"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,9 @@ from mipmap_plugin.scenes.lenses import Lens
 
 # The word of notes on photographs that are not there.
 ABSENT = "absent"
+
+# How far the ratio of a photograph's sides may be from that of its camera: copies are rounded to whole pixels, some to multiples.
+SHAPE_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +110,17 @@ class Scene:
             raise SceneError(f"{self.source}: camera {camera.name!r} has no image; ask with a camera that is a key of `images`")
         image, lens = read_image(self.images[camera], background), self.lenses.get(self.images[camera])
         return image if lens is None else lens.undistorted(image)
+
+
+def refuse_other_shape(stated: tuple[int, int], photograph: tuple[int, int], where: str) -> None:
+    """Raise SceneError, beginning with `where`, for a photograph that is no copy of the size that its camera states: one that was turned or cropped.
+
+    Both are (width, height), px. Resized to such a photograph, the camera would show a distorted scene.
+    """
+    (wide, high), (width, height) = stated, photograph
+    if abs(math.log(wide * height / (high * width))) > SHAPE_TOLERANCE + 1 / min(width, height):
+        advice = "it was turned or cropped since; give the photographs that the cameras were found in, or leave them out"
+        raise SceneError(f"{where}: its camera is of {wide} x {high} px, but the photograph has {width} x {height} px: {advice}")
 
 
 def _undistorted_size(size: tuple[int, int], whole: Path, camera: Camera) -> tuple[int, int]:

@@ -53,7 +53,7 @@ def read_cameras(path: str | Path, cfg: dict[str, Any] | None = None) -> list[Ca
 def write_cameras(path: str | Path, cameras: Sequence[Camera], *, overwrite: bool = False) -> Path:
     """Write `cameras` as INRIA does, test views first; return the path. Raises OutputExists.
 
-    The format has no principal point: it is taken to be the image center.
+    A principal point off the image center is written as cx and cy, which INRIA's readers do not know and some descendants do.
     """
     ordered = sorted(cameras, key=lambda camera: camera.split != "test")
     write_json(Path(path), [_entry(index, camera) for index, camera in enumerate(ordered)], overwrite)
@@ -63,7 +63,9 @@ def write_cameras(path: str | Path, cameras: Sequence[Camera], *, overwrite: boo
 def _entry(index: int, camera: Camera) -> dict[str, Any]:
     to_world = camera.viewmat[:3, :3].T.tolist()
     where = {"position": camera.center.tolist(), "rotation": to_world}
-    return {"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height, **where, "fy": camera.fy, "fx": camera.fx}
+    centered = (camera.cx, camera.cy) == (camera.width / 2, camera.height / 2)
+    lens = {"fy": camera.fy, "fx": camera.fx} | ({} if centered else {"cx": camera.cx, "cy": camera.cy})
+    return {"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height, **where, **lens}
 
 
 def _tests(names: list[str], path: Path) -> set[int]:
@@ -135,10 +137,21 @@ def _name(entry: Any, where: str) -> str:
 
 
 def _camera(entry: dict[str, Any], name: str, split: Any, where: str) -> Camera:
-    """`rotation` is camera to world, `position` the eye; the principal point is the image center by construction."""
+    """`rotation` is camera to world, `position` the eye; INRIA has the principal point in the image center, and some descendants write it."""
     camera_to_world = rotation(present(entry, "rotation", where), f"{where}, rotation")
     position = numbers(present(entry, "position", where), (3,), f"{where}, position")
     viewmat = viewmat_of(camera_to_world, position)
     width, height = (pixels(present(entry, key, where), f"{where}, {key}") for key in ("width", "height"))
     fx, fy = (positive(present(entry, key, where), f"{where}, {key}") for key in ("fx", "fy"))
-    return Camera(width, height, fx, fy, width / 2, height / 2, viewmat, name, split)
+    cx, cy = (_principal_point(entry.get(key), side, f"{where}, {key}") for key, side in (("cx", width), ("cy", height)))
+    return Camera(width, height, fx, fy, cx, cy, viewmat, name, split)
+
+
+def _principal_point(value: Any, side: int, where: str) -> float:
+    """px from the edge; the middle of the `side` (px) if there is no value. Raises SceneError for what seems to be in another unit."""
+    if value is None:
+        return side / 2
+    number = numbers(value, (), where).item()
+    if abs(number) <= 1 < side / 2:  # a fraction of the image, or an offset from its center
+        raise SceneError(f"{where}: is {number:g}, but must be in pixels from the edge of the image; correct it, or leave it out if it is the center")
+    return number

@@ -12,7 +12,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError, brief
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import pixels
-from mipmap_plugin.scenes.base import ABSENT, Scene
+from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
 from mipmap_plugin.scenes.cameras_json import TEST_EVERY, photographs_folder, trained_size
 from mipmap_plugin.scenes.colmap_sizes import refuse_truncated
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, note
@@ -55,6 +55,7 @@ def read_colmap(path: str | Path, cfg: dict[str, Any] | None = None) -> Scene:
         exists, options = is_file(photograph), cfg
         if exists:
             size, options = image_size(photograph), {**cfg, "images": "images", "ds": 1}
+            refuse_other_shape((camera.width, camera.height), size, str(photograph))
             camera, lens = camera.resized(*size), lens and lens.at(size)
         if lens is not None:
             camera, lenses[photograph] = lens.straightened(camera), lens

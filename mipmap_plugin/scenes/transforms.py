@@ -14,7 +14,7 @@ from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SceneError
 from mipmap_plugin.formats.images import image_size, is_file
 from mipmap_plugin.formats.json_file import ROTATION_TOLERANCE, numbers, pixels, positive, present, read_json, rotation
-from mipmap_plugin.scenes.base import ABSENT, Scene
+from mipmap_plugin.scenes.base import ABSENT, Scene, refuse_other_shape
 from mipmap_plugin.scenes.lenses import INSTALL, Lens, can_undistort, note
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -35,7 +35,8 @@ OPENGL_TO_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.f
 def read_transforms(path: str | Path) -> Scene:
     """The scene of a folder with transforms files, or of one such file.
 
-    `transforms_test.json` is the test split, or `transforms_val.json` if there is none. A frame whose image is missing stays a
+    `transforms_test.json` is the test split, or `transforms_val.json` if there is none; in a file that lists the frames of training
+    (`train_filenames`), as nerfstudio's may, all others are. A frame whose image is missing stays a
     view if the file states its size (`w`, `h`), and is left out otherwise; `notes` count both.
 
     Raises:
@@ -108,7 +109,7 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
         lacks = "has no list of 'frames'" if frames != [] else "lists no frames"
         raise SceneError(f"{file}: {lacks}; give a NeRF-Synthetic, instant-ngp or nerfstudio transforms file")
     views: list[tuple[Camera, Path | None, Lens | None]] = []
-    absent = 0
+    absent, trained = 0, data.get("train_filenames")
     for index, frame in enumerate(frames):
         where = f"{file}, frame {index}"
         if not isinstance(frame, dict):
@@ -120,7 +121,10 @@ def _read_file(file: Path, split: Literal["train", "test"]) -> tuple[list[tuple[
         stated = _stated_size(values, where)
         actual = image_size(image) if image else stated  # the image may have been shrunk since
         if actual:
-            name = image.stem if image else listed.replace("\\", "/").rsplit("/", 1)[-1]
+            name = image.stem if image else _stem(listed.replace("\\", "/").rsplit("/", 1)[-1])
+            split = split if not isinstance(trained, list) else "train" if listed in trained else "test"
+            if stated:
+                refuse_other_shape(stated, actual, f"{where} ({name})")
             model = _lens_model(values, f"{where} ({name})")
             camera = _camera(values, stated or actual, name, split, f"{where} ({name})").resized(*actual)
             lens = _lens(values, model, camera, f"{where} ({name})")
@@ -144,6 +148,11 @@ def _image(folder: Path, listed: str) -> Path | None:
     """The image file of a `file_path`, which may lack its suffix; None if it is missing."""
     stem = listed.replace("\\", "/")
     return next((folder / f"{stem}{suffix}" for suffix in IMAGE_SUFFIXES if is_file(folder / f"{stem}{suffix}")), None)
+
+
+def _stem(name: str) -> str:
+    """The name of a view whose image is absent: that of the image, without the suffix if it has one."""
+    return next((name.removesuffix(suffix) for suffix in IMAGE_SUFFIXES[1:] if name.endswith(suffix)), name)
 
 
 def _stated_size(values: Mapping[str, Any], where: str) -> tuple[int, int] | None:

@@ -79,7 +79,8 @@ class GsplatHost:
             return resized
         if points is None:
             advice = "give the COLMAP scene that it was trained on"
-            raise SceneError(f"gsplat trained in a normalized coordinate frame, which is computed from the points of COLMAP: {advice}")
+            own = "if its cameras are in the frame of the splats, the cfg.yml of its result folder has to say normalize_world_space: false"
+            raise SceneError(f"gsplat trained in a normalized coordinate frame, which is computed from the points of COLMAP: {advice}; {own}")
         frame = normalized_frame(cameras, points, means)
         return [camera.moved(frame) for camera in resized]
 

@@ -1,0 +1,48 @@
+"""Which cameras see anything: of a capture that was cut down to one object, most do not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from torch import Tensor
+
+from mipmap_plugin.adaptation.views import showing
+from mipmap_plugin.adaptation.warn import warn
+from mipmap_plugin.camera import Camera
+from mipmap_plugin.models.base import SplatModel
+
+# Splats that are looked for at first, for nearly every camera sees one of so many, and then by the others: a camera takes 75 ms for a million.
+SOME, MANY = 1 << 14, 1 << 16
+
+# A camera counts as seeing a splat whose center lies in a frame this many times as large as its picture: splats reach into a picture from beside it.
+LARGER = 2
+
+
+def seeing(cameras: Sequence[Camera], model: SplatModel, near: float) -> list[Camera]:
+    """The cameras that see something of the model, with a warning of how many do not. `near`: the near plane, in world units.
+
+    All of them where none sees anything, or none that the base was trained on, and of a moving model, whose splats are elsewhere at other moments.
+    """
+    if len(cameras) < 2 or model.traits.moves:
+        return list(cameras)
+    frames = {_larger(camera): camera for camera in cameras}
+    found = {frames[frame] for frame in _seeing(list(frames), model.parameters()["means"], near)}
+    if len(found) == len(cameras) or not any(camera.split == "train" for camera in found):
+        return list(cameras)
+    blind = len(cameras) - len(found)
+    warn(f"{blind} of {len(cameras)} cameras {'sees no splat, and is' if blind == 1 else 'see no splat, and are'} left out")
+    return [camera for camera in cameras if camera in found]
+
+
+def _seeing(frames: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
+    """The frames with one of the `means` [N, 3] inside, of many evenly chosen ones."""
+    some, many = (means[:: max(1, len(means) // most)] for most in (SOME, MANY))
+    found = showing(frames, some, near)
+    known = set(found)
+    return found + showing([frame for frame in frames if frame not in known], many, near)
+
+
+def _larger(camera: Camera) -> Camera:
+    width, height = LARGER * camera.width, LARGER * camera.height
+    return replace(camera, width=width, height=height, cx=camera.cx + (width - camera.width) / 2, cy=camera.cy + (height - camera.height) / 2)

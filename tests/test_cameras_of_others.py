@@ -1,0 +1,67 @@
+"""Cameras as other tools than INRIA's write them: what their files say beyond its format is not lost."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import tiny
+
+from mipmap_plugin.errors import SceneError
+from mipmap_plugin.scenes import read_cameras, read_transforms, write_cameras
+
+POSE = [[1, 0, 0, 1.0], [0, 1, 0, 2.0], [0, 0, 1, 3.0], [0, 0, 0, 1]]
+
+
+def test_a_principal_point_in_a_cameras_json_is_read(tmp_path):
+    """Descendants of 3DGS write it; without it the picture would be shifted."""
+    cropped, centered = replace(tiny.cameras(1)[0], cx=11.0, cy=15.5), replace(tiny.cameras(2)[1], name="b")
+    path = write_cameras(tmp_path / "cameras.json", [cropped, centered])
+    assert [(camera.cx, camera.cy) for camera in read_cameras(path)] == [(11.0, 15.5), (centered.cx, centered.cy)]
+    assert "cx" not in json.loads(path.read_text())[1]
+    halved = read_cameras(path, {"resolution": 2})[0]
+    assert (halved.width, halved.cx, halved.cy) == (cropped.width // 2, 5.5, 7.75)
+
+
+@pytest.mark.parametrize("wrong", [0.5, -0.02, "left"])
+def test_a_principal_point_in_other_units_is_refused(tmp_path, wrong):
+    path = write_cameras(tmp_path / "cameras.json", [replace(tiny.cameras(1)[0], cx=11.0)])
+    path.write_text(path.read_text().replace("11.0", json.dumps(wrong)))
+    with pytest.raises(SceneError, match=r"entry 0 \(view_0\), cx: is "):
+        read_cameras(path)
+
+
+def transforms(folder, **facts):
+    frames = [{"file_path": f"images/{name}.JPG", "transform_matrix": POSE} for name in ("a", "b.1", "c")]
+    path = folder / "transforms.json"
+    path.write_text(json.dumps({"w": 40, "h": 30, "fl_x": 50.0, "frames": frames, **facts}))
+    return path
+
+
+def test_a_transforms_file_may_list_the_frames_of_each_split(tmp_path):
+    lists = {"train_filenames": ["images/a.JPG", "images/c.JPG"], "val_filenames": ["images/b.1.JPG"], "test_filenames": ["images/b.1.JPG"]}
+    assert [camera.split for camera in read_transforms(transforms(tmp_path, **lists)).cameras] == ["train", "test", "train"]
+    assert [camera.split for camera in read_transforms(transforms(tmp_path)).cameras] == ["train"] * 3
+
+
+def test_a_view_has_the_same_name_with_its_photograph_and_without(tmp_path):
+    path = transforms(tmp_path)
+    names = [camera.name for camera in read_transforms(path).cameras]
+    (tmp_path / "images").mkdir()
+    for name in names:
+        tiny.write_image(tmp_path / "images" / f"{name}.JPG", tiny.torch.zeros(30, 40, 3))
+    with_photographs = read_transforms(path)
+    assert len(with_photographs.images) == 3
+    assert names == [camera.name for camera in with_photographs.cameras] == ["a", "b.1", "c"]
+
+
+@pytest.mark.parametrize(("size", "fits"), [((40, 30), True), ((13, 10), True), ((5, 4), True), ((30, 40), False), ((40, 22), False)])
+def test_a_photograph_that_was_turned_or_cropped_is_refused(tmp_path, size, fits):
+    """A camera that followed its shape would show a distorted scene."""
+    path, (width, height) = transforms(tmp_path), size
+    (tmp_path / "images").mkdir()
+    tiny.write_image(tmp_path / "images/a.JPG", tiny.torch.zeros(height, width, 3))
+    if fits:
+        assert read_transforms(path).cameras[0].size == (height, width)
+        return
+    with pytest.raises(SceneError, match=rf"frame 0 \(a\): its camera is of 40 x 30 px, but the photograph has {width} x {height} px"):
+        read_transforms(path)
