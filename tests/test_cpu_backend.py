@@ -353,7 +353,7 @@ def test_without_numba_the_error_says_what_to_install(monkeypatch):
     assert BACKEND.lacking(needs) == [NO_NUMBA]
     with pytest.raises(BackendUnavailable, match=r"pip install 'mipmap-plugin\[cpu\]'"):
         BACKEND.render(g, camera(), Effects(1))
-    with pytest.warns(UserWarning, match="it needs numba; .* until then the backend reference does, many times slower"):
+    with pytest.warns(UserWarning, match="numba, which some .* have no wheels of; .*; the backend reference takes its place, many times slower"):
         assert choose_backend("auto", needs)[0].name == "reference"
 
 

@@ -23,9 +23,9 @@ from mipmap_plugin.screen_filters import INTEGRATED
 from mipmap_plugin.splatting.buckets import ranks_for
 from mipmap_plugin.splatting.packing import packed
 
-NO_NUMBA = f"it needs numba; {install('cpu')}"
+NO_NUMBA = f"it needs numba, which some Pythons and processors have no wheels of; where there are, {install('cpu')}"
 NO_FOLDER = "numba has no writable folder for compiled code; set the environment variable NUMBA_CACHE_DIR to one"
-REINSTALL = "run pip install --force-reinstall numba, which brings all that it needs"
+REINSTALL = "install it anew, where there are wheels by pip install --force-reinstall numba, which brings all that it needs"
 
 # The position of the coefficients among the arguments of `_Draw.forward`.
 SH = 5
