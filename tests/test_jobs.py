@@ -79,6 +79,18 @@ def test_a_broken_scene_does_not_stop_the_others(run, scenes):
     assert {path.name for path in scenes.iterdir()} >= {"chair_x0.5", "chair_x4", "lego_x0.5", "lego_x4"}
 
 
+def test_jobs_that_fail_side_by_side_leave_no_empty_folder(run, scenes, tmp_path, monkeypatch):
+    """Each of them removes what it made, but not what the other one had made before."""
+
+    def failing(many, jobs, threads):
+        jobs[0].target.parent.mkdir(parents=True)
+        yield from (Outcome(job, "failed", reason="the disk is full") for job in jobs)
+
+    monkeypatch.setattr("mipmap_plugin.commands.many.engine", failing)
+    assert run("adapt", scenes / "lego", scenes / "chair", "--scale", "1/2", "--output", tmp_path / "new" / "out")[0] == 2
+    assert not (tmp_path / "new").exists()
+
+
 def test_no_job_replaces_the_base_of_another(run, tmp_path):
     for seed, name in enumerate(("a.ply", "a_x0.5.ply")):
         tiny.ply(tmp_path / name, seed=seed)
