@@ -18,6 +18,7 @@ import tiny
 from running import saving_often, wait_until
 
 from mipmap_plugin.adaptation.optimization.loop import adapt
+from mipmap_plugin.adaptation.optimization.validation import MIN_VIEWS
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists, SettingsError
@@ -236,6 +237,15 @@ def test_a_large_scene_that_took_fewer_steps_is_finished(tmp_path, monkeypatch):
     assert finished(job) is not None and run_job(job).status == "finished before"
     for other in ({"steps": 8}, {"extra_views": 40}):  # the former takes all of them
         assert finished(replace(job, settings=job.settings | other)) is None
+
+
+def test_a_file_is_finished_by_the_views_for_validation_that_were_asked_for(tmp_path):
+    """A time budget, here one for the fewest, does not tell these from fewer that somebody asked for."""
+    job = job_of(tmp_path, settings={"steps": 1, "seed": 0, "views": "given", "time_budget_s": 1e-3}, overwrite=True)
+    fewest = replace(job, settings=job.settings | {"validation_views": MIN_VIEWS})
+    for made, other in ((fewest, job), (job, fewest)):
+        assert run_job(made).status == "done"
+        assert finished(made) is not None and finished(other) is None
 
 
 def test_another_base_or_another_file_is_not_finished(tmp_path):
