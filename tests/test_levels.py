@@ -536,6 +536,11 @@ def test_an_interruption_is_told_also_where_somebody_has_deleted_the_folder(tmp_
         make_levels(base, request(), resume=tmp_path / "state")
 
 
+def test_a_ladder_in_memory_keeps_no_truths():
+    """It is written as PLYs, which round nothing."""
+    assert [level.adapted.judge for level in make_levels(wrapped(), request(coarsest=1.0)).levels] == [None]
+
+
 def test_levels_that_another_run_kept_meanwhile_are_not_mixed_with_these(tmp_path, monkeypatch):
     base = wrapped()
     adapt = base.adapt

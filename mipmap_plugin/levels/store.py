@@ -58,7 +58,7 @@ class LevelStore:
         Raises OutputError, and what `__init__` raises for a folder in which another run has kept levels meanwhile.
         """
         if self._folder is None:
-            return make(None)
+            return replace(make(None), judge=None)  # a level is written as a PLY, which rounds nothing that is to be measured
         file = self._folder / f"{name}.ply"
         if not file.with_name(file.name + REPORT).is_file():
             refuse_unwritable(file)
