@@ -74,7 +74,6 @@ def test_a_time_budget_bounds_the_views_for_validation_alike_on_each_machine(sec
     view, asked = replace(tiny.cameras(1)[0], viewmat=torch.eye(4)), recipe("default", 1 / 4, time_budget_s=seconds)
     taken = affordable_for_model(asked, base, [view], near=0.2)
     assert taken.validation_views == views == affordable_for_model(asked, base, [], near=0.2).validation_views
-    assert as_taken(asked, taken) == taken
     assert affordable_for_model(recipe("default", 1 / 4, steps=9), base, [view], near=0.2).validation_views == 16
 
 

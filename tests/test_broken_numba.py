@@ -30,7 +30,7 @@ def run(tmp_path):
 
 
 def test_torch_takes_its_place(run):
-    said = f"mipmap-plugin: backend cpu cannot do this: {REMEDY}; until then the backend reference does, many times slower"
+    said = f"mipmap-plugin: backend cpu cannot do this: {REMEDY}; the backend reference takes its place, many times slower"
     assert run("auto") == (0, [said])
 
 

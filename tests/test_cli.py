@@ -1,11 +1,13 @@
 """The command line: what it prints and writes, its exit codes, and one sentence instead of a traceback for everything that is wrong."""
 
 import errno
+import gc
 import json
 import re
 import signal
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,7 +32,7 @@ from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
-from mipmap_plugin.wrap import wrap_model
+from mipmap_plugin.wrap import Wrapped, wrap_model
 
 QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
 NO_STEP = ["--backend", "reference", "--steps", "0"]
@@ -195,6 +197,21 @@ def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
     log = (tmp_path / "log.txt").read_text()
     assert "ended by 2 steps" in log and "backend reference: requested" in log and "the 4 given views" in log
     assert not list(tmp_path.rglob("*.resume"))
+
+
+def test_a_file_that_is_written_takes_no_memory_while_the_next_is_made(run, model_folder, tmp_path, monkeypatch):
+    made, left, adapt = [], [], Wrapped.adapt
+
+    def watched(*arguments, **options):
+        gc.collect()
+        left.append([each() for each in made])
+        adapted = adapt(*arguments, **options)
+        made.append(weakref.ref(adapted))
+        return adapted
+
+    monkeypatch.setattr(Wrapped, "adapt", watched)
+    assert run("adapt", model_folder, "--scale", "1/4", "--scale", "1/2", "--output", tmp_path / "out", *NO_STEP)[0] == 0
+    assert left == [[], [None]]
 
 
 def test_adapt_writes_beside_the_checkpoint_unless_told_otherwise(run, tmp_path):

@@ -1,6 +1,8 @@
 """A zoom-in for a renderer that draws otherwise than the training did: the conversion before it."""
 
+import gc
 import signal
+import weakref
 
 import pytest
 import tiny
@@ -64,6 +66,23 @@ def test_a_zoom_in_starts_from_it_and_tells_so():
     assert report.notes[-1].startswith("converted at x1 before, ") and report.notes[-1].endswith(", in 3 steps")
     assert 0 < report.seconds["conversion"] < report.seconds["total"]
     assert report.curve[0].seconds > report.seconds["conversion"]
+
+
+def test_the_first_stage_is_forgotten_before_the_second(monkeypatch):
+    """The truths of its views take megabytes, and nothing reads them any more."""
+    stages, left = [], []
+    run = Session.run
+
+    def watched(session, *arguments):
+        gc.collect()
+        left.append([stage() for stage in stages])
+        done = run(session, *arguments)
+        stages.extend((weakref.ref(session), weakref.ref(done.judge)))
+        return done
+
+    monkeypatch.setattr(Session, "run", watched)
+    wrapped().adapt(2, viewer="antialiased", **BRIEF)
+    assert left == [[], [None, None]]
 
 
 def test_what_no_view_shows_is_told_once_and_of_the_base(monkeypatch):

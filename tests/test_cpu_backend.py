@@ -347,18 +347,18 @@ def test_torch_still_works_after_its_idle_threads_were_dismissed(threads_for_any
 
 
 def test_without_numba_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: NO_NUMBA)
+    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: [NO_NUMBA])
     g = gaussians(2, dtype=torch.float32)
     needs = Needs.of(g, Effects(1), gradients=True)
     assert BACKEND.lacking(needs) == [NO_NUMBA]
     with pytest.raises(BackendUnavailable, match=r"pip install 'mipmap-plugin\[cpu\]'"):
         BACKEND.render(g, camera(), Effects(1))
-    with pytest.warns(UserWarning, match="it needs numba; .* until then the backend reference does, many times slower"):
+    with pytest.warns(UserWarning, match="numba, which some .* have no wheels of; .*; the backend reference takes its place, many times slower"):
         assert choose_backend("auto", needs)[0].name == "reference"
 
 
 @pytest.mark.filterwarnings("error")
 def test_numba_is_not_missed_where_it_would_not_do(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: NO_NUMBA)
+    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: [NO_NUMBA])
     usual = Needs.of(gaussians(2, dtype=torch.float32), Effects(1), gradients=True)
     assert choose_backend("auto", usual, replace(usual, screen_filter="surfel"))[0].name == "reference"

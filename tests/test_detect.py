@@ -1,6 +1,7 @@
 """Detection: every family and exchange format by its bytes, and the right file of a model folder."""
 
 import gzip
+import random
 
 import numpy as np
 import pytest
@@ -104,6 +105,14 @@ def test_other_files(tmp_path, content, sentence):
     (tmp_path / "a.bin").write_bytes(content)
     with pytest.raises(CheckpointError, match=sentence):
         detect(tmp_path / "a.bin")
+
+
+@pytest.mark.parametrize("name", ["a.splat", "b.spz", "c.SOG", "d.ksplat", "e.ply"])
+def test_a_damaged_file_of_splats_is_called_so(tmp_path, name):
+    file = tmp_path / name
+    file.write_bytes(random.Random(1).randbytes(320))
+    with pytest.raises(CheckpointError, match=rf"{name} is damaged, cut off or no {file.suffix.lower()} file; download or export it again"):
+        detect(file)
 
 
 def test_a_capture_in_lcc_is_converted_first(tmp_path):

@@ -18,6 +18,7 @@ import tiny
 from running import saving_often, wait_until
 
 from mipmap_plugin.adaptation.optimization.loop import adapt
+from mipmap_plugin.adaptation.optimization.validation import MIN_VIEWS
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.cli import main
 from mipmap_plugin.errors import OutputExists, SettingsError
@@ -77,6 +78,18 @@ def test_a_broken_scene_does_not_stop_the_others(run, scenes):
     assert code == 2 and "2 of 6 jobs failed" in err
     assert "6 jobs: 2 failed, 4 done" in out and "broken.ply" in out
     assert {path.name for path in scenes.iterdir()} >= {"chair_x0.5", "chair_x4", "lego_x0.5", "lego_x4"}
+
+
+def test_jobs_that_fail_side_by_side_leave_no_empty_folder(run, scenes, tmp_path, monkeypatch):
+    """Each of them removes what it made, but not what the other one had made before."""
+
+    def failing(many, jobs, threads):
+        jobs[0].target.parent.mkdir(parents=True)
+        yield from (Outcome(job, "failed", reason="the disk is full") for job in jobs)
+
+    monkeypatch.setattr("mipmap_plugin.commands.many.engine", failing)
+    assert run("adapt", scenes / "lego", scenes / "chair", "--scale", "1/2", "--output", tmp_path / "new" / "out")[0] == 2
+    assert not (tmp_path / "new").exists()
 
 
 def test_no_job_replaces_the_base_of_another(run, tmp_path):
@@ -224,6 +237,15 @@ def test_a_large_scene_that_took_fewer_steps_is_finished(tmp_path, monkeypatch):
     assert finished(job) is not None and run_job(job).status == "finished before"
     for other in ({"steps": 8}, {"extra_views": 40}):  # the former takes all of them
         assert finished(replace(job, settings=job.settings | other)) is None
+
+
+def test_a_file_is_finished_by_the_views_for_validation_that_were_asked_for(tmp_path):
+    """A time budget, here one for the fewest, does not tell these from fewer that somebody asked for."""
+    job = job_of(tmp_path, settings={"steps": 1, "seed": 0, "views": "given", "time_budget_s": 1e-3}, overwrite=True)
+    fewest = replace(job, settings=job.settings | {"validation_views": MIN_VIEWS})
+    for made, other in ((fewest, job), (job, fewest)):
+        assert run_job(made).status == "done"
+        assert finished(made) is not None and finished(other) is None
 
 
 def test_another_base_or_another_file_is_not_finished(tmp_path):

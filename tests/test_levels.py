@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import pairwise
@@ -502,17 +503,63 @@ def test_a_first_level_whose_state_cannot_be_written_leaves_nothing(tmp_path, mo
     assert not (tmp_path / "new").exists()
 
 
+def test_a_ladder_that_is_killed_before_its_first_level_leaves_its_state_at_most(tmp_path, monkeypatch):
+    base, state = wrapped(), tmp_path / "new" / "state"
+    adapt, found = base.adapt, []
+
+    def watched(scale, **options):
+        return adapt(scale, observe=lambda *_: found.append({each.name for each in state.iterdir()}), **options)
+
+    monkeypatch.setattr(base, "adapt", watched)
+    make_levels(base, request(coarsest=1.0, steps=2), resume=state)
+    assert len(found) == 3 and set().union(*found) == {".level_0.ply.resume.lock"}
+
+
+def test_what_a_ladder_that_was_killed_leaves_is_in_nobodys_way(tmp_path):
+    for left in ("level_0.ply.resume.lock", "request.json.0.tmp"):  # of a process that has ended
+        (tmp_path / f".{left}" / "new").mkdir(parents=True)
+    ladder = make_levels(wrapped(), request(coarsest=1.0), resume=tmp_path)
+    assert {each.name for each in tmp_path.iterdir()} == {"request.json", "level_0.ply", "level_0.ply.adaptation.json"} and ladder.levels
+
+
 def test_a_ladder_whose_first_level_has_a_state_keeps_it(tmp_path, monkeypatch):
+    base, state = wrapped(), tmp_path / "state"
+    monkeypatch.setattr("mipmap_plugin.adaptation.session.adapt", lambda run, task, config, on_interrupt, observe: on_interrupt(run))
+    with pytest.raises(Interrupted):
+        make_levels(base, request(steps=1), resume=state)
+    monkeypatch.undo()
+    assert [each.name for each in state.iterdir()] == ["level_0.ply.resume"]
+    assert make_levels(base, request(steps=1, coarsest=1.0), resume=state).levels  # its first level is the same
+
+
+def test_an_interruption_is_told_also_where_somebody_has_deleted_the_folder(tmp_path, monkeypatch):
     base = wrapped()
 
-    def begun(scale, resume, **_):
-        resume.write_text("a state")
+    def interrupted(scale, resume, **_):
+        shutil.rmtree(resume.parent, ignore_errors=True)
         interrupt()
 
-    monkeypatch.setattr(base, "adapt", begun)
-    with pytest.raises(Interrupted):
+    monkeypatch.setattr(base, "adapt", interrupted)
+    with pytest.raises(Interrupted, match="Ctrl-C"):
         make_levels(base, request(), resume=tmp_path / "state")
-    assert {each.name for each in (tmp_path / "state").iterdir()} == {"request.json", "level_0.ply.resume"}
+
+
+def test_a_ladder_in_memory_keeps_no_truths():
+    """It is written as PLYs, which round nothing."""
+    assert [level.adapted.judge for level in make_levels(wrapped(), request(coarsest=1.0)).levels] == [None]
+
+
+def test_levels_that_another_run_kept_meanwhile_are_not_mixed_with_these(tmp_path, monkeypatch):
+    base = wrapped()
+    adapt = base.adapt
+
+    def overtaken(scale, **options):
+        make_levels(wrapped(), request(coarsest=0.6), resume=tmp_path / "state")
+        return adapt(scale, **options)
+
+    monkeypatch.setattr(base, "adapt", overtaken)
+    with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
+        make_levels(base, request(), resume=tmp_path / "state")
 
 
 def test_a_damaged_unfinished_ladder_is_told(tmp_path):

@@ -242,12 +242,15 @@ def test_a_failed_conversion_leaves_nothing(ladder, tool):
     assert not (ladder / "streamed").exists()
 
 
-@pytest.mark.parametrize("by", ["zoom", "distance"])
-def test_streamed_sog_of_one_level_is_refused_before_any_work(tmp_path, tool, capsys, monkeypatch, by):
+@pytest.mark.parametrize(
+    ("bound", "value", "by"), [("--coarsest", "0.9", "zoom"), ("--coarsest", "0.9", "distance"), ("--until-splats", "1000", "zoom")]
+)
+def test_streamed_sog_of_one_level_is_refused_before_any_work(tmp_path, tool, capsys, monkeypatch, bound, value, by):
     monkeypatch.setattr("mipmap_plugin.levels.ladder.make_levels", None)
-    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "0.9"]
+    words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), bound, value]
     assert cli.main([*words, "--by", by, "--streamed-sog"]) == 2
-    assert "a single level" in capsys.readouterr().err and not (tmp_path / "ladder").exists()
+    assert f"a single level, which needs no streaming; give a smaller {bound}, or" in capsys.readouterr().err
+    assert not (tmp_path / "ladder").exists()
 
 
 def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not_stream_it(tmp_path, tool, capsys, monkeypatch):
@@ -255,7 +258,8 @@ def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not
     words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
     words += ["--by", "zoom", "--recipe", "instant", "--views", "given", "--backend", "reference"]
     assert cli.main([*words, "--streamed-sog"]) == 2
-    assert "leave --streamed-sog out, which goes on from what is made" in capsys.readouterr().err and not (tmp_path / "ladder").exists()
+    told = "a single level, which needs no streaming; leave --streamed-sog out, which goes on from what is made"
+    assert told in capsys.readouterr().err and not (tmp_path / "ladder").exists()
     monkeypatch.setattr("mipmap_plugin.wrap.Wrapped.adapt", None)
     assert cli.main(words) == 0 and (tmp_path / "ladder" / "level_0.ply").is_file()
 

@@ -32,7 +32,7 @@ def test_a_pixel_is_that_of_the_closest_view_that_sees_the_splat():
 
 
 def test_a_broken_numba_leaves_it_to_torch(monkeypatch):
-    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: "numba does not load")
+    monkeypatch.setattr("mipmap_plugin.backends.cpu.missing", lambda: ["numba does not load"])
     torch.testing.assert_close(pixel_size(torch.tensor([[0.0, 0.0, 4.0]]), [VIEW]), torch.tensor([4.0]) / FOCAL)
 
 

@@ -36,6 +36,7 @@ from mipmap_plugin.models.mip import MipModel
 from mipmap_plugin.models.vanilla import VanillaModel, load_vanilla
 from mipmap_plugin.recipes import recipe
 from mipmap_plugin.scenes import write_cameras
+from mipmap_plugin.screen_filters import DILATION
 from mipmap_plugin.tiles import plan, run, slabs, steering, tile, truth
 from mipmap_plugin.tiles.cut import cut, front_to_back
 from mipmap_plugin.tiles.folder import work_folder
@@ -251,6 +252,17 @@ def test_no_start_is_worse_than_the_base(job, monkeypatch, psnrs, name):
     scene, folder = cut_in_three(job, merge_to=0.5, merging_costs=20.0)
     measured = iter(psnrs)
     monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
+    StartSearch(scene, folder).run()
+    assert torch.load(folder / "start.pt")["name"] == name and not list(measured)
+
+
+@pytest.mark.parametrize(("eps2d", "name"), [(0.1, "the closed form of merged splats"), (DILATION, "the closed form")])
+def test_the_mildest_merging_may_cost_more_before_steps_for_another_renderer(job, monkeypatch, eps2d, name):
+    scene, folder = cut_in_three(job, merge_to=0.5)
+    scene.target = replace(scene.target, eps2d=eps2d)
+    measured = iter((20.0, 30.0, 29.5, 29.5, 29.5))  # the base, the closed form, and what is merged less and less
+    monkeypatch.setattr("mipmap_plugin.tiles.start.psnr", lambda *_: next(measured))
+    monkeypatch.setattr("mipmap_plugin.tiles.start.draws_alike", lambda *_: False)
     StartSearch(scene, folder).run()
     assert torch.load(folder / "start.pt")["name"] == name and not list(measured)
 

@@ -72,8 +72,9 @@ class Stages:
             return Session(self.request, scale, config, self.cameras, self.photographs).run(self.resume, self.observe)
         session = Session(self.request, 1.0, first, self.cameras, None)
         session.keeps_state = True
-        converted = session.run(self.resume and conversion_state(self.resume), self.observe)
+        converted = replace(session.run(self.resume and conversion_state(self.resume), self.observe), judge=None)  # which nobody saves
         stopped = session.ended is End.OBSERVER
+        del session  # with the truths of its views
         half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if stopped else {}))
         request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, told=True), budget_share=SHARE)
         with _kept_if_interrupted(converted.states):

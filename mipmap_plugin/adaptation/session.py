@@ -85,7 +85,7 @@ class Session:
         self.effects = next(iter(self.targets.values()))
         self.extremes, self.start_target = extreme_targets(self.targets), median_target(self.targets)
         asked, near = fitting(config, self.base_effects), self.effects.near_plane
-        self.asked_steps, config = config.steps, affordable_for_model(asked, self.base, cameras, near)
+        self.asked, config = asked, affordable_for_model(asked, self.base, cameras, near)
         self.scale, self.config, self.viewer, self._base_in_viewer = scale, config, request.viewer, request.base_in_viewer
         self.finer, self.inputs, self.budget_share = request.finer, dict(request.inputs), request.budget_share
         self.device, self.orbit = self.base.parameters()["means"].device, orbit_of(self.base, request.up)
@@ -141,7 +141,7 @@ class Session:
         self.notes = [note for note in search.notes if note == UNMATCHED or not (self.finer and self.finer.told)]
         states = {AS_IT_IS: self._for_target(self._base_in_viewer, shared=True), f"the start, {start}": initial}
         curve: list[CurvePoint] = []
-        ended_by = "0 steps" + fewer_note(self.asked_steps, self.config.model_copy(update={"steps": 0}))
+        ended_by = "0 steps" + fewer_note(self.asked.steps, self.config.model_copy(update={"steps": 0}))
         pool.release_to_system()
         self.seconds["total"] = now(self.device) - began
         if self._takes_steps:
@@ -218,7 +218,7 @@ class Session:
         self.notes = [*self.notes, *([] if self.keeps_state else no_steps_notes(run, self.config, self.budget_share))]
         self.ended = run.ended_by
         told = run.ended_by.told(self.config, run.step, self.budget_share)
-        return run, told + (plan_note(run, self.config) or fewer_note(self.asked_steps, self.config)) + growth_note(run)
+        return run, told + (plan_note(run, self.config) or fewer_note(self.asked.steps, self.config)) + growth_note(run)
 
     def _for_target(self, model: SplatModel, *, shared: bool = False) -> SplatModel:
         """A copy of a model that is rendered with the target's screen filter; `shared`: with the model's tensors, if it can have these."""
@@ -277,7 +277,7 @@ class Session:
         return Report(
             scale=self.scale,
             base=self.base.digest or digest_of_parameters(self.base),
-            settings=self.config,
+            settings=self.config.model_copy(update={"validation_views": self.asked.validation_views}),  # which a time budget bounds
             backend=self.backend_note,
             views=self.views_note,
             viewer=self.viewer,

@@ -102,7 +102,7 @@ def _fastest(reasons_of: dict[str, list[str]]) -> Backend | None:
 def _warn_of_numba(chosen: str, reasons: Sequence[str]) -> None:
     """Say that a working numba would save much time, where the backend cpu lacks nothing else."""
     if chosen == "reference" and len(reasons) == 1 and "numba" in reasons[0]:
-        warnings.warn(f"backend cpu cannot do this: {reasons[0]}; until then the backend reference does, many times slower", stacklevel=3)
+        warnings.warn(f"backend cpu cannot do this: {reasons[0]}; the backend reference takes its place, many times slower", stacklevel=3)
 
 
 def _lacking(name: str, backend: Backend, needs: Sequence[Needs]) -> list[str]:

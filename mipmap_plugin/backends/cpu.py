@@ -23,9 +23,9 @@ from mipmap_plugin.screen_filters import INTEGRATED
 from mipmap_plugin.splatting.buckets import ranks_for
 from mipmap_plugin.splatting.packing import packed
 
-NO_NUMBA = f"it needs numba; {install('cpu')}"
+NO_NUMBA = f"it needs numba, which some Pythons and processors have no wheels of; where there are, {install('cpu')}"
 NO_FOLDER = "numba has no writable folder for compiled code; set the environment variable NUMBA_CACHE_DIR to one"
-REINSTALL = "run pip install --force-reinstall numba, which brings all that it needs"
+REINSTALL = "install it anew, where there are wheels by pip install --force-reinstall numba, which brings all that it needs"
 
 # The position of the coefficients among the arguments of `_Draw.forward`.
 SH = 5
@@ -50,9 +50,7 @@ class CpuBackend:
         supported = {"max_color", "color_steps", "radial", "bucketed", "even_buckets", "frozen_beyond", "packing"}
         changed = needs.screen_filter in INTEGRATED and set(needs.settings.changed()) - supported
         unsupported = [f"it draws the screen filter {needs.screen_filter} with the usual cut-offs only"] if changed else []
-        if lacking := self.capabilities.lacking(needs) + unsupported:
-            return lacking
-        return [reason] if (reason := missing()) else []
+        return self.capabilities.lacking(needs) + unsupported or missing()
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if numba is missing or the request is not supported."""
@@ -154,9 +152,13 @@ def _ranks(gaussians: Gaussians, camera: Camera, settings: RenderSettings) -> An
     return bucketing.ranks(_array(gaussians.means), _array(gaussians.scales), camera)
 
 
+def missing() -> list[str]:
+    """What this machine lacks to run the backend, and what to do; empty if nothing. It imports numba."""
+    return [reason] if (reason := _why_no_kernels()) else []
+
+
 @cache  # numba that failed to load is half loaded, and would fail in another way when tried again
-def missing() -> str:
-    """What this machine lacks to run the kernels, and what to do; empty if nothing. It imports numba."""
+def _why_no_kernels() -> str:
     if importlib.util.find_spec("numba") is None:
         return NO_NUMBA
     try:
@@ -168,8 +170,8 @@ def missing() -> str:
 
 def _drawing() -> ModuleType:
     """The kernels. Imported at use. Raises BackendUnavailable if they do not load."""
-    if reason := missing():
-        raise BackendUnavailable(f"backend 'cpu' cannot do this: {reason}")
+    if reasons := missing():
+        raise BackendUnavailable(f"backend 'cpu' cannot do this: {'; '.join(reasons)}")
     return importlib.import_module("mipmap_plugin.backends.cpu_kernels.drawing")
 
 

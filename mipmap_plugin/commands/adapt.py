@@ -144,6 +144,7 @@ def _save_all(base: Wrapped, models: Iterable[tuple[Adapted, Path]], page: Adapt
             show_before_and_after(base, adapted)
         if page:
             page.add(base, adapted.as_written(Path(reports[-1]["file"])))
+        del adapted  # before the next is made: its splats, and the truths that its file was measured by, take memory
     if page:
         page.write(reports)
     if json:

@@ -72,13 +72,14 @@ def saved(wrapped: Wrapped, request: LadderRequest, output: Path, exports: Expor
     unfinished = state_path(output)
     refuse_ladder(output, wrapped, overwrite=overwrite)
     refuse_ladder(output, wrapped, overwrite=overwrite, room=room_for(wrapped, request, unfinished))
-    if exports.streamed_sog and _is_single(wrapped, request):
-        raise SettingsError(SINGLE_LEVEL)
+    if exports.streamed_sog and (bound := _ends_at_once(wrapped, request)):
+        raise SettingsError(f"{SINGLE_LEVEL}; give a smaller {bound}, or leave --streamed-sog out")
     if not wrapped.cameras:
         warnings.warn(NO_CAMERAS, stacklevel=2)
     ladder = _made(wrapped, request, unfinished)
     if exports.streamed_sog and len(ladder.levels) == 1:
-        raise SettingsError(f"{SINGLE_LEVEL}, or leave --streamed-sog out, which goes on from what is made")
+        # Other numbers would make another ladder, and a smaller --coarsest may make more levels that are left out.
+        raise SettingsError(f"{SINGLE_LEVEL}; leave --streamed-sog out, which goes on from what is made")
     with _kept(unfinished):
         folder = ladder.save(output, overwrite=overwrite, keep_resume=True)  # an export may fail after minutes, and the levels took longer
     try:
@@ -112,12 +113,14 @@ def _kept(unfinished: Path) -> Iterator[None]:
         raise type(error)(f"{str(error) or 'interrupted'}; {again}") from error
 
 
-def _is_single(wrapped: Wrapped, request: LadderRequest) -> bool:
-    """Whether a ladder will have one level, as far as that is known before any work."""
+def _ends_at_once(wrapped: Wrapped, request: LadderRequest) -> str:
+    """The option for which a ladder will have one level, as far as that is known before any work; "" if it will have more."""
     if wrapped.model.traits.no_viewer:
-        return False  # and no ladder
-    few = request.until_splats is not None and len(wrapped.model.parameters()["means"]) <= request.until_splats
-    return few or request.first_band(wrapped.target(request.viewer), wrapped.effects()).reaches(request.coarsest)
+        return ""  # and no ladder
+    if request.until_splats is not None and len(wrapped.model.parameters()["means"]) <= request.until_splats:
+        return "--until-splats"
+    band = request.first_band(wrapped.target(request.viewer), wrapped.effects())
+    return "--coarsest" if band.reaches(request.coarsest) else ""
 
 
 def print_summary(folder: Path, manifest: dict[str, Any], exports: Sequence[Path] = (), json: bool = False) -> None:

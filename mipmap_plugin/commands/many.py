@@ -13,6 +13,7 @@ from mipmap_plugin.commands.common import print_facts
 from mipmap_plugin.commands.outputs import adapted_path
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import JobsFailed, SettingsError, install
+from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job, Outcome
 from mipmap_plugin.jobs.listing import find_checkpoints, is_pattern, read_list, shard, without_outputs
@@ -75,6 +76,7 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
     """
     jobs = make_jobs(many, given, request, base)
     outcomes: list[Outcome] = []
+    missing = {folder for job in jobs for folder in missing_folders(job.target.parent)}
     try:
         with closing(engine(many, jobs, threads)) as running:
             for outcome in counted(running, len(jobs), "adapting", "job"):
@@ -84,6 +86,8 @@ def adapt_many(many: Many, given: Sequence[Path], request: Request, base: Base, 
         _print(outcomes, jobs, json)
         again = " with --skip-existing" if request.overwrite and not many.skip_existing else ""
         raise KeyboardInterrupt(f"interrupted; run the same command again{again} to go on where it stopped") from interrupt
+    finally:  # a job that fails leaves a folder that another one was using
+        remove_empty(sorted(missing, key=lambda folder: len(folder.parts), reverse=True))
     _print(outcomes, jobs, json)
     if failed := [outcome for outcome in outcomes if outcome.status != "done" and outcome.status != "finished before"]:
         raise JobsFailed(f"{len(failed)} of {len(jobs)} jobs failed; the same command does these again, and no other")

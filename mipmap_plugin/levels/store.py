@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -16,16 +16,19 @@ from mipmap_plugin.adaptation.report import Report, versions
 from mipmap_plugin.camera import digest_of
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import MipmapPluginError, SettingsError, brief
-from mipmap_plugin.formats.atomic import json_text, write_json
+from mipmap_plugin.formats.atomic import json_text, refuse_unwritable, settled, write_json
 from mipmap_plugin.formats.json_file import read_json
-from mipmap_plugin.formats.staging import missing_folders, remove_empty
 from mipmap_plugin.frozen_base import FrozenBase
 from mipmap_plugin.levels.request import LadderRequest
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import Filtered, SplatModel, digest_of_parameters
-from mipmap_plugin.models.places import REPORT, state_path
+from mipmap_plugin.models.places import REPORT, STATE, state_path
 
+# Written before the first level: what was broken off earlier leaves the state of a run at most.
 REQUEST = "request.json"
+
+# The name of a run's state, or of the lock beside it.
+IS_STATE = re.compile(rf"\.?level_.*{re.escape(STATE)}.*").fullmatch
 
 
 class LevelStore:
@@ -36,8 +39,13 @@ class LevelStore:
         self._folder, self._base, self._target = folder, base, base.target(request.viewer)
         if folder is None:
             return
-        self._facts, file = json.loads(json_text(_facts(base, request))), folder / REQUEST
-        if folder.exists() and any(each.name != REQUEST for each in folder.iterdir()):
+        self._facts = json.loads(json_text(_facts(base, request)))
+        self._refuse_others(folder)
+
+    def _refuse_others(self, folder: Path) -> None:
+        """Raise what `__init__` raises. The state of a run, which says itself what it belongs to, is no level yet."""
+        file = settled(folder / REQUEST)
+        if folder.exists() and any(each.name != REQUEST and not IS_STATE(each.name) for each in folder.iterdir()):
             if not file.is_file():
                 raise SettingsError(f"{folder}: unfinished ladders are kept there, but it has other things in it; choose another output")
             if read_json(file) != self._facts:
@@ -47,27 +55,18 @@ class LevelStore:
     def level(self, name: str, make: Callable[[Path | None], Adapted]) -> Adapted:
         """The level of that name from the folder, or else the one that `make` returns for the path of the state of its run, kept from now on.
 
-        Raises OutputError.
+        Raises OutputError, and what `__init__` raises for a folder in which another run has kept levels meanwhile.
         """
         if self._folder is None:
-            return make(None)
+            return replace(make(None), judge=None)  # a level is written as a PLY, which rounds nothing that is to be measured
         file = self._folder / f"{name}.ply"
         if not file.with_name(file.name + REPORT).is_file():
-            with self._used(self._folder):
-                make(state_path(file)).save(file, overwrite=True)
+            refuse_unwritable(file)
+            made = make(state_path(file))
+            self._refuse_others(self._folder)
+            write_json(self._folder / REQUEST, self._facts, overwrite=True)
+            made.save(file, overwrite=True)
         return self._loaded(file)
-
-    @contextmanager
-    def _used(self, folder: Path) -> Iterator[None]:
-        """Mark the folder as this ladder's. One that has neither a level nor a state of one after the block goes away."""
-        around = missing_folders(folder.parent)
-        write_json(folder / REQUEST, self._facts, overwrite=True)
-        try:
-            yield
-        finally:
-            if [each.name for each in folder.iterdir()] == [REQUEST]:
-                (folder / REQUEST).unlink()
-                remove_empty([folder, *around])
 
     def remove(self) -> None:
         """Delete the folder, whose levels have been saved elsewhere."""

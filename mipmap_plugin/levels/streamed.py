@@ -29,7 +29,7 @@ from mipmap_plugin.levels.manifest import read_manifest
 
 STREAMED, SETTINGS = "streamed", "playcanvas.json"
 
-SINGLE_LEVEL = "this ladder has a single level, which needs no streaming; give a smaller --coarsest"
+SINGLE_LEVEL = "this ladder has a single level, which needs no streaming"
 
 # px: the shorter side of the canvas that distances are computed for.
 CANVAS = 1080
@@ -100,7 +100,7 @@ def write_streamed(folder: Path, canvas: int = CANVAS, *, overwrite: bool = Fals
     manifest = read_manifest(folder)
     rising = distances(manifest, canvas)
     if not rising:
-        raise SettingsError(SINGLE_LEVEL)
+        raise SettingsError(f"{folder}: {SINGLE_LEVEL}; open its level as it is")
     with new_folder(folder / STREAMED, overwrite) as temporary, TemporaryDirectory(prefix=TEMPORARY) as copies:
         made = temporary / LOD_META
         extent = manifest.get("chunk_extent", max(1, round(EXTENT * rising[0])))

@@ -127,6 +127,8 @@ def _why_not(files: Files) -> str:
         return f"{path} is the state of a training, which 3DGS resumes from and which is not read here; give the model folder that it lies in"
     if kind == "torch":
         return f"{path} is a torch file that holds no known checkpoint; give a PLY file or a model folder"
+    if kind == "unknown" and path.suffix.lower() in (".ply", *EXCHANGED):
+        return f"{path} is damaged, cut off or no {path.suffix.lower()} file; download or export it again"
     if path.suffix == ".npz":
         return f"{path} is a NumPy archive that no family knows; give a PLY file or a model folder, or register its family"
     if path.suffix.lower() in (".lcc", ".lcc2"):
