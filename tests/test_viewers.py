@@ -9,6 +9,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
+from mipmap_plugin.adaptation.renderers import SteppingRenderer
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.gsplat import GsplatBackend
@@ -512,6 +513,53 @@ def test_a_splat_of_less_than_half_a_step_is_not_seen_and_has_its_gradient(backe
     gradients = [torch.autograd.grad(image.sum(), list(leaves.values()), retain_graph=True) for image in images]
     for rounded, exact in zip(*gradients, strict=True):
         torch.testing.assert_close(rounded, exact)
+
+
+# Linear light
+
+
+@BOTH
+def test_metalsplatter_blends_in_linear_light(backend):
+    """Half of a splat of 0.2 over white: in linear light, 0.5 · 0.2^2.2 + 0.5, which sRGB shows as 0.747, where others show 0.6."""
+    effects = replace(find_viewer("metalsplatter").effects(Effects(0)), background=(1.0, 1.0, 1.0))
+    image = backend.render(splat(400.0, 400.0, 0.5, 0.2), camera(), effects).image
+    light = 0.5 * 0.2**2.2 + 0.5
+    assert image[MIDDLE, MIDDLE].tolist() == pytest.approx([1.055 * light ** (1 / 2.4) - 0.055] * 3, abs=1e-5)
+    others = replace(effects, settings=replace(effects.settings, linear_light=None))
+    assert backend.render(splat(400.0, 400.0, 0.5, 0.2), camera(), others).image[MIDDLE, MIDDLE, 0] == pytest.approx(0.6, abs=1e-5)
+
+
+@BOTH
+def test_a_background_is_shown_as_it_is_in_linear_light(backend):
+    behind = (0.02, 0.4, 1.0)  # on the line of sRGB, on its curve, and white
+    effects = Effects(0, background=behind, settings=RenderSettings(linear_light=2.2))
+    image = backend.render(splat(1.0, 1.0), camera(), effects).image
+    assert image[0, 0].tolist() == pytest.approx(behind, abs=1e-6)
+
+
+@BOTH
+def test_black_has_finite_gradients_in_linear_light(backend):
+    leaves, black = differentiable(splat(9.0, 9.0, color=-0.5))
+    backend.render(black, camera(), Effects(0, settings=RenderSettings(linear_light=2.2))).image.sum().backward()
+    assert all(leaf.grad.isfinite().all() for leaf in leaves.values())
+
+
+def test_all_views_of_a_step_are_blended_in_linear_light():
+    light, plain = Effects(0, settings=RenderSettings(linear_light=2.2)), Effects(0)
+    splats, backend = splat(9.0, 9.0), CpuBackend()
+    views = [view.image for view in backend.render_views(splats, [(camera(), plain), (camera(), light)])]
+    assert all(torch.equal(view, backend.render(splats, camera(), effects).image) for view, effects in zip(views, (plain, light), strict=True))
+
+
+def test_steps_by_rows_are_not_taken_in_linear_light():
+    light = find_viewer("metalsplatter").effects(Effects(0))
+    assert SteppingRenderer.of(CpuBackend(), [Effects(0)]) and not SteppingRenderer.of(CpuBackend(), [Effects(0), light])
+
+
+@pytest.mark.parametrize("also", [{"max_color": 1.0}, {"picture_step": 1 / 255}, {"packing": find_viewer("spark").settings.packing}])
+def test_linear_light_goes_with_no_rounding(also):
+    with pytest.raises(SettingsError, match="leave those out"):
+        RenderSettings(linear_light=2.2, **also)
 
 
 # Beside the picture
