@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from mipmap_plugin.adaptation.parallel import views_at_once
-from mipmap_plugin.adaptation.renderers import SteppingRenderer, unrounded
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.closed_form import closed_form
 from mipmap_plugin.adaptation.start.merging import merge
@@ -25,7 +24,7 @@ def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], call
     few = gaussians[torch.arange(min(2, len(gaussians)))].detach()
     if hasattr(backend, "compile_ahead"):
         backend.compile_ahead(few, effects, calls)
-    steps = calls.by_rows and SteppingRenderer.of(backend, [unrounded(each) for each in effects]) is not None
+    steps = calls.by_rows and hasattr(backend, "stepper") and all(each.settings.linear_light is None for each in effects)
     # The first with the usual settings, and the first with others, for which a backend may have kernels of their own.
     kinds = list({setting.settings == USUAL: setting for setting in reversed(effects)}.values())
     for setting in effects:
