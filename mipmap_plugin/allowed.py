@@ -47,6 +47,7 @@ OF_SETTINGS: Mapping[str, Rule] = {
     "max_half_axis": POSITIVE,
     "frozen_beyond": ANY_SIZE,
     "frame": POSITIVE,
+    "linear_light": ("a power from 1 to 4", lambda value: _number(value) and 1 <= value <= 4),
     "picture_step": ("a step above 0 and up to 1", lambda value: _number(value) and 0 < value <= 1),
 }
 

@@ -165,6 +165,8 @@ def _viewer_effects(settings: RenderSettings) -> list[Effect]:
          "a square root per splat"),
         ("coarse order", coarse, "splats in the same bucket of depth are not sorted", "the order is exact",
          "a sort of all splats"),
+        ("linear light", settings.linear_light is not None, "splats are blended in linear light", "splats are blended as their colors are",
+         "three powers per splat and per pixel"),
         ("rounded picture", settings.picture_step is not None, "8 bits after each splat", "rounded only for display", "another copy of the image"),
         ("packing", rounded, "the viewer keeps rounded splats", "splats are not rounded", "a rounding for each number of a splat"),
     ]  # fmt: skip

@@ -98,6 +98,7 @@ class RenderSettings:
         packing: Quantization of splats in memory.
         frozen_beyond: The Jacobian is frozen so far outside the picture, in halves of its width and height; infinity: nowhere.
         frame: In halves of the picture from its middle: splats whose center lies farther out along x or y are not rendered.
+        linear_light: Splats are blended in linear light: colors to this power; the picture is sRGB of what comes out.
         picture_step: The picture is rounded to multiples after each splat, back to front; the gradient ignores the rounding.
     """
 
@@ -122,10 +123,11 @@ class RenderSettings:
     packing: Packing | None = None
     frozen_beyond: float = FRUSTUM_MARGIN
     frame: float = math.inf
+    linear_light: float | None = None
     picture_step: float | None = None
 
     def __post_init__(self) -> None:
-        check("render settings", self, OF_SETTINGS, optional=frozenset({"radius", "max_color", "color_steps", "picture_step"}))
+        check("render settings", self, OF_SETTINGS, optional=frozenset({"radius", "max_color", "color_steps", "picture_step", "linear_light"}))
         if not isinstance(self.packing, Packing | None):
             raise SettingsError(f"render settings: packing must be a Packing, or None, got {type(self.packing).__name__}")
         if not isinstance(self.even_buckets, EvenBuckets | None):
@@ -134,6 +136,8 @@ class RenderSettings:
             raise SettingsError("`fades` needs the radius at which a splat falls to 0; give radius, such as 8**0.5")
         if self.radial + self.bucketed + (self.even_buckets is not None) > 1:
             raise SettingsError("`radial`, `bucketed` and `even_buckets` are different orders of splats; give only one of them")
+        if self.linear_light is not None and not all(value is None for value in (self.max_color, self.color_steps, self.picture_step, self.packing)):
+            raise SettingsError("`linear_light` goes with no packing, and with no limit or rounding of colors or of the picture; leave those out")
         if self.radius is None and (self.fits_picture or self.max_half_axis < math.inf):
             raise SettingsError("`max_half_axis` and `fits_picture` need the radius at which a splat ends; give radius, such as 8**0.5")
 
@@ -154,9 +158,9 @@ class RenderSettings:
         return [f.name for f in fields(self) if getattr(self, f.name) != getattr(USUAL, f.name)]
 
     def without_color_rounding(self) -> RenderSettings:
-        """These settings without limits and rounding of colors, for images whose colors are other quantities."""
+        """These settings without limits, rounding and light of colors, for images whose colors are other quantities."""
         packing = None if self.packing is None else replace(self.packing, color=None, bands=())
-        return replace(self, max_color=None, color_steps=None, packing=packing, picture_step=None)
+        return replace(self, max_color=None, color_steps=None, packing=packing, linear_light=None, picture_step=None)
 
     def finer(self, n: float) -> RenderSettings:
         """These settings for an image with n times as many pixels along each axis: areas in px² are scaled by n²."""

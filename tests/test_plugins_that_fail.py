@@ -321,7 +321,7 @@ def test_names_are_parts_of_file_names(name):
         {"min_alpha": 0.0}, {"min_alpha": 2.0}, {"min_alpha": "x"}, {"min_alpha": float("nan")}, {"min_transmittance": 2.0}, {"radius": 0},
         {"radius": -3.0}, {"tile": 0}, {"tile": 3.5}, {"tile": 100_000}, {"max_alpha": 0.0}, {"max_color": -1.0}, {"color_steps": (0.1, 0.1)},
         {"color_steps": [0.1, 0.1, 0.1]}, {"min_variance": -1.0}, {"max_half_axis": 0.0, "radius": 3.0}, {"frame": -1.0}, {"picture_step": -1.0},
-        {"packing": "yes"}, {"even_buckets": True},
+        {"linear_light": 0.0}, {"packing": "yes"}, {"even_buckets": True},
     ],
 )  # fmt: skip
 def test_render_settings_out_of_range_are_refused(wrong):

@@ -26,7 +26,7 @@ from mipmap_plugin.evaluation.protocols import PROTOCOLS
 from mipmap_plugin.formats.ply import read_ply
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.splatting.viewers import BUILT_IN, find_viewer, viewers_for
+from mipmap_plugin.splatting.viewers import BUILT_IN, FURTHER, find_viewer, viewers_for
 
 BRIEF = dict(steps=2, extra_views=1, merge_to=1.0, warm_up=0, views_per_step=3, validation_views=2)
 PAIR = ("classic", "spark")
@@ -51,8 +51,8 @@ def colored(*shades):
 # What a file is for
 
 
-def test_portable_is_every_built_in_viewer_with_the_usual_one_first():
-    assert viewers_for("portable") == tuple(viewer.name for viewer in BUILT_IN)
+def test_portable_is_every_built_in_viewer_but_the_further_ones_with_the_usual_one_first():
+    assert viewers_for("portable") == tuple(viewer.name for viewer in BUILT_IN if viewer not in FURTHER)
     assert viewers_for("portable")[0] == "classic" and viewers_for("spark") == ("spark",)
 
 
@@ -205,7 +205,7 @@ def test_the_command_writes_a_portable_file_beside_another(tmp_path, capsys):
     what, where = capsys.readouterr().out.splitlines()[2:]
     assert what.startswith("x0.25 in portable: ") and where.startswith(str(tmp_path / "base_x0.25_portable")) and where.endswith("made for portable")
     [line] = [line for line in (tmp_path / "log").read_text().splitlines() if "  in each viewer: classic " in line]
-    assert all(f"{viewer.name} " in line for viewer in BUILT_IN)
+    assert all(f"{name} " in line for name in viewers_for("portable"))
     assert json.loads(next((tmp_path / "base_x0.25_portable").rglob("*.adaptation.json")).read_text())["viewer"] == "portable"
 
 

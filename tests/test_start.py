@@ -227,6 +227,8 @@ def test_steps_with_the_usual_settings_and_with_others_are_compiled_first(monkey
     effects = [Effects(1), Effects(1, "mip"), find_viewer("unity").effects(Effects(1)), find_viewer("spark").effects(Effects(1))]
     compilation.warm_up(backend, tiny.gaussians(3), effects, Calls(gradients=True, merging=False, by_rows=True))
     assert len(stepped) == 2 and effects[0] in stepped and effects[2] in stepped
+    compilation.warm_up(backend, tiny.gaussians(3), [find_viewer("metalsplatter").effects(Effects(1))], Calls(True, merging=False, by_rows=True))
+    assert len(stepped) == 2  # in linear light the backend takes none
 
 
 @pytest.mark.parametrize(("views", "by_rows"), [(VIEWS_AT_ONCE, True), (VIEWS_AT_ONCE + 1, False)])

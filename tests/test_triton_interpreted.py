@@ -41,7 +41,7 @@ HARD = [
     "quaternion-0-classic", "opacity-1-classic", "nan-in-scales-classic", "inf-in-sh-antialiased", "nan-in-covariances",
     "image-1x1-classic", "principal-point-outside-classic", "sh-bands-left-out",
     "spark-1", "playcanvas-1", "gaussian-splats-3d-1", "viser-1", "scale-1e4-playcanvas", "needle-1e12-spark",
-    "rule-half-axis-of-the-whole", "rule-faint-and-transparent", "rule-rounded-picture",
+    "rule-half-axis-of-the-whole", "rule-faint-and-transparent", "rule-rounded-picture", "rule-linear-light",
 ]  # fmt: skip
 
 # Of two sizes and two degrees of SH, in two orders of buckets, and with most of the rules of viewers.

@@ -13,7 +13,7 @@ from ply_files import splat_columns, splat_names, write, write_model_folder, wri
 from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError, ShapeError
 from mipmap_plugin.formats.cfg_args import read_cfg_args
 from mipmap_plugin.formats.ply import read_ply
-from mipmap_plugin.formats.tags import provenance_of
+from mipmap_plugin.formats.tags import provenance_of, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.base import TrainedScale
@@ -299,13 +299,22 @@ def test_header_keeps_foreign_comments_and_replaces_those_of_this_package(tmp_pa
     model = load_vanilla(write_splats(tmp_path / "a.ply", comments=("Exported from Brush", "SplatRenderMode: mip", "antialiased 1")))
     once = load_vanilla(model.save(tmp_path / "b.ply", provenance={"scale": 2}))
     comments = read_ply(once.save(tmp_path / "c.ply", provenance={**PROVENANCE, "name": "Brüder\n"})).comments
-    assert comments[:2] == ("Exported from Brush", "SplatRenderMode: mip")
-    assert len(comments) == 3 and comments[2].isascii()
+    assert comments[:4] == ("Exported from Brush", "mip=true", "kernel_size=0.3", "SplatRenderMode: mip")
+    assert len(comments) == 5 and comments[4].isascii()
     assert provenance_of(comments) == {**PROVENANCE, "name": "Brüder\n"}
 
 
 def test_header_says_default_for_the_classic_filter(tmp_path):
     assert "SplatRenderMode: default" in read_ply(raw_model().save(tmp_path / "a.ply", provenance={})).comments
+
+
+@pytest.mark.parametrize(("screen_filter", "eps2d", "compensates"), [("classic", 0.075, False), ("mip", 0.1, True), ("analytic", 0.3, False)])
+def test_web_splat_reads_the_filter_in_its_own_words(screen_filter, eps2d, compensates):
+    """It takes the first comment in which each word is, and refuses a file where what follows the last = there is no truth value, or number."""
+    comments = with_tags(with_tags([], "antialiased", {}, 0.3), screen_filter, {"viewer": "spark"}, eps2d)
+    first = {word: next(text for text in comments if word in text).split("=")[-1] for word in ("mip", "kernel_size")}
+    assert first == {"mip": str(compensates).lower(), "kernel_size": f"{eps2d:g}"}
+    assert sum("mip=" in text for text in comments) == 1
 
 
 def test_extra_columns_are_kept_until_rows_change(tmp_path):

@@ -9,6 +9,7 @@ import tiny
 import torch
 
 from mipmap_plugin import cli, register_viewer, wrap_model
+from mipmap_plugin.adaptation.renderers import SteppingRenderer
 from mipmap_plugin.backends.base import Needs
 from mipmap_plugin.backends.cpu import CpuBackend
 from mipmap_plugin.backends.gsplat import GsplatBackend
@@ -111,7 +112,10 @@ def test_cesium_drops_splats_smaller_than_two_of_its_pixels(backend):
 @BOTH
 @pytest.mark.parametrize(
     ("viewer", "more"),
-    [("playcanvas", 0.075), ("gaussian-splats-3d", 0.3), ("cesium", 0.01875), ("babylon", 0.075), ("gsplat-js", 0.075), ("antimatter15", 0.0)],
+    [
+        *(("playcanvas", 0.075), ("gaussian-splats-3d", 0.3), ("cesium", 0.01875), ("babylon", 0.075), ("gsplat-js", 0.075), ("antimatter15", 0.0)),
+        *(("web-splat", 0.3), ("visionary", 0.1), ("splatapult", 0.3), ("gdgs", 0.3)),
+    ],
 )
 def test_a_viewer_dilates_by_its_own_variance(backend, viewer, more):
     rendered = alpha(backend, viewer, splat(4.0, 1.0, 0.8))
@@ -189,6 +193,28 @@ def test_gaussian_splats_3d_turns_a_nearly_round_splat(backend):
         along, across = dx * x + dy * y, dx * y - dy * x
         weight = math.exp(-(along**2 / (middle + spread) + across**2 / (middle - spread)) / 2)
         assert rendered[MIDDLE + dy, MIDDLE + dx] == pytest.approx(0.8 * weight, abs=2e-5)
+
+
+@BOTH
+def test_programs_that_took_its_eigenvalues_stretch_splats_or_drop_them(backend):
+    """NVIDIA's viewer does both, MetalSplatter stretches less, and Godot's only drops."""
+    small, a_little_larger, round_one = splat(0.0161, 0.0161), splat(0.0163, 0.0163), splat(1.0, 1.0, 0.8)
+    stretched = {"vk-gaussian-splatting": math.sqrt(0.1), "metalsplatter": 0.1, "gdgs": 0.0}
+    for viewer, spread in stretched.items():
+        assert alpha(backend, viewer, round_one)[MIDDLE + 2, MIDDLE] == pytest.approx(0.8 * math.exp(-2 / (1.3 + spread)), abs=1e-5)
+        assert (alpha(backend, viewer, small).max() == 0) == (viewer != "metalsplatter")
+    assert alpha(backend, "vk-gaussian-splatting", a_little_larger).max() > 0
+    assert alpha(backend, "gdgs", splat(0.0326, 1e-6)).max() > 0  # a needle of that mean
+
+
+@BOTH
+@pytest.mark.parametrize(("viewer", "radius", "most"), [("metalsplatter", 3.0, 0.999), ("web-splat", 3.0687, 0.99), ("visionary", 3.0687, 0.99)])
+def test_a_splat_ends_and_is_covered_as_in_the_program(backend, viewer, radius, most):
+    more = find_viewer(viewer).eps2d
+    spread = 0.1 if viewer == "metalsplatter" else 0.0
+    middle = alpha(backend, viewer, splat(9.0, 9.0, 1.0))[MIDDLE]
+    assert middle[MIDDLE] == pytest.approx(most, abs=1e-6)
+    assert [bool(middle[MIDDLE + x] > 0) for x in range(11)] == [x < radius * math.sqrt(9.0 + more - spread) for x in range(11)]
 
 
 @BOTH
@@ -489,11 +515,58 @@ def test_a_splat_of_less_than_half_a_step_is_not_seen_and_has_its_gradient(backe
         torch.testing.assert_close(rounded, exact)
 
 
+# Linear light
+
+
+@BOTH
+def test_metalsplatter_blends_in_linear_light(backend):
+    """Half of a splat of 0.2 over white: in linear light, 0.5 · 0.2^2.2 + 0.5, which sRGB shows as 0.747, where others show 0.6."""
+    effects = replace(find_viewer("metalsplatter").effects(Effects(0)), background=(1.0, 1.0, 1.0))
+    image = backend.render(splat(400.0, 400.0, 0.5, 0.2), camera(), effects).image
+    light = 0.5 * 0.2**2.2 + 0.5
+    assert image[MIDDLE, MIDDLE].tolist() == pytest.approx([1.055 * light ** (1 / 2.4) - 0.055] * 3, abs=1e-5)
+    others = replace(effects, settings=replace(effects.settings, linear_light=None))
+    assert backend.render(splat(400.0, 400.0, 0.5, 0.2), camera(), others).image[MIDDLE, MIDDLE, 0] == pytest.approx(0.6, abs=1e-5)
+
+
+@BOTH
+def test_a_background_is_shown_as_it_is_in_linear_light(backend):
+    behind = (0.02, 0.4, 1.0)  # on the line of sRGB, on its curve, and white
+    effects = Effects(0, background=behind, settings=RenderSettings(linear_light=2.2))
+    image = backend.render(splat(1.0, 1.0), camera(), effects).image
+    assert image[0, 0].tolist() == pytest.approx(behind, abs=1e-6)
+
+
+@BOTH
+def test_black_has_finite_gradients_in_linear_light(backend):
+    leaves, black = differentiable(splat(9.0, 9.0, color=-0.5))
+    backend.render(black, camera(), Effects(0, settings=RenderSettings(linear_light=2.2))).image.sum().backward()
+    assert all(leaf.grad.isfinite().all() for leaf in leaves.values())
+
+
+def test_all_views_of_a_step_are_blended_in_linear_light():
+    light, plain = Effects(0, settings=RenderSettings(linear_light=2.2)), Effects(0)
+    splats, backend = splat(9.0, 9.0), CpuBackend()
+    views = [view.image for view in backend.render_views(splats, [(camera(), plain), (camera(), light)])]
+    assert all(torch.equal(view, backend.render(splats, camera(), effects).image) for view, effects in zip(views, (plain, light), strict=True))
+
+
+def test_steps_by_rows_are_not_taken_in_linear_light():
+    light = find_viewer("metalsplatter").effects(Effects(0))
+    assert SteppingRenderer.of(CpuBackend(), [Effects(0)]) and not SteppingRenderer.of(CpuBackend(), [Effects(0), light])
+
+
+@pytest.mark.parametrize("also", [{"max_color": 1.0}, {"picture_step": 1 / 255}, {"packing": find_viewer("spark").settings.packing}])
+def test_linear_light_goes_with_no_rounding(also):
+    with pytest.raises(SettingsError, match="leave those out"):
+        RenderSettings(linear_light=2.2, **also)
+
+
 # Beside the picture
 
 
 @BOTH
-@pytest.mark.parametrize(("viewer", "most"), [("spark", 1.4), ("gaussian-splats-3d", 1.2)])
+@pytest.mark.parametrize(("viewer", "most"), [("spark", 1.4), ("gaussian-splats-3d", 1.2), ("splatapult", 1.5), ("gdgs", 1.2), ("web-splat", 1.2)])
 def test_a_splat_is_left_out_by_its_center(backend, viewer, most):
     def seen(halves):
         return alpha(backend, viewer, splat(900.0, 900.0, means=(halves * SIZE / 2 * DEPTH / FOCAL, 0.0, DEPTH))).max()
@@ -583,7 +656,7 @@ def test_the_usual_viewers_have_the_usual_settings():
 
 
 def test_supersplat_is_playcanvas_and_every_record_is_under_its_name():
-    assert find_viewer("supersplat") is find_viewer("playcanvas")
+    assert find_viewer("supersplat") is find_viewer("playcanvas") and find_viewer("lichtfeld") is find_viewer("brush")
     assert all(find_viewer(viewer.name) is viewer and viewer.source and viewer.title for viewer in BUILT_IN)
 
 

@@ -38,13 +38,14 @@ SETTINGS = {
     "packing": "packing",
     "frozen_beyond": "another limit of the Jacobian",
     "frame": "culling by the center",
+    "linear_light": "blending in linear light",
     "picture_step": "rounding after each splat",
 }
 
 # Those that screen filters that integrate support; the others depend on a splat's weight at a point.
 WITH_INTEGRALS = frozenset({
     *("min_alpha", "min_transmittance", "radius", "tile", "max_color", "color_steps"),
-    *("radial", "bucketed", "even_buckets", "frozen_beyond", "frame", "packing"),
+    *("radial", "bucketed", "even_buckets", "frozen_beyond", "frame", "packing", "linear_light"),
 })
 
 # Incremented when `Backend.render` or the records below change in a way that breaks existing backends.

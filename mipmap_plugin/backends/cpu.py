@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered, Stepper
+from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import BackendUnavailable, brief, install
@@ -54,16 +55,18 @@ class CpuBackend:
 
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Raises BackendUnavailable, an ImportError, if numba is missing or the request is not supported."""
+        if effects.settings.linear_light is not None:
+            return in_linear_light(self.render, gaussians, camera, effects)
         return self._drawn(gaussians, [(camera, effects)])[0]
 
     def render_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         """Several views of the same splats, each with effects of its own, in one call. Raises as `render`."""
-        if any(effects.settings.packing is not None for _, effects in shots):  # which depends on the camera
+        if any(effects.settings.packing is not None or effects.settings.linear_light is not None for _, effects in shots):  # by the camera
             return [self.render(gaussians, camera, effects) for camera, effects in shots]
         return self._drawn(gaussians, shots)
 
     def stepper(self, raw: Mapping[str, Tensor]) -> Stepper:
-        """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`; effects without packing only."""
+        """What draws and moves splats of 3DGS by their contiguous raw parameters, as `AdamStep.raw`; without packing and linear light."""
         _drawing()  # reports what numba lacks
         from mipmap_plugin.backends.cpu_kernels.stepping import CpuStepper
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Capabilities, Needs, Rendered
+from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.effects import SURFEL, Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -39,6 +40,8 @@ class ReferenceBackend:
     def render(self, gaussians: Gaussians, camera: Camera, effects: Effects) -> Rendered:
         """The view of `camera`. Only the splats that can touch the image take part in the gradient graph."""
         settings = effects.settings
+        if settings.linear_light is not None:
+            return in_linear_light(self.render, gaussians, camera, effects)
         ranks = buckets.ranks_for(settings, gaussians, camera)
         if settings.packing is not None:
             gaussians = packed(gaussians, camera, settings.packing)

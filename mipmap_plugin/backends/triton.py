@@ -26,6 +26,7 @@ from torch.autograd.function import once_differentiable
 
 from mipmap_plugin.backends.base import API_VERSION, SETTINGS, Calls, Capabilities, Needs, Rendered, Stepper
 from mipmap_plugin.backends.external import NO_CUDA, CachedCheck
+from mipmap_plugin.backends.linear_light import in_linear_light
 from mipmap_plugin.camera import ONE_PIXEL, Camera
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.gaussians import Gaussians
@@ -70,11 +71,15 @@ class TritonBackend:
 
         The host synchronizes with the GPU once, for the number of (splat, tile) pairs, and not in the backward pass.
         """
+        if effects.settings.linear_light is not None:
+            return in_linear_light(self.render, gaussians, camera, effects)
         return self.render_views(gaussians, [(camera, effects)])[0]
 
     def render_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         """Several views of the same splats, each with effects of its own, by one launch of each kernel; of packed splats, which depend on the
-        camera, one by one. Raises as `render`."""
+        camera, one by one, and in linear light too. Raises as `render`."""
+        if any(effects.settings.linear_light is not None for _, effects in shots):
+            return [self.render(gaussians, camera, effects) for camera, effects in shots]
         outputs: list[Tensor] = []
         for tensors, together in self._prepared(gaussians, shots):
             outputs += _Draw.apply(together, torch.is_grad_enabled(), *tensors)  # type: ignore[no-untyped-call]  # torch's

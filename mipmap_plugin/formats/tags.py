@@ -7,13 +7,17 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from mipmap_plugin.screen_filters import SCREEN_FILTERS
+from mipmap_plugin.screen_filters import COMPENSATED, SCREEN_FILTERS
 
 PROVENANCE = "mipmap_plugin"
 
 # Brush and splat-transform write the first, Postshot the second.
 _RENDER_MODE = re.compile(r"SplatRenderMode:\s*(\w+)", re.IGNORECASE)
 _ANTIALIASED = re.compile(r"antialiased\s+([01])\b", re.IGNORECASE)
+
+# What web-splat reads. It opens no file whose first comment with "mip" in it does not end with =true or =false, nor one whose first with
+# "kernel_size" does not end with = and a number (959a3ec, io/ply.rs); so these are before all others of this package.
+_WEB_SPLAT = re.compile(r"(mip|kernel_size)=[\w.]+$")
 
 # nerfstudio names its vertical so; Brush's exports have the same comment with y, whatever is up in them.
 _Z_UP = re.compile(r"vertical axis:\s*z\b", re.IGNORECASE)
@@ -39,10 +43,11 @@ def vertical_of(comments: Iterable[str]) -> tuple[float, float, float] | None:
 
 
 def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any], eps2d: float | None = None) -> list[str]:
-    """Foreign comments, followed by the two lines of this package, which replace older ones. `eps2d`: dilation of the filter, px²."""
-    foreign = [text for text in comments if not _tag(text) and not text.startswith(PROVENANCE + " {")]
+    """Foreign comments, followed by the lines of this package, which replace older ones. `eps2d`: dilation of the filter, px²."""
+    foreign = [text for text in comments if not _tag(text) and not _WEB_SPLAT.match(text) and not text.startswith(PROVENANCE + " {")]
     tag = _TAGS.get(screen_filter)
-    tags = [f"SplatRenderMode: {tag}"] if tag else []
+    tags = [f"mip={'true' if screen_filter in COMPENSATED else 'false'}", *([] if eps2d is None else [f"kernel_size={eps2d:g}"])]
+    tags += [f"SplatRenderMode: {tag}"] if tag else []
     if eps2d is not None and (screen_filter == "mip" or tag is None):
         provenance = {**provenance, "screen_filter": screen_filter, "kernel_size": eps2d}  # which the tag does not tell
     return [*foreign, *tags, f"{PROVENANCE} {json.dumps(provenance, default=str)}"]

@@ -10,67 +10,18 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-from mipmap_plugin.allowed import OF_VIEWER, check
-from mipmap_plugin.effects import NEAR_PLANE, Effects
+from mipmap_plugin.effects import NEAR_PLANE
 from mipmap_plugin.errors import PluginError, SettingsError
 from mipmap_plugin.registry import Registry
-from mipmap_plugin.render_settings import FRUSTUM_MARGIN, USUAL, EvenBuckets, Packing, RenderSettings
-from mipmap_plugin.screen_filters import DILATION, SCREEN_FILTERS
-
-
-@dataclass(frozen=True)
-class Viewer:
-    """One drawing convention: a screen filter and further render settings.
-
-    Attributes:
-        name: Short name, as in `--viewer`.
-        title: The name that people know it by.
-        source: The source code this record was taken from, with its version.
-        screen_filter: As in `Effects`: "classic" dilates, "antialiased" and "mip" compensate.
-        eps2d: The variance that the filter adds, px² of the image.
-        settings: What else differs from 3DGS: cut-offs, order, rounding.
-        near_plane: World units; None: decided by the page that embeds the viewer.
-        sh_degree: Bands above it are not drawn.
-        filter_3d: Whether the viewer reads the column filter_3D of a PLY and smooths splats by it.
-        unlike: Known differences between the viewer and this record.
-    """
-
-    name: str
-    title: str
-    source: str
-    screen_filter: str
-    eps2d: float
-    settings: RenderSettings = USUAL
-    near_plane: float | None = None
-    sh_degree: int = 3
-    filter_3d: bool = False
-    unlike: str = ""
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.screen_filter, str) or self.screen_filter not in SCREEN_FILTERS:
-            raise SettingsError(f"viewer {self.name!r}: there is no screen filter {self.screen_filter!r}; choose from {', '.join(SCREEN_FILTERS)}")
-        if not isinstance(self.settings, RenderSettings):
-            raise SettingsError(f"viewer {self.name!r}: settings must be RenderSettings, got {type(self.settings).__name__}")
-        check(f"viewer {self.name!r}", self, OF_VIEWER, optional=frozenset({"near_plane"}))
-
-    def effects(self, effects: Effects) -> Effects:
-        """`effects` under this viewer's convention. The near plane changes only if the viewer has one."""
-        near = effects.near_plane if self.near_plane is None else self.near_plane
-        degree = min(effects.sh_degree, self.sh_degree)
-        return replace(
-            effects, sh_degree=degree, screen_filter=self.screen_filter, eps2d=self.eps2d, near_plane=near, settings=self.settings
-        )
-
-
-# Standard deviations at which a splat ends in viewers that draw it as a 2 x 2 square with the weight exp(-r²) up to r = 2.
-EDGE = 8**0.5
-
-# The frame buffer has 8 bits and is rounded after each splat, so less than half a step is invisible. In the viewers alpha may be 1; here
-# it is a little less, so that splats behind keep a gradient. The viewers have no least transmittance; here it is too small to be visible.
-WEBGL = RenderSettings(min_alpha=0.5 / 255, radius=EDGE, max_alpha=0.999, min_transmittance=1e-6, frozen_beyond=math.inf, picture_step=1 / 255)
+from mipmap_plugin.render_settings import EvenBuckets, Packing
+from mipmap_plugin.screen_filters import DILATION
+from mipmap_plugin.splatting.native_viewers import BRUSH, FURTHER, UNITY
+from mipmap_plugin.splatting.viewer import EDGE as EDGE
+from mipmap_plugin.splatting.viewer import WEBGL
+from mipmap_plugin.splatting.viewer import Viewer as Viewer
 
 # px²: PlayCanvas and Cesium require half-axes of 2 half pixels: 2·sqrt(2·4·v) >= 2, v >= 1/8.
 PIXEL_SIZE = 1 / 8
@@ -103,7 +54,7 @@ FRONT_TO_BACK = "covariances are stored in float16, quaternions in 8 bits, and t
 
 BUILT_IN = (
     Viewer(
-        "classic", "3DGS: INRIA's viewer, gsplat, nerfstudio", "diff-gaussian-rasterization; gsplat 1.5, rasterize_mode classic",
+        "classic", "3DGS: INRIA's viewer, gsplat, nerfstudio", "diff-gaussian-rasterization; gsplat 1.5, rasterize_mode classic; 3DGS.cpp f614d66",
         "classic", DILATION, near_plane=NEAR_PLANE, unlike=INRIA_UNLIKE,
     ),
     Viewer(
@@ -193,26 +144,16 @@ BUILT_IN = (
         unlike="covariances are stored in float16, quaternions and SH coefficients in 8 bits; an SPZ file that says it was trained with "
         "antialiasing is drawn with compensation",
     ),
-    Viewer(
-        "unity", "UnityGaussianSplatting (aras-p)", "UnityGaussianSplatting 1.1.1 (2c6fed3), RenderGaussianSplats, GaussianSplatting.hlsl",
-        "classic", DILATION, replace(WEBGL, min_alpha=1 / 255, frozen_beyond=FRUSTUM_MARGIN, picture_step=None),
-        unlike="a splat ends at a square instead of an ellipse, assets are packed at the quality chosen on import, and the background shines "
-        "through in linear light; not compared with its images",
-    ),
-    Viewer(
-        "brush", "Brush", "brush 8b7f5c6c, brush-render, for a file without SplatRenderMode mip", "classic", DILATION,
-        RenderSettings(max_alpha=0.999), near_plane=0.01, sh_degree=4, unlike="a file with SplatRenderMode mip is drawn as mip; "
-        "not compared with its images",
-    ),
+    UNITY, BRUSH, *FURTHER,
 )  # fmt: skip
 
 # What a name may be: files that are adapted for the viewer have it in theirs.
 IN_FILES = re.compile(r"\w[\w.+-]*")
 
 ALIASES = {
-    **dict.fromkeys(("inria", "gsplat", "nerfstudio", "kiri"), "classic"),
+    **dict.fromkeys(("inria", "gsplat", "nerfstudio", "kiri", "3dgs.cpp"), "classic"),
     **dict.fromkeys(("supersplat", "supersplat-viewer"), "playcanvas"),
-    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe"},
+    **{"mkkellogg": "gaussian-splats-3d", "threejs": "three", "drei": "aframe", "lichtfeld": "brush", "godot": "gdgs"},
 }
 
 # What is asked for, but has no record: why, and what to take instead.
@@ -234,7 +175,7 @@ for _viewer in BUILT_IN:
     register_viewer(_viewer.name, _viewer)
 for _alias, _name in ALIASES.items():
     register_viewer(_alias, VIEWERS.get(_name))
-register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN))
+register_viewer("portable", tuple(viewer.name for viewer in BUILT_IN if viewer not in FURTHER))
 
 
 def _registered(name: str) -> Any:

@@ -24,7 +24,7 @@ def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], call
     few = gaussians[torch.arange(min(2, len(gaussians)))].detach()
     if hasattr(backend, "compile_ahead"):
         backend.compile_ahead(few, effects, calls)
-    steps = calls.by_rows and hasattr(backend, "stepper")
+    steps = calls.by_rows and hasattr(backend, "stepper") and all(each.settings.linear_light is None for each in effects)
     # The first with the usual settings, and the first with others, for which a backend may have kernels of their own.
     kinds = list({setting.settings == USUAL: setting for setting in reversed(effects)}.values())
     for setting in effects:

@@ -253,7 +253,7 @@ RULES = {
     "contribution": RenderSettings(min_contribution=1.5),
     "spread": RenderSettings(least_spread=3.0),
     "largest-color": RenderSettings(max_color=0.6),
-    "distance": RenderSettings(radial=True),
+    **{"distance": RenderSettings(radial=True), "linear-light": RenderSettings(linear_light=2.2)},
     "frame": RenderSettings(frame=0.7, frozen_beyond=math.inf),
     "half-axis": RenderSettings(radius=2.0, max_half_axis=5.0),
     "half-axis-of-the-whole": RenderSettings(radius=2.0, max_half_axis=5.0, boxed=True),
