@@ -12,8 +12,8 @@ from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.models.base import SplatModel
 
-# Splats that are looked for at first, for nearly every camera sees one of so many, and then by the others: a camera takes 75 ms for a million.
-SOME, MANY = 1 << 14, 1 << 16
+# Splats that are looked for at most, round by round: nearly every camera sees one of the first, and only those that do not look for more.
+SAMPLES = 1 << 8, 1 << 14, 1 << 16
 
 # A camera counts as seeing a splat whose center lies in a frame this many times as large as its picture: splats reach into a picture from beside it.
 LARGER = 2
@@ -37,10 +37,11 @@ def seeing(cameras: Sequence[Camera], model: SplatModel, near: float) -> list[Ca
 
 def _seeing(frames: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
     """The frames with one of the `means` [N, 3] inside, of many evenly chosen ones."""
-    some, many = (means[:: max(1, len(means) // most)] for most in (SOME, MANY))
-    found = showing(frames, some, near)
-    known = set(found)
-    return found + showing([frame for frame in frames if frame not in known], many, near)
+    found = dict[Camera, None]()
+    for most in SAMPLES:
+        others = [frame for frame in frames if frame not in found]
+        found |= dict.fromkeys(showing(others, means[:: max(1, len(means) // most)], near))
+    return list(found)
 
 
 def _larger(camera: Camera) -> Camera:
