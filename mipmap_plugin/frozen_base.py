@@ -15,7 +15,6 @@ from mipmap_plugin.adaptation import notebook
 from mipmap_plugin.adaptation.adapted import Adapted, render_model
 from mipmap_plugin.adaptation.choosing import choose, mergeable_settings
 from mipmap_plugin.adaptation.conversion import Stages, conversion
-from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import LIMIT, BaseImages
@@ -208,8 +207,7 @@ class FrozenBase:
         family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
         alone = threads.limited_for(backend, self.threads)
         with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
-            looked_from = seeing(cameras, model, self.effects().near_plane)
-            stages = Stages(request, looked_from, photographs, None if resume is None else Path(resume), observe)
+            stages = Stages(request, list(cameras), photographs, None if resume is None else Path(resume), observe)
             adapted = stages.adapt(scale, config, first)
         adapted.report.seconds["loading"] = self.loading_s
         adapted.report.cameras_from.update(self.cameras_from)

@@ -442,7 +442,7 @@ def test_backends_lists_each_with_its_reasons(run, monkeypatch):
 def test_backends_check_prints_a_table_and_fails_if_a_case_does(run, monkeypatch):
     outcomes = [Outcome("fine", 1e-6, True, True, ""), Outcome("odd", 0.5, True, False, "the image differs")]
     monkeypatch.setattr(backends_module, "CASES", {"one": None})
-    monkeypatch.setattr(backends_module, "check_backend", lambda backend, cases, device: outcomes)
+    monkeypatch.setattr(backends_module, "check_backend", lambda backend, cases, dtype, device: outcomes)
     code, out, err = run("backends", "--check", "reference")
     assert code == 2 and "FAIL: the image differs" in out and "| fine " in out
     assert err == "mipmap-plugin: backend 'reference' fails 1 of 2 cases: odd\n"
@@ -461,7 +461,7 @@ def test_backends_check_goes_case_by_case_and_further_where_asked(full, run, mon
     """So that a bar can show how far it is; in one thread, and then in as many as before."""
     asked, threads = [], torch.get_num_threads()
 
-    def one(backend, cases, device):
+    def one(backend, cases, dtype, device):
         asked.append((list(cases), torch.get_num_threads()))
         return [Outcome(case, 0.0, True, True, "") for case in cases]
 

@@ -17,6 +17,7 @@ from mipmap_plugin.adaptation.optimization.ending import End
 from mipmap_plugin.adaptation.optimization.state_file import StateFile
 from mipmap_plugin.adaptation.optimization.validation import count_of_views
 from mipmap_plugin.adaptation.report import Report
+from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.session import AdaptationRequest, Observer, Session
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.photographs import Photographs
@@ -64,13 +65,15 @@ class Stages:
 
     def adapt(self, scale: float, config: AdaptConfig, first: AdaptConfig | None) -> Adapted:
         """Adapt to `scale`; `first`: the settings of a conversion before. Raises as `Session.run` does."""
-        refuse_adapted(self.request.images.model.source)
+        base = self.request.images.model
+        refuse_adapted(base.source)
         if not self.cameras and config.views != "orbit":
-            warn(orbited(self.request.images.model.source, orbit_of(self.request.images.model, self.request.up)))
-        refuse_broken(self.request.images.model, next(iter(self.cameras), ONE_PIXEL), steps=config.steps > 0)
+            warn(orbited(base.source, orbit_of(base, self.request.up)))
+        refuse_broken(base, next(iter(self.cameras), ONE_PIXEL), steps=config.steps > 0)
+        cameras = seeing(self.cameras, base, self.request.images.effects.near_plane)
         if first is None:
-            return Session(self.request, scale, config, self.cameras, self.photographs).run(self.resume, self.observe)
-        session = Session(self.request, 1.0, first, self.cameras, None)
+            return Session(self.request, scale, config, cameras, self.photographs).run(self.resume, self.observe)
+        session = Session(self.request, 1.0, first, cameras, None)
         session.keeps_state = True
         converted = replace(session.run(self.resume and conversion_state(self.resume), self.observe), judge=None)  # which nobody saves
         stopped = session.ended is End.OBSERVER
@@ -78,7 +81,7 @@ class Stages:
         half = config.model_copy(update={"time_budget_s": _half(config)} | ({"steps": 0} if stopped else {}))
         request = replace(self.request, finer=FinerLevel(converted.model, 1.0, NAME, told=True), budget_share=SHARE)
         with _kept_if_interrupted(converted.states):
-            adapted = Session(request, scale, half, self.cameras, self.photographs).run(self.resume, self._further(converted.report))
+            adapted = Session(request, scale, half, cameras, self.photographs).run(self.resume, self._further(converted.report))
         settings = {"time_budget_s": config.time_budget_s} | ({"steps": config.steps} if stopped else {})
         report = adapted.report.model_copy(update={"settings": adapted.report.settings.model_copy(update=settings)})
         return replace(adapted, report=_joined(converted.report, report, stopped), states=[*converted.states, *adapted.states])

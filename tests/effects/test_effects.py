@@ -55,6 +55,7 @@ def test_a_plain_scene_calls_for_the_screen_filter_only():
         "color limit": (False, "colors have no upper bound"),
         "order by distance": (False, "splats are sorted by depth"),
         "coarse order": (False, "the order is exact"),
+        "linear light": (False, "splats are blended as their colors are"),
         "rounded picture": (False, "rounded only for display"),
         "packing": (False, "splats are not rounded"),
         "covariances": (False, "quaternions and scales suffice"),
@@ -75,7 +76,8 @@ def test_everything_on():
     )  # fmt: skip
     requested = Effects(1, "antialiased", 0.1, supersampling=4, settings=everything, outputs=("depth", "normals"))
     effects = explain(requested, splats_with_covariances, of_model, recipe("paper", 4), 4)
-    assert [effect.name for effect in effects if not effect.on] == ["coarse order"]  # there is another already
+    assert [effect.name for effect in effects if not effect.on] == ["coarse order", "linear light"]  # there are another order and a limit
+    assert states(Effects(settings=RenderSettings(linear_light=2.2)), splats)["linear light"] == (True, "splats are blended in linear light")
     assert states(Effects(settings=RenderSettings(bucketed=True)), splats)["coarse order"][0]
     assert states(Effects(settings=RenderSettings(even_buckets=EvenBuckets())), splats)["coarse order"][0]
     rooted = states(Effects(settings=RenderSettings(min_contribution=0.5, rooted=True)), splats)["contribution cull"]
