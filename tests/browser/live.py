@@ -103,19 +103,20 @@ class LivePage:
         return float(self.page.get_by_role("slider").first.get_attribute("aria-valuenow"))
 
     def choose(self, label: str, option: str) -> None:
-        """Choose from a list."""
+        """Choose from a list, and wait until it is closed."""
         self.page.get_by_label(label, exact=True).first.click()
-        self.page.get_by_role("option", name=option, exact=True).click()
+        chosen = self.page.get_by_role("option", name=option, exact=True)
+        chosen.click()
+        chosen.wait_for(state="hidden")
 
     def press(self, button: str) -> None:
         """Press a button."""
         self.page.get_by_role("button", name=button, exact=True).click()
 
     def slide(self, steps: int, slider: int = 0) -> None:
-        """Move a slider by keys: that of zooms, or with 1 that of moments."""
-        self.page.get_by_role("slider").nth(slider).focus()
+        """Move a slider by keys: that of zooms, or with 1 that of moments. Each key focuses it anew: a list that closes takes the focus."""
         for _ in range(abs(steps)):
-            self.page.keyboard.press("ArrowRight" if steps > 0 else "ArrowLeft")
+            self.page.get_by_role("slider").nth(slider).press("ArrowRight" if steps > 0 else "ArrowLeft")
 
     def box(self) -> dict[str, float]:
         """Where the picture is, px."""
