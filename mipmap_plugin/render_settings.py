@@ -151,6 +151,11 @@ class RenderSettings:
         longest = min(self.max_half_axis, width, height) if self.fits_picture else self.max_half_axis
         return math.inf if self.radius is None else (longest / self.radius) ** 2
 
+    @property
+    def by_view(self) -> bool:
+        """Whether the splats are made ready for each view: such views are drawn one by one, and no backend moves the splats itself."""
+        return self.packing is not None or self.linear_light is not None
+
     def changed(self) -> list[str]:
         """The names of the settings that differ from the defaults."""
         if self == USUAL:  # a quick answer, as this is asked for every image

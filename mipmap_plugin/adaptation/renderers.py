@@ -79,8 +79,7 @@ class SteppingRenderer:
     def of(cls, backend: Backend, targets: Sequence[Effects]) -> SteppingRenderer | None:
         """None if the backend moves no splats, or the effects do not allow it."""
         stepper = getattr(backend, "stepper", None)
-        alone = [target.settings for target in targets if target.settings.packing is not None or target.settings.linear_light is not None]
-        return None if stepper is None or alone else cls(stepper, targets)
+        return None if stepper is None or any(target.settings.by_view for target in targets) else cls(stepper, targets)
 
     def differentiate(self, stepper: Any, cameras: Sequence[Camera], draw: int, compare: Comparison) -> list[Tensor]:
         """Draw the views of a step, whose first is the `draw`-th since the beginning, and compare their images; return the mean square errors."""

@@ -22,17 +22,19 @@ LARGER = 2
 def seeing(cameras: Sequence[Camera], model: SplatModel, near: float) -> list[Camera]:
     """The cameras that see something of the model, with a warning of how many do not. `near`: the near plane, in world units.
 
-    All of them where none sees anything, or none that the base was trained on, and of a moving model, whose splats are elsewhere at other moments.
+    Of many splats some are looked for, so that a camera that sees a few of a million counts as blind. All cameras stay where none sees anything,
+    or none that the base was trained on, and those of a moving model, whose splats are elsewhere at other moments.
     """
     if len(cameras) < 2 or model.traits.moves:
         return list(cameras)
     frames = {_larger(camera): camera for camera in cameras}
     found = {frames[frame] for frame in _seeing(list(frames), model.parameters()["means"], near)}
-    if len(found) == len(cameras) or not any(camera.split == "train" for camera in found):
+    kept = [camera for camera in cameras if camera in found]
+    blind = len(cameras) - len(kept)
+    if not blind or not any(camera.split == "train" for camera in kept):
         return list(cameras)
-    blind = len(cameras) - len(found)
-    warn(f"{blind} of {len(cameras)} cameras {'sees no splat, and is' if blind == 1 else 'see no splat, and are'} left out")
-    return [camera for camera in cameras if camera in found]
+    warn(f"{blind} of {len(cameras)} cameras {'sees' if blind == 1 else 'see'} no splat, or hardly any, and {'is' if blind == 1 else 'are'} left out")
+    return kept
 
 
 def _seeing(frames: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:

@@ -61,7 +61,7 @@ class CpuBackend:
 
     def render_views(self, gaussians: Gaussians, shots: Sequence[tuple[Camera, Effects]]) -> list[Rendered]:
         """Several views of the same splats, each with effects of its own, in one call. Raises as `render`."""
-        if any(effects.settings.packing is not None or effects.settings.linear_light is not None for _, effects in shots):  # by the camera
+        if any(effects.settings.by_view for _, effects in shots):
             return [self.render(gaussians, camera, effects) for camera, effects in shots]
         return self._drawn(gaussians, shots)
 

@@ -147,7 +147,7 @@ def _drawing(
     if not isinstance(render, Renderer):
         return partial(render, shared)
     render_views = getattr(render.backend, "render_views", None)
-    if render_views is None or render.effects.settings.packing is not None or together(shared.means, cameras) < len(cameras):
+    if render_views is None or render.effects.settings.by_view or together(shared.means, cameras) < len(cameras):
         return render.of(shared)
     drawn = dict(zip(cameras, render_views(shared, [(camera, render.effects) for camera in cameras]), strict=True))
     return lambda camera: drawn[camera].image
