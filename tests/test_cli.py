@@ -159,6 +159,13 @@ def test_cameras_beside_a_lone_file_are_named_but_not_read(run, tmp_path):
     assert f"give the scene's cameras (--cameras), such as {cameras}, if it is of this scene" in " ".join(err.split())
 
 
+def test_inspect_sees_a_lone_file_by_given_cameras(run, model_folder, tmp_path):
+    ply, cameras = tiny.ply(tmp_path / "a.ply"), model_folder / "cameras.json"
+    out = run("inspect", ply, "--no-viewers", "--cameras", cameras)[1]
+    assert "\ncameras:      4, 32 x 24 px, " in out and f"adapt {ply} --scale 1/4 --cameras {cameras}\n" in out
+    refused(run("inspect", ply, "--cameras", tmp_path / "none.json"), "none.json")
+
+
 def test_inspect_says_how_far_viewers_are_from_training(run, model_folder):
     pytest.importorskip("numba")
     [line] = [line for line in run("inspect", model_folder)[1].splitlines() if line.startswith("viewers:")]

@@ -200,6 +200,12 @@ def test_a_checkpoint_given_twice_is_one(tmp_path, monkeypatch):
     assert find_checkpoints([Path("b[1].ply")]) == [Path("b[1].ply")]  # a name, though it looks like a pattern
 
 
+def test_a_list_of_cameras_is_no_checkpoint(tmp_path):
+    tiny.ply(tmp_path / "a.ply")
+    write_cameras(tmp_path / "cameras.json", tiny.cameras(3))
+    assert find_checkpoints([tmp_path / "*"]) == find_checkpoints(tmp_path.iterdir()) == [tmp_path / "a.ply"]
+
+
 def test_a_list_that_is_no_text(tmp_path):
     (tmp_path / "list").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SettingsError, match="not a text file"):

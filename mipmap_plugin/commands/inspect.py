@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.commands.common import base_cameras, print_facts, summary
-from mipmap_plugin.commands.types import Checkpoint, ScreenFilter, Up
+from mipmap_plugin.commands.types import Cameras, Checkpoint, ScreenFilter, Up
 from mipmap_plugin.process.garbage import uncollected
 from mipmap_plugin.progress import announced
 
@@ -21,6 +21,7 @@ def inspect(
     checkpoint: Checkpoint,
     iteration: int | None = None,
     screen_filter: ScreenFilter = None,
+    cameras: Cameras = None,
     up: Up = None,
     viewers: bool = True,
     all: bool = False,
@@ -43,11 +44,14 @@ def inspect(
         known = {"file": told(found.path), "family": found.family}
         if not json:
             print_facts(known, json)  # before torch is imported
+        from mipmap_plugin.models.inria_folder import read_options
+        from mipmap_plugin.scenes import load_scene
         from mipmap_plugin.wrap import wrap_model
 
         model = load_model(checkpoint, iteration=iteration)
-        wrapped = wrap_model(model, screen_filter=screen_filter, up=up)
-    facts = _facts(checkpoint, wrapped, whole=all or json)
+        scene = None if cameras is None else load_scene(cameras, read_options(model.folder)[0])
+        wrapped = wrap_model(model, cameras=scene, screen_filter=screen_filter, up=up)
+    facts = _facts(checkpoint, wrapped, cameras, whole=all or json)
     asked = [note for note in model.notes if "--screen-filter" in note and screen_filter]  # which is answered
     if not json:
         print_facts(facts, json)  # before pictures are drawn, which takes longer
@@ -59,8 +63,8 @@ def inspect(
     print_facts(known | facts | last if json else last, json)
 
 
-def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]:
-    """What is known of a loaded model without a picture, by name; `whole`: with the effects that are off."""
+def _facts(checkpoint: Path, wrapped: Wrapped, given: Path | None, *, whole: bool) -> dict[str, Any]:
+    """What is known of a loaded model without a picture, by name. `given`: where its cameras lie; `whole`: with the effects that are off."""
     from mipmap_plugin.adaptation.views import remarks, too_unlike
     from mipmap_plugin.effects import explain
     from mipmap_plugin.models.base import effects_of
@@ -68,7 +72,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
     from mipmap_plugin.models.vanilla import VanillaModel
     from mipmap_plugin.scenes import unread_cameras
 
-    model, place = wrapped.model, base_cameras(wrapped, None)
+    model, place = wrapped.model, base_cameras(wrapped, given)
     orbit = f"; it is looked at {wrapped.orbit().told()}" if not wrapped.cameras and wrapped.orbit().up else ""
     with announced("examining"):
         gaussians = model.gaussians(wrapped.views()[0])
@@ -77,7 +81,7 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
         lost = remarks(wrapped.views(), model, wrapped.effects().near_plane, orbit=not wrapped.cameras)
         told = [*health.sentences(), *lost, *filter(None, [too_unlike(wrapped.views())])]
     return {
-        "verdict": _verdict(wrapped, checkpoint, told, bool(lost) or health.spoilt(), health.mostly_unseen()),
+        "verdict": _verdict(wrapped, _advice(wrapped, checkpoint, given), told, bool(lost) or health.spoilt(), health.mostly_unseen()),
         "splats": len(gaussians),
         "sh degree": f"{gaussians.used_sh_degree()} in use of {gaussians.sh_degree}",
         "trained with": f"{wrapped.trained.screen_filter}, {wrapped.trained.eps2d:g} px², background {wrapped.background}",
@@ -87,27 +91,35 @@ def _facts(checkpoint: Path, wrapped: Wrapped, *, whole: bool) -> dict[str, Any]
     }
 
 
-def _verdict(wrapped: Wrapped, checkpoint: Path, health: Sequence[str], spoilt: bool, unseen: str) -> str:
+def _verdict(wrapped: Wrapped, advice: str, health: Sequence[str], spoilt: bool, unseen: str) -> str:
     """Whether the checkpoint is sound, and what to do with it. `health`: remarks; `spoilt`: one says that it is not; `unseen`: that most is."""
-    from mipmap_plugin.models.adapted_scale import adapted_scale
     from mipmap_plugin.models.health import DROPPED
-    from mipmap_plugin.scenes import unread_cameras
 
-    notes, seen, scale = wrapped.model.notes, bool(wrapped.cameras), adapted_scale(wrapped.model.source)
-
-    if lost := next((note for note in notes if DROPPED in note), None):
+    if lost := next((note for note in wrapped.model.notes if DROPPED in note), None):
         return f"doubtful: {lost}; train or export it again, or adapt what is left"
-    place, cameras = shlex.quote(str(checkpoint)), unread_cameras(wrapped.model.source)
-    told, up = wrapped.asked["screen filter"], wrapped.asked.get("up")
-    views = "" if seen else f" --up {up}" if up else f" --cameras {shlex.quote(str(cameras or 'SCENE'))}"
-    advice = f"mipmap-plugin adapt {place} --scale 1/4" + (f" --screen-filter {told}" if told else "") + views
-    if scale not in (None, 1.0):
-        advice = f"mipmap-plugin render {place}, at x{scale:g}, which it was adapted to and looks right at"
-    remarks = len(health)
-    noted = f", but {unseen}" if unseen else f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""
     if spoilt:
         return "doubtful: read health before you adapt it"
+    remarks = len(health)
+    noted = f", but {unseen}" if unseen else f", with {remarks} remark{'s' if remarks > 1 else ''} (health)" if remarks else ""
     return f"sound{noted}; next: {advice}"
+
+
+def _advice(wrapped: Wrapped, checkpoint: Path, given: Path | None) -> str:
+    """The next command for a sound checkpoint, with what this one was told. `given`: where its cameras lie."""
+    from mipmap_plugin.models.adapted_scale import adapted_scale
+    from mipmap_plugin.scenes import unread_cameras
+
+    place, scale = shlex.quote(str(checkpoint)), adapted_scale(wrapped.model.source)
+    if scale not in (None, 1.0):
+        return f"mipmap-plugin render {place}, at x{scale:g}, which it was adapted to and looks right at"
+    words = ["mipmap-plugin", "adapt", place, "--scale", "1/4"]
+    if told := wrapped.asked["screen filter"]:
+        words += ["--screen-filter", told]
+    if given is None and not wrapped.cameras and (up := wrapped.asked.get("up")):
+        words += ["--up", up]
+    elif given is not None or not wrapped.cameras:
+        words += ["--cameras", shlex.quote(str(given or unread_cameras(wrapped.model.source) or "SCENE"))]
+    return " ".join(words)
 
 
 def _off(effects: Sequence[Effect], *, shown: bool) -> list[str]:

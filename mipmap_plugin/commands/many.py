@@ -116,9 +116,10 @@ def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) ->
 
 def _checkpoints(given: Sequence[Path]) -> list[Path]:
     """The checkpoints of the command and of its list, without outputs of earlier runs, which a pattern such as output/* finds too."""
-    if not given:
+    found = find_checkpoints(given)
+    if not found:
         raise SettingsError(NO_CHECKPOINT)
-    checkpoints, outputs = without_outputs(find_checkpoints(given))
+    checkpoints, outputs = without_outputs(found)
     if outputs and not checkpoints:
         raise SettingsError(f"{outputs[0]}: this was adapted already; give the checkpoint that it was made of")
     if outputs:
