@@ -45,3 +45,9 @@ def ctrl_c_is_heard():
 def nothing_that_is_registered_stays():
     with BACKENDS.temporarily(), FAMILIES.temporarily(), UPSAMPLERS.temporarily(), VIEWERS.temporarily(), RECIPES.temporarily():
         yield
+
+
+@pytest.fixture
+def small_orbits(monkeypatch):
+    """Views of a generated orbit of 24 px, in place of 800: for tests of a file without cameras, whose pictures do not matter."""
+    monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)

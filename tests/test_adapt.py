@@ -603,6 +603,7 @@ def test_a_scene_of_which_most_is_before_the_near_plane_is_told_of():
         base.adapt(1 / 2, recipe="instant")
 
 
+@pytest.mark.usefixtures("small_orbits")
 def test_without_cameras_the_orbit_is_told_of(recwarn):
     wrap_model(tiny.model(), backend="reference").adapt(1 / 2, steps=0, extra_views=2, merge_to=1.0)
     assert [each for each in recwarn if str(each.message).startswith("no cameras are known: views of a generated orbit")]

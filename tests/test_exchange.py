@@ -423,6 +423,7 @@ def test_real_splats_survive_each_format(shared_data, tmp_path, ending):
     assert (agree(base, load_model(saved), nearest=True) > 0.95).all()
 
 
+@pytest.mark.usefixtures("small_orbits")
 def test_the_db_of_a_file_are_of_what_its_format_keeps(tool, tmp_path, capsys):
     """The stand-in writes SPZ that it reads as `answer.ply`, another model: as if the format rounded a lot."""
     script = (tool / "splat-transform").read_text()
@@ -444,6 +445,7 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tool, tmp_path, capsys):
     assert "its format rounds splats, which costs" in said.err and any("its format rounds splats" in note for note in report["notes"])
 
 
+@pytest.mark.usefixtures("small_orbits")
 def test_a_ply_is_not_measured_again(tmp_path, capsys):
     words = ["--scale", "1/4", "--steps", "0", "--backend", "reference"]
     assert main(["adapt", str(tiny.ply(tmp_path / "scan.ply")), *words, "--output", str(tmp_path / "out.ply")]) == 0

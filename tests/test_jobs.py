@@ -285,6 +285,7 @@ def test_other_cameras_background_or_photographs_are_not_finished(tmp_path):
     assert finished(job) is not None
 
 
+@pytest.mark.usefixtures("small_orbits")
 def test_another_vertical_is_not_finished(tmp_path):
     job = job_of(tmp_path)
     job = replace(job, base=replace(job.base, cameras=None, up="z"))

@@ -256,7 +256,7 @@ def test_streamed_sog_of_one_level_is_refused_before_any_work(tmp_path, tool, ca
 def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not_stream_it(tmp_path, tool, capsys, monkeypatch):
     monkeypatch.setattr("mipmap_plugin.levels.ladder._no_use", lambda *_: "no better")
     words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
-    words += ["--by", "zoom", "--recipe", "instant", "--views", "given", "--backend", "reference"]
+    words += ["--by", "zoom", "--recipe", "instant", "--views", "given"]
     assert cli.main([*words, "--streamed-sog"]) == 2
     told = "a single level, which needs no streaming; leave --streamed-sog out, which goes on from what is made"
     assert told in capsys.readouterr().err and not (tmp_path / "ladder").exists()
@@ -267,7 +267,7 @@ def test_a_ladder_that_came_out_as_one_level_is_kept_for_a_command_that_does_not
 @pytest.mark.parametrize("at", ["mipmap_plugin.levels.ladder.write_ladder", "mipmap_plugin.levels.store.LevelStore._loaded"])
 def test_a_disk_that_fills_leaves_the_finished_levels_for_the_same_command(tmp_path, capsys, monkeypatch, at):
     words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
-    words += ["--by", "zoom", "--steps", "1", "--views", "given", "--backend", "reference"]
+    words += ["--by", "zoom", "--steps", "1", "--views", "given"]
 
     def full(*arguments):
         raise OutputError("the disk is full")
@@ -283,7 +283,7 @@ def test_a_disk_that_fills_leaves_the_finished_levels_for_the_same_command(tmp_p
 @pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt, 130), (lambda: OutputError("the disk is full"), 2)], ids=["Ctrl-C", "error"])
 def test_an_export_that_ends_early_loses_no_level(tmp_path, tool, capsys, monkeypatch, error, code):
     words = ["levels", str(tiny.folder(tmp_path / "base")), "--viewer", "playcanvas", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2"]
-    words += ["--by", "zoom", "--steps", "1", "--views", "given", "--backend", "reference", "--streamed-sog"]
+    words += ["--by", "zoom", "--steps", "1", "--views", "given", "--streamed-sog"]
 
     def ends(*arguments):
         raise error()
