@@ -109,9 +109,10 @@ def test_without_growing_nothing_is_on_trial(monkeypatch):
     assert not torch.equal(start, end)
 
 
-def test_published_growing_is_not_on_trial(monkeypatch):
+@pytest.mark.parametrize("backend", ["reference", "cpu"])  # the latter moves splats itself, as long as none grows
+def test_published_growing_is_not_on_trial(monkeypatch, backend):
     monkeypatch.setattr(Task, "agreement", lambda *_: pytest.fail("asked"))
-    model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend=backend)
     run = model.adapt(2, recipe="paper", steps=3, prune_every=2, densify_gradient=1e-12)
     assert run.report.gaussians_after > len(tiny.model())
 

@@ -132,8 +132,8 @@ class Session:
         began = now(self.device)
         with self.phase("compilation"):
             merging, effects = self.config.merge_to < 1 and self._has_blend_weights, (self.base_effects, *self.targets.values())
-            takes_steps, per_step, plain = self._takes_steps, self.config.views_per_step, self.base.traits.plain
-            calls = calls_of(self.views, self.scale, per_step, gradients=takes_steps, merging=merging, plain=plain)
+            takes_steps, by_rows = self._takes_steps, self.base.traits.plain and self.config.densify_gradient is None
+            calls = calls_of(self.views, self.scale, self.config.views_per_step, gradients=takes_steps, merging=merging, by_rows=by_rows)
             warm_up(self.backend, self.base.gaussians(self.views[0]), effects, calls)
         evaluate_moments(self.base, [*self.views, *self.validation.steering], self.phase)
         search = StartSearch(self._start_problem())

@@ -96,8 +96,9 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     task.follow(run.student)
     progress = run.progress(config)
     set_rates(run.optimizer, config, progress, run.steering.rate_factor(run.step, config), frozen=frozen_parameters(run))
-    at_once = views_at_once(cameras[view] for view in views) if run.gradients is None else 1
-    run.by_rows = ByRows.of(run.student, task.render_to_step, run.by_rows) if len(views) <= at_once else None
+    growing = run.gradients is not None  # which needs the gradients of each view
+    at_once = 1 if growing else views_at_once(cameras[view] for view in views)
+    run.by_rows = None if growing or len(views) > at_once else ByRows.of(run.student, task.render_to_step, run.by_rows)
     if run.by_rows is not None:
         _step_by_rows(run, run.by_rows, task, config, views, cameras)
     else:

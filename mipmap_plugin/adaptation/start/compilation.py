@@ -40,11 +40,11 @@ def warm_up(backend: Any, gaussians: Gaussians, effects: Sequence[Effects], call
             _step(backend, few, kind)
 
 
-def calls_of(views: Sequence[Camera], scale: float, per_step: int, *, gradients: bool, merging: bool, plain: bool) -> Calls:
-    """What an adaptation over views of the base's scale calls; plain: whether the model's rows are splats, which a backend may move itself."""
+def calls_of(views: Sequence[Camera], scale: float, per_step: int, *, gradients: bool, merging: bool, by_rows: bool) -> Calls:
+    """What an adaptation over views of the base's scale calls; by_rows: whether the backend may move the model's rows itself."""
     zoomed = [view.zoomed(scale) for view in views]
     pixels = [view.width * view.height for view in (*views, *zoomed)]
-    return Calls(gradients, merging, plain and per_step <= views_at_once(zoomed), (min(pixels), max(pixels) * per_step))
+    return Calls(gradients, merging, by_rows and per_step <= views_at_once(zoomed), (min(pixels), max(pixels) * per_step))
 
 
 def _step(backend: Any, splats: Gaussians, effects: Effects) -> None:
