@@ -27,7 +27,7 @@ TOLD = "drawn as its training drew it"
 
 def wrapped(screen_filter: str, eps2d: float, count: int = 60):
     trained = TrainedScale(screen_filter, eps2d)
-    return wrap_model(tiny.model(count, trained), cameras=tiny.cameras(), backend="reference")
+    return wrap_model(tiny.model(count, trained), cameras=tiny.cameras())
 
 
 @pytest.mark.parametrize("scale", [1 / 8, 4])
@@ -102,7 +102,7 @@ def test_where_there_is_nothing_to_tell(scale, viewer):
 def test_the_notes_of_a_filtered_file_do_not_call_it_classic_and_its_filter_a_stray_column(tmp_path, name):
     folder = mip_checkpoints.folder(tmp_path / "model", name)
     (folder / "cfg_args").write_text((folder / "cfg_args").read_text().replace("resolution=1", "resolution=1, train_test_exp=False"))
-    saved = wrap_model(folder, cameras=tiny.cameras(), backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "small")
+    saved = wrap_model(folder, cameras=tiny.cameras()).adapt(1 / 2, recipe="instant").save(tmp_path / "small")
     for path in (folder, saved):
         notes = " ".join(load_model(path).notes)
         assert "carried along" not in notes and "classic" not in notes and "header" not in notes
@@ -121,5 +121,5 @@ def test_inspect_asks_for_the_filter_until_it_is_told(tmp_path, capsys, screen_f
 
 def test_the_command_names_the_filter_that_the_file_is_for(tmp_path, capsys):
     folder = tiny.folder(tmp_path / "base", trained=TrainedScale("antialiased"))
-    assert main(["adapt", str(folder), "--scale", "1/2", "--recipe", "instant", "--backend", "reference"]) == 0
+    assert main(["adapt", str(folder), "--scale", "1/2", "--recipe", "instant"]) == 0
     assert "made for renderers that draw as its training did (antialiased, 0.3 px²)" in capsys.readouterr().out

@@ -81,7 +81,7 @@ def test_cameras_that_see_the_same_share_an_image_and_others_do_not(drawn):
 
 
 def test_each_base_image_is_drawn_once_for_all_scales(drawn):
-    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3), backend="reference")
+    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3))
     wrapped.adapt(1 / 2, steps=2, extra_views=1, validation_views=2)
     first = list(drawn)
     wrapped.adapt(1 / 4, steps=2, extra_views=1, validation_views=2)
@@ -89,7 +89,7 @@ def test_each_base_image_is_drawn_once_for_all_scales(drawn):
 
 
 def test_where_the_time_is_measured_all_images_are_drawn_again(drawn):
-    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3), backend="reference")
+    wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3))
     for _ in range(2):
         adapt_alone(wrapped, 1 / 2, steps=1, extra_views=1, validation_views=2)
     assert len(drawn) == 2 * len(set(drawn)) > 0
@@ -97,7 +97,7 @@ def test_where_the_time_is_measured_all_images_are_drawn_again(drawn):
 
 def test_a_scale_is_adapted_alike_whether_or_not_another_came_before():
     def adapted(*scales):
-        wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3), backend="reference")
+        wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3))
         return [wrapped.adapt(scale, steps=2, extra_views=1, validation_views=2) for scale in scales][-1].model.parameters()
 
     alone, after = adapted(1 / 4), adapted(1 / 2, 1 / 4)
@@ -106,7 +106,7 @@ def test_a_scale_is_adapted_alike_whether_or_not_another_came_before():
 
 def test_a_base_that_is_adapted_once_keeps_no_images(drawn):
     def adapted(keeps):
-        wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3), backend="reference")
+        wrapped = wrap_model(tiny.model(10), cameras=tiny.cameras(3))
         wrapped.keeps_images = keeps
         parameters = wrapped.adapt(1 / 2, steps=4, extra_views=1, validation_views=2).model.parameters()
         return wrapped.images._store._bytes, parameters

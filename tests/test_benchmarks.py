@@ -188,21 +188,21 @@ def test_a_zoom_in_of_a_capture_is_shrunk_and_compared_with_the_base(captures):
 
 
 def test_held_out_views_of_a_capture_come_in_the_order_of_names(tmp_path):
-    base = wrap_model(tiny.model(), cameras=tiny.cameras(9)[::-1], backend="reference")
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(9)[::-1])
     judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,), every=4))
     assert [view.name for view in judged] == ["view_0", "view_4", "view_8"] and len(others) == 6
 
 
 def test_smaller_cameras_of_a_capture_are_those_of_its_base():
     """Views of another zoom would get base images of the size of the training, so that the base were its own truth at the new scale."""
-    base = wrap_model(tiny.model(), cameras=tiny.cameras(4), backend="reference")
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(4))
     judged, others = unbounded.split(base, unbounded.Capture("ball", (2.0,), every=2, share=0.5))
     assert {(view.width, view.zoom) for view in (*judged, *others)} == {(base.cameras[0].width // 2, 1.0)}
 
 
 def test_a_capture_without_cameras_is_judged_on_views_that_no_seed_of_adapting_draws(monkeypatch):
     monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
-    base = wrap_model(tiny.model(), cameras=[], backend="reference")
+    base = wrap_model(tiny.model(), cameras=[])
     judged, others = unbounded.split(base, unbounded.Capture("ball", (0.25,)))
     adapted = base.adapt(0.25, recipe="instant", cameras=others or None)
     assert len(judged) == unbounded.ORBIT_VIEWS and others == [] and views_seen(judged, adapted.adapted_to) == []

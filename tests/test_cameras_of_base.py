@@ -20,12 +20,12 @@ from mipmap_plugin.scenes import load_scene, write_cameras
 
 def instant(base, target, cameras=None):
     """A file adapted from `base` in no step."""
-    wrapped = wrap_model(base, backend="reference", cameras=cameras and load_scene(cameras))
+    wrapped = wrap_model(base, cameras=cameras and load_scene(cameras))
     return wrapped.adapt(1 / 2, recipe="instant").save(target)
 
 
 def poses(path) -> torch.Tensor:
-    return torch.stack([view.viewmat for view in wrap_model(path, backend="reference").cameras])
+    return torch.stack([view.viewmat for view in wrap_model(path).cameras])
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_cameras_that_are_not_what_they_were_are_not_taken(base, tmp_path, spoil
     else:
         (base / "cameras.json").write_text("{")
     with pytest.warns(UserWarning, match="cameras that are not found any more.*give the scene's cameras"):
-        assert wrap_model(adapted, backend="reference").cameras == []
+        assert wrap_model(adapted).cameras == []
 
 
 @pytest.mark.parametrize("record", [{}, {"scene": 3}, {"options": "x"}, None])
@@ -67,12 +67,12 @@ def test_a_report_without_a_place_is_one_of_before(base, tmp_path, record):
     adapted = instant(base, tmp_path / "adapted.ply")
     report = adapted.with_name(adapted.name + ".adaptation.json")
     report.write_text(json.dumps(json.loads(report.read_text()) | {"cameras_from": record}))
-    assert wrap_model(adapted, backend="reference").cameras == []
+    assert wrap_model(adapted).cameras == []
 
 
 def test_a_job_knows_them_without_loading(base, tmp_path):
     adapted = instant(base, tmp_path / "adapted.ply")
-    assert Base(adapted).asked() == Base(adapted, backend="reference").load().asked
+    assert Base(adapted).asked() == Base(adapted).load().asked
 
 
 def test_those_of_an_archive_are_found_in_it_again(base, tmp_path, monkeypatch, capsys):
@@ -87,24 +87,24 @@ def test_those_of_an_archive_are_found_in_it_again(base, tmp_path, monkeypatch, 
 def test_what_another_process_unpacked_is_not_recorded(base, tmp_path):
     unpacked = tmp_path / f"{TEMPORARY}ab12_x9z" / "base"
     shutil.copytree(base, unpacked)
-    assert not wrap_model(unpacked, backend="reference").cameras_from
+    assert not wrap_model(unpacked).cameras_from
 
 
 def test_a_file_in_another_frame_names_none(base, tmp_path):
-    adapted = wrap_model(base, backend="reference").adapt(1 / 2, recipe="instant")
+    adapted = wrap_model(base).adapt(1 / 2, recipe="instant")
     adapted.model.traits = replace(adapted.model.traits, placed=True)
     assert adapted.report.cameras_from and not adapted.report_of(tmp_path / "lone.ply").cameras_from
 
 
 def test_render_says_whose_cameras_these_are(base, tmp_path, capsys):
     adapted = instant(base, tmp_path / "adapted.ply")
-    assert main(["render", str(adapted), "--output", str(tmp_path / "pictures"), "--backend", "reference"]) == 0
+    assert main(["render", str(adapted), "--output", str(tmp_path / "pictures")]) == 0
     assert f"seen by the cameras of its base, in {base}; --cameras gives others" in capsys.readouterr().out
     assert len([*(tmp_path / "pictures").iterdir()]) == len(tiny.cameras())
 
 
 def test_render_says_nothing_of_a_base(base, tmp_path, capsys):
-    assert main(["render", str(base), "--output", str(tmp_path / "pictures"), "--backend", "reference"]) == 0
+    assert main(["render", str(base), "--output", str(tmp_path / "pictures")]) == 0
     assert "its base" not in capsys.readouterr().out
 
 

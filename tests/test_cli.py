@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pressing
 import pytest
 import tiny
 import torch
@@ -34,8 +35,8 @@ from mipmap_plugin.models.vanilla import VanillaModel
 from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.wrap import Wrapped, wrap_model
 
-QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
-NO_STEP = ["--backend", "reference", "--steps", "0"]
+QUICK = ["--views", "given", "--steps", "2"]
+NO_STEP = ["--steps", "0"]
 
 
 @pytest.fixture
@@ -115,7 +116,7 @@ def test_splats_that_are_left_out_are_told_of(run, tmp_path):
     write_ply(tmp_path / "b.ply", columns)
     said = f"mipmap-plugin: {tmp_path / 'b.ply'}: 3 of 20 splats were dropped: 3 of 20 splats hold a NaN in means\n"
     assert "\nverdict:      doubtful: 3 of 20 splats were dropped" in run("inspect", tmp_path / "b.ply", "--no-viewers")[1]
-    words = ["adapt", tmp_path / "b.ply", "--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--log", tmp_path / "log"]
+    words = ["adapt", tmp_path / "b.ply", "--scale", "1/2", "--recipe", "instant", "--log", tmp_path / "log"]
     assert said in run(*words)[2]
     assert "3 of 20 splats were dropped" in (tmp_path / "log").read_text()
 
@@ -138,7 +139,7 @@ def test_a_wrong_scale_of_render_is_named(run, model_folder):
 @pytest.mark.usefixtures("small_orbits")
 def test_a_folder_of_a_base_and_its_adaptations_is_the_base(run, tmp_path):
     ply = tiny.ply(tmp_path / "a.ply")
-    assert run("adapt", ply, "--scale", "1/2", "--recipe", "instant", "--backend", "reference")[0] == 0
+    assert run("adapt", ply, "--scale", "1/2", "--recipe", "instant")[0] == 0
     assert f"file:         {ply}\n" in run("inspect", tmp_path, "--no-viewers")[1]
 
 
@@ -158,7 +159,7 @@ def test_cameras_beside_a_lone_file_are_named_but_not_read(run, tmp_path):
     out = run("inspect", ply, "--no-viewers")[1]
     assert f"cameras:      none are read; {cameras} may be of this scene\n" in out
     assert f"adapt {ply} --scale 1/4 --cameras {cameras}\n" in out
-    err = run("adapt", ply, "--scale", "1/2", "--recipe", "instant", "--backend", "reference")[2]
+    err = run("adapt", ply, "--scale", "1/2", "--recipe", "instant")[2]
     assert f"give the scene's cameras (--cameras), such as {cameras}, if it is of this scene" in " ".join(err.split())
 
 
@@ -206,7 +207,7 @@ def test_adapt_two_scales_into_a_folder(run, model_folder, tmp_path):
         assert where.pop(0).startswith(f"{ply}, made for renderers that draw as 3DGS does")
         assert re.fullmatch(rf"x{scale:g}: (\S+ -> \S+ dB on views|holds the base as it is, ).*, 60 -> \d+ splats, \d+\.\d s", what.pop(0))
     log = (tmp_path / "log.txt").read_text()
-    assert "ended by 2 steps" in log and "backend reference: requested" in log and "the 4 given views" in log
+    assert "ended by 2 steps" in log and "backend cpu: " in log and "the 4 given views" in log
     assert not list(tmp_path.rglob("*.resume"))
 
 
@@ -271,14 +272,7 @@ def test_an_output_that_exists_needs_overwrite_and_is_refused_before_any_work(ru
 def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tmp_path, monkeypatch):
     command = ["adapt", model_folder, "--scale", "1/4", *QUICK]
     run(*command, "--output", tmp_path / "whole.ply")
-    render, pressed = ReferenceBackend.render, []
-
-    def interrupting(self, gaussians, camera, effects):
-        if gaussians.means.requires_grad and torch.is_grad_enabled() and camera.width > 1 and not pressed:  # in a step
-            pressed.append(signal.raise_signal(signal.SIGINT))
-        return render(self, gaussians, camera, effects)
-
-    monkeypatch.setattr(ReferenceBackend, "render", interrupting)
+    pressing.in_step(monkeypatch, lambda: signal.raise_signal(signal.SIGINT))(1)
     code, out, err = run(*command, "--output", tmp_path / "new.ply")
     assert (code, out) == (130, "")
     assert "interrupted at step 1; run the same command again to continue from" in err and "Traceback" not in err
@@ -289,7 +283,7 @@ def test_ctrl_c_ends_with_130_and_the_same_command_goes_on(run, model_folder, tm
 
 
 def test_adapt_to_the_bases_own_scale_gives_the_base(run, model_folder, tmp_path):
-    code, out, err = run("adapt", model_folder, "--scale", "1", "--output", tmp_path / "same.ply", "--report", "--backend", "reference")
+    code, out, err = run("adapt", model_folder, "--scale", "1", "--output", tmp_path / "same.ply", "--report")
     assert (code, err) == (0, "") and out.startswith("x1: holds the base as it is, 60 -> 60 splats, 0.0 s\n")
     assert read_ply(tmp_path / "same.ply").columns["x"].shape == (60,)
 
@@ -304,7 +298,7 @@ def test_ctrl_c_anywhere_else_says_interrupted(run, model_folder, monkeypatch):
 
 
 def test_render_writes_the_test_views_at_the_scale(run, model_folder, tmp_path):
-    words = ["--scale", "1/2", "--cameras", model_folder / "cameras.json", "--backend", "reference"]
+    words = ["--scale", "1/2", "--cameras", model_folder / "cameras.json"]
     code, out, _ = run("render", model_folder, "--output", tmp_path / "out", *words)
     assert (code, out) == (0, f"4 pictures in {tmp_path / 'out'}\n")
     pictures = sorted((tmp_path / "out").iterdir())
@@ -313,7 +307,7 @@ def test_render_writes_the_test_views_at_the_scale(run, model_folder, tmp_path):
 
 
 def test_render_of_one_view_is_the_view(run, model_folder, tmp_path):
-    words = ["--view", "view_1", "--screen-filter", "scaled", "--supersampling", "2", "--background", "white", "--backend", "reference"]
+    words = ["--view", "view_1", "--screen-filter", "scaled", "--supersampling", "2", "--background", "white"]
     code, out, _ = run("render", model_folder, "--output", tmp_path / "out", *words)
     assert code == 0 and out.startswith("1 picture in")
     [picture] = (tmp_path / "out").iterdir()
@@ -324,9 +318,9 @@ def test_render_writes_the_row_of_supersampling_that_evaluate_judges(run, tmp_pa
     splats = tiny.gaussians()
     VanillaModel.from_gaussians(replace(splats, sh=3 * splats.sh), TrainedScale()).save(tmp_path / "bright", provenance={})  # beyond a screen's white
     write_cameras(tmp_path / "bright" / "cameras.json", tiny.cameras(2))
-    words = ["--scale", "1/4", "--view", "view_1", "--screen-filter", "scaled", "--supersampling", "4", "--backend", "reference"]
+    words = ["--scale", "1/4", "--view", "view_1", "--screen-filter", "scaled", "--supersampling", "4"]
     assert run("render", tmp_path / "bright", "--output", tmp_path / "out", *words)[0] == 0
-    base = wrap_model(tmp_path / "bright", backend="reference")
+    base = wrap_model(tmp_path / "bright")
     [row] = [each for each in baselines(base, 1 / 4, "area") if each.name == "supersampling, 4 x 4"]
     [view] = [view for view in base.cameras if view.name == "view_1"]
     shown = np.asarray(Image.open(tmp_path / "out" / "train_view_1.png")).astype(int)
@@ -339,14 +333,14 @@ def test_render_says_that_no_view_shows_anything(run, tmp_path):
     behind[2, 3] = -100.0
     away = [replace(camera, viewmat=camera.viewmat + behind) for camera in tiny.cameras(2)]
     scene = write_cameras(tmp_path / "cameras.json", away)
-    code, out, err = run("render", tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "out", "--cameras", scene, "--backend", "reference")
+    code, out, err = run("render", tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "out", "--cameras", scene)
     assert (code, out) == (0, f"2 pictures in {tmp_path / 'out'}\n")
     assert "none of the 2 views shows a splat: the cameras seem to be of another scene" in " ".join(err.split())
 
 
 def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, model_folder, tmp_path):
     refused(run("render", model_folder, "--output", tmp_path / "out", "--view", "nowhere"), "there is no view nowhere; the first of 4 are view_")
-    words = ["render", model_folder, "--output", tmp_path / "out", "--view", "view_1", "--backend", "reference"]
+    words = ["render", model_folder, "--output", tmp_path / "out", "--view", "view_1"]
     assert run(*words)[0] == 0
     refused(run(*words), "train_view_1.png exists already; pass --overwrite")
     refused(run(*words, "--overwrite", "--supersampling", "0"), "supersampling: must be at least 1")
@@ -364,7 +358,7 @@ def test_picture_names_are_unique_and_stay_in_their_folder():
 
 def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
-    wanted = ["--scale", "1", "--scale", "1/4", "--recipe", "instant", "--protocol", "P1", "--backend", "reference"]
+    wanted = ["--scale", "1", "--scale", "1/4", "--recipe", "instant", "--protocol", "P1"]
     words = ["evaluate", model_folder, "--images", scene, "--output", tmp_path / "rows.json", *wanted]
     code, out, _ = run(*words)
     assert code == 0
@@ -378,7 +372,7 @@ def test_evaluate_prints_a_table_and_writes_its_rows(run, model_folder, tmp_path
 
 
 def test_evaluate_as_json(run, model_folder, tmp_path):
-    code, out, _ = run("evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1", "--json", "--backend", "reference")
+    code, out, _ = run("evaluate", model_folder, "--images", tiny.scene(tmp_path / "scene"), "--scale", "1", "--json")
     assert code == 0 and json.loads(out)["rows"][0]["name"] == "base"
 
 
@@ -399,7 +393,7 @@ def test_evaluate_and_tradeoff_tell_of_photographs_that_are_absent(run, model_fo
     scene = tiny.scene(tmp_path / "scene")
     (scene / "test" / "view_1.png").unlink()
     note = "transforms_test.json: 1 listed image is absent; 1 camera is left out because the file has no w and h"
-    words = [model_folder, "--images", scene, "--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--json"]
+    words = [model_folder, "--images", scene, "--scale", "1/2", "--recipe", "instant", "--json"]
     code, out, err = run("evaluate", *words, "--output", tmp_path / "rows.json")
     assert code == 0 and f"mipmap-plugin: {scene}: {note}\n" in err
     assert json.loads(out)["judged_views"] == [1] and json.loads(out)["notes"] == [note]
@@ -411,7 +405,7 @@ def test_evaluate_and_tradeoff_tell_of_photographs_that_are_absent(run, model_fo
 
 def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, model_folder, tmp_path):
     scenes = [tiny.scene(tmp_path / "one"), tiny.scene(tmp_path / "two")]
-    words = ["--scale", "1/4", "--published", "nerf-synthetic", "--backend", "reference"]
+    words = ["--scale", "1/4", "--published", "nerf-synthetic"]
     code, out, _ = run("evaluate", model_folder, model_folder, "--images", *scenes, *words)
     assert code == 0
     assert "| one       | x0.25 | P3 " in out and "| mean of 2 | x0.25 | P3 " in out
@@ -422,7 +416,7 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
 def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
     refused(run("evaluate", tiny.ply(tmp_path / "a.ply"), "--images", scene, "--scale", "1"), "has no cameras, so its base scale is not known")
-    refused(run("evaluate", model_folder, "--images", scene, "--scale", "4", "--backend", "reference"), "the photographs have only 32 x 24")
+    refused(run("evaluate", model_folder, "--images", scene, "--scale", "4"), "the photographs have only 32 x 24")
     refused(run("evaluate", model_folder, "--images", tmp_path / "nowhere", "--scale", "1"), "there is no such file or folder")
 
 
@@ -431,11 +425,11 @@ def test_a_checkpoint_of_which_nothing_is_drawn_is_refused_before_the_work(run, 
     faint.parameters()["opacities"][:] = -8.0
     faint.save(tmp_path / "faint", provenance={})
     write_cameras(tmp_path / "faint" / "cameras.json", tiny.cameras(3))
-    photographs = ["--images", tiny.scene(tmp_path / "scene"), "--scale", "1/2", "--backend", "reference"]
+    photographs = ["--images", tiny.scene(tmp_path / "scene"), "--scale", "1/2"]
     for words in (
-        ["adapt", "--scale", "1/2", "--backend", "reference"],
-        ["levels", "--viewer", "spark", "--output", tmp_path / "levels", "--backend", "reference"],
-        ["tradeoff", "--scale", "1/2", "--output", tmp_path / "tradeoff", "--backend", "reference"],
+        ["adapt", "--scale", "1/2"],
+        ["levels", "--viewer", "spark", "--output", tmp_path / "levels"],
+        ["tradeoff", "--scale", "1/2", "--output", tmp_path / "tradeoff"],
         ["evaluate", *photographs],
         ["adapt", "--scale", "1/2", "--tiles", "2", "--backend", "cpu"],
     ):
@@ -534,7 +528,7 @@ def test_a_damaged_photograph_ends_in_one_sentence(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
     picture = scene / "test/view_0.png"
     picture.write_bytes(picture.read_bytes()[:200])
-    refused(run("evaluate", model_folder, "--images", scene, "--scale", "1", "--backend", "reference"), "view_0.png")
+    refused(run("evaluate", model_folder, "--images", scene, "--scale", "1"), "view_0.png")
 
 
 def test_a_damaged_state_ends_in_one_sentence(run, model_folder, tmp_path):

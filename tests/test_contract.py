@@ -30,7 +30,7 @@ def model(**members):
 
 
 def wrapped(**members):
-    return wrap_model(model(**members), cameras=tiny.cameras(2), backend="reference")
+    return wrap_model(model(**members), cameras=tiny.cameras(2))
 
 
 def parameters(**changes):
@@ -135,7 +135,7 @@ def registered(path, load=lambda path, iteration: model(), **changes):
 def test_levels_of_a_family_that_writes_no_ply_end_in_a_sentence(tmp_path, capsys):
     own = type("Own", (Theirs,), {"save": save_as_text})
     file = registered(tmp_path / "a.own", lambda path, iteration: own(tiny.model().parameters(), TrainedScale(), Origin(path)))
-    words = ["--viewer", "spark", "--recipe", "instant", "--backend", "reference", "--output", str(tmp_path / "levels")]
+    words = ["--viewer", "spark", "--recipe", "instant", "--output", str(tmp_path / "levels")]
     assert main(["levels", str(file), *words]) == 2
     assert "family 'theirs': save() wrote a file of the type unknown to" in capsys.readouterr().err
 
@@ -220,7 +220,7 @@ class Forgetful(Theirs):
 )  # fmt: skip
 def test_the_suite_sees_models_that_break_a_promise(kind, test):
     with pytest.raises(AssertionError):
-        getattr(ModelSuite(), test)(wrap_model(kind(tiny.model().parameters()), cameras=tiny.cameras(2), backend="reference"))
+        getattr(ModelSuite(), test)(wrap_model(kind(tiny.model().parameters()), cameras=tiny.cameras(2)))
 
 
 def test_the_suite_wants_a_ply_for_viewers(tmp_path):

@@ -166,7 +166,7 @@ def test_a_single_ply_cannot_hold_the_network(tmp_path):
 
 @pytest.mark.parametrize(("scale", "settings"), [(1 / 4, dict(steps=15, extra_views=4)), (4, dict(recipe="instant"))])
 def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, scale, settings):
-    wrapped = wrap_model(moving.write_deformable(tmp_path / "m", moving.deform_state(width=64)), backend="reference")
+    wrapped = wrap_model(moving.write_deformable(tmp_path / "m", moving.deform_state(width=64)))
     adapted = wrapped.adapt(scale, **settings)
     base, now = moving.decibels(wrapped, adapted, [moving.at(time) for time in (0.0, 0.5, 1.0)])
     assert now > base + 1
@@ -177,7 +177,7 @@ def test_adapting_gains_and_leaves_the_network_as_it_was(tmp_path, scale, settin
 
 
 def test_an_adapted_model_keeps_its_rows_together_when_splats_are_dropped(tmp_path):
-    wrapped = wrap_model(moving.write_deformable(tmp_path / "m"), backend="reference")
+    wrapped = wrap_model(moving.write_deformable(tmp_path / "m"))
     adapted = wrapped.adapt(1 / 4, steps=4, extra_views=0, prune_every=2, min_opacity=0.4, returns="last")
     assert 0 < len(adapted.model.gaussians(tiny.cameras()[0])) < 60
 
@@ -231,7 +231,7 @@ def test_another_archive_in_its_place_is_refused(tmp_path):
 
 
 def test_the_published_recipe_clones_and_splits_before_the_splats_move(tmp_path):
-    wrapped = wrap_model(moving.write_deformable(tmp_path / "m", moving.deform_state(width=64)), backend="reference")
+    wrapped = wrap_model(moving.write_deformable(tmp_path / "m", moving.deform_state(width=64)))
     adapted = wrapped.adapt(1 / 4, recipe="paper", steps=3, prune_every=2, densify_gradient=1e-9)
     assert adapted.report.gaussians_after > 60
     assert all(bool(tensor.isfinite().all()) for tensor in adapted.model.parameters().values())

@@ -122,7 +122,7 @@ def test_each_view_is_enlarged_once_and_beforehand(upsampler):
 
 
 def adapted(upsampler_name, **settings):
-    model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6))
     return model.adapt(2, upsampler=upsampler_name, **settings)
 
 
@@ -156,7 +156,7 @@ def test_a_network_grows_splats_up_to_a_limit(upsampler, keeps):
 def test_an_upsampler_that_is_all_noise_does_no_harm(upsampler, recipe):
     """Against the base's own larger render: little below the closed form, whatever the target; noise itself is 30 dB below."""
     upsampler(lambda image, size: torch.rand(*size, 3, generator=torch.Generator().manual_seed(int(image.sum() * 1000))))
-    base = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(6))
     views = tiny.cameras(2, seed=9, split="test")
     truths = [base.render(view.zoomed(2), 2, "scaled").image for view in views]
 

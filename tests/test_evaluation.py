@@ -38,7 +38,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture
 def model():
-    return wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    return wrap_model(tiny.model(), cameras=tiny.cameras())
 
 
 # Metrics
@@ -260,7 +260,7 @@ def test_an_upsampler_has_a_row_of_its_own(model, scene, monkeypatch):
 def test_a_row_is_not_called_held_out_where_a_judged_pose_was_adapted_to(scene):
     """Without `eval` in cfg_args every camera of the checkpoint counts as one of training."""
     judged = [replace(camera, split="train", name="another") for camera in tiny.cameras(2, seed=9)]
-    own = wrap_model(tiny.model(), cameras=[*tiny.cameras(2), judged[0]], backend="reference")
+    own = wrap_model(tiny.model(), cameras=[*tiny.cameras(2), judged[0]])
     rows = {row.name: row for row in evaluate(own, scene, [1 / 4], ["instant", "default"], "P3", **BRIEF) if row.ended_by}
     assert list(rows) == [f"{recipe}, {on}" for recipe in ("instant", "default") for on in ("1 of 2 judged views adapted to", "scored")]
 
@@ -286,7 +286,7 @@ def test_the_mean_over_scenes(model, scene):
 
 def test_a_checkpoint_without_cameras_cannot_be_judged(scene):
     with pytest.raises(SettingsError, match="has no cameras, so its base scale is not known; give its model folder"):
-        evaluate(wrap_model(tiny.model(), backend="reference"), scene, [1], [], "P3")
+        evaluate(wrap_model(tiny.model()), scene, [1], [], "P3")
 
 
 def test_rows_as_text_and_as_records(model, scene):
@@ -327,14 +327,14 @@ def test_a_markdown_table_pads_its_columns():
 
 
 def test_a_viewer_that_cannot_be_adapted_for_is_refused_before_anything_is_drawn(scene, monkeypatch):
-    own = wrap_model(tiny.model(trained=TrainedScale(keeps_filter=True)), cameras=tiny.cameras(), backend="reference")
+    own = wrap_model(tiny.model(trained=TrainedScale(keeps_filter=True)), cameras=tiny.cameras())
     monkeypatch.setattr(Wrapped, "render", None)
     with pytest.raises(SettingsError, match="leave the viewer spark out"):
         evaluate(own, scene, [1 / 4], ["instant"], "P3", viewer="spark")
 
 
 def test_a_setting_out_of_range_is_refused_before_anything_is_drawn(scene, monkeypatch):
-    base = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    base = wrap_model(tiny.model(), cameras=tiny.cameras())
     monkeypatch.setattr(Wrapped, "render", None)
     with pytest.raises(SettingsError, match="setting steps"):
         evaluate(base, scene, [1 / 4], ["default"], "P3", steps=-1)

@@ -428,7 +428,7 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tool, tmp_path, capsys):
     """The stand-in writes SPZ that it reads as `answer.ply`, another model: as if the format rounded a lot."""
     script = (tool / "splat-transform").read_text()
     (tool / "splat-transform").write_text(script + f"pathlib.Path(target).write_bytes({gzip.compress(SPZ)!r}) if target.endswith('.spz') else None\n")
-    words = ["--scale", "1/4", "--steps", "0", "--backend", "reference", "--viewer", "classic"]
+    words = ["--scale", "1/4", "--steps", "0", "--viewer", "classic"]
     tiny.model(seed=5).save(tool / "answer.ply", provenance={}, overwrite=True)
     source = tiny.ply(tmp_path / "scan.ply")
     assert main(["adapt", str(source), *words, "--output", str(tmp_path / "scan.spz"), "--report"]) == 0
@@ -447,6 +447,6 @@ def test_the_db_of_a_file_are_of_what_its_format_keeps(tool, tmp_path, capsys):
 
 @pytest.mark.usefixtures("small_orbits")
 def test_a_ply_is_not_measured_again(tmp_path, capsys):
-    words = ["--scale", "1/4", "--steps", "0", "--backend", "reference"]
+    words = ["--scale", "1/4", "--steps", "0"]
     assert main(["adapt", str(tiny.ply(tmp_path / "scan.ply")), *words, "--output", str(tmp_path / "out.ply")]) == 0
     assert json.loads((tmp_path / "out.ply.adaptation.json").read_text())["written"] is None

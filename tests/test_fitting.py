@@ -52,7 +52,7 @@ OPTIONS = [[], ["--viewer", "spark"], ["--viewer", "mip"], ["--scale", "1/3"], [
 @pytest.mark.parametrize("options", OPTIONS)
 def test_a_file_is_as_large_as_it_may_be_and_no_larger(tmp_path, options):
     base, output, size = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "small.ply", 6_000
-    words = ["adapt", str(base), "--bytes", str(size), "--output", str(output), "--steps", "1", "--views", "given", "--backend", "reference"]
+    words = ["adapt", str(base), "--bytes", str(size), "--output", str(output), "--steps", "1", "--views", "given"]
     assert cli.main([*words, *options]) == 0
     assert size - UNKNOWN - 2 * ROW <= output.stat().st_size <= size
 
@@ -63,7 +63,7 @@ def test_a_file_of_fewer_splats_at_the_bases_own_scale_is_optimized():
 
 def test_the_command_makes_a_file_of_so_many_splats(tmp_path, capsys):
     base, output = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12)), tmp_path / "small.ply"
-    words = ["adapt", str(base), "--splats", "9", "--output", str(output), "--steps", "1", "--views", "given", "--backend", "reference"]
+    words = ["adapt", str(base), "--splats", "9", "--output", str(output), "--steps", "1", "--views", "given"]
     assert cli.main(words) == 0
     assert len(load_model(output)) <= 9
     assert "x0.1875" in capsys.readouterr().out  # 9 of 60 splats are those of 0.8 times this scale
@@ -74,7 +74,7 @@ def test_the_command_makes_a_file_of_so_many_splats(tmp_path, capsys):
 def test_a_file_of_few_splats_is_compared_with_the_base(tmp_path, capsys):
     """Which it may not be replaced by, for that has more."""
     base, output = tiny.folder(tmp_path / "base", tiny.cameras(4, width=16, height=12)), tmp_path / "small.ply"
-    words = ["adapt", str(base), "--splats", "5", "--scale", "1", "--output", str(output), "--steps", "1", "--backend", "reference", "--json"]
+    words = ["adapt", str(base), "--splats", "5", "--scale", "1", "--output", str(output), "--steps", "1", "--json"]
     assert cli.main(words) == 0
     [report] = json.loads(capsys.readouterr().out)
     assert report["gaussians_after"] <= 5 and report["validation"]["the base as it is"] > max(

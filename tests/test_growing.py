@@ -5,6 +5,7 @@ import signal
 from types import SimpleNamespace
 
 import numpy as np
+import pressing
 import pytest
 import tiny
 import torch
@@ -14,7 +15,6 @@ from mipmap_plugin.adaptation.optimization.run import Task, Trial
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.target.resize import resize
 from mipmap_plugin.adaptation.target.upsamplers import register_upsampler
-from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.config import LearningRates
 from mipmap_plugin.models.vanilla import Origin, VanillaModel
 from mipmap_plugin.recipes import recipe
@@ -41,7 +41,7 @@ def judged(monkeypatch):
 
 
 def adapted(resume=None, observe=None, **settings):
-    model = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    model = wrap_model(tiny.model(), cameras=tiny.cameras(6))
     return model.adapt(2, upsampler="mine", resume=resume, observe=observe, **{**EAGER, **settings})
 
 
@@ -122,7 +122,7 @@ def test_agreement_at_the_start_is_that_of_the_closed_form(monkeypatch):
     agreement = Task.agreement
     monkeypatch.setattr(Task, "agreement", lambda *given: found.append(agreement(*given)) or found[-1])
     adapted(steps=1)
-    base = wrap_model(tiny.model(), cameras=tiny.cameras(6), backend="reference")
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(6))
     closed = base.adapt(2, recipe="instant", views="train")
     errors = []
     for view in tiny.cameras(6):
@@ -131,21 +131,13 @@ def test_agreement_at_the_start_is_that_of_the_closed_form(monkeypatch):
     assert found[0] == pytest.approx(-10 * math.log10(sum(errors) / 6), abs=0.01)
 
 
-@pytest.mark.parametrize(("agreements", "pressed"), [((30.0, 20.0), 6), ((30.0, 31.0, 32.0), 10)])  # with a growth on trial; after its judgment
+@pytest.mark.parametrize(("agreements", "pressed"), [((30.0, 20.0), 3), ((30.0, 31.0, 32.0), 5)])  # with a growth on trial; after its judgment
 def test_a_resumed_run_equals_an_uninterrupted_one(judged, monkeypatch, tmp_path, agreements, pressed):
     judged(*agreements)
     whole = adapted()
-    render, calls = ReferenceBackend.render, []
-
-    def interrupting(self, gaussians, camera, effects):
-        calls.append(gaussians.means.requires_grad and torch.is_grad_enabled() and camera.width > 1)  # in a step
-        if sum(calls) == pressed and calls[-1]:
-            signal.raise_signal(signal.SIGINT)
-        return render(self, gaussians, camera, effects)
-
     judged(*agreements)
     with monkeypatch.context() as patched:
-        patched.setattr(ReferenceBackend, "render", interrupting)
+        pressing.in_step(patched, lambda: signal.raise_signal(signal.SIGINT))(pressed)
         with pytest.raises(Interrupted):
             adapted(resume=tmp_path / "state")
     resumed = adapted(resume=tmp_path / "state")
@@ -162,7 +154,7 @@ def test_rows_that_are_as_many_but_others_have_no_columns_of_the_base(monkeypatc
     rates = LearningRates(means=0.05, scales=0.02, quats=0.004, opacities=0.05, sh0=0.015, shN=0.02)  # with which one splat is pruned
     settings = dict(most_growth=1, densify_gradient=1e-12, min_opacity=0.5, prune_every=1, steps=4, check_every=2, merge_to=1.0, warm_up=0)
     settings |= dict(rates=rates, views_per_step=3)
-    run = wrap_model(base, cameras=tiny.cameras(6), backend="reference").adapt(1 / 2, extra_views=0, closed_form=False, **settings)
+    run = wrap_model(base, cameras=tiny.cameras(6)).adapt(1 / 2, extra_views=0, closed_form=False, **settings)
     assert run.report.returned.startswith("the state after step 2") and len(run.model) == len(base)
     assert not torch.equal(run.model.parameters()["means"], base.parameters()["means"])
     assert "confidence" not in run.model.extras

@@ -124,7 +124,7 @@ def test_what_inspect_calls_doubtful_is_told_of_once_and_in_the_report(tmp_path,
     wrong = {name: np.float32(1) / (1 + np.exp(-values)) for name, values in columns.items() if name in (column, *map(column.format, range(3)))}
     write(ply, columns | wrong)
     command, *options = words
-    assert main([command, str(path), *options, "--output", str(tmp_path / "new"), "--backend", "reference", "--views", "given"]) == 0
+    assert main([command, str(path), *options, "--output", str(tmp_path / "new"), "--views", "given"]) == 0
     assert capsys.readouterr().err.count(sentence) == 1
     reports = sorted((tmp_path / "new").rglob("*.adaptation.json"))
     assert reports and all(json.loads(report.read_text())["notes"][0] == sentence for report in reports)

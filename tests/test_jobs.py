@@ -35,8 +35,8 @@ from mipmap_plugin.scenes import write_cameras
 from mipmap_plugin.tiles.job import TileJob
 from mipmap_plugin.wrap import Wrapped
 
-QUICK = ["--backend", "reference", "--views", "given", "--steps", "2"]
-NO_STEP = ["--backend", "reference", "--steps", "0"]
+QUICK = ["--views", "given", "--steps", "2"]
+NO_STEP = ["--steps", "0"]
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def job_of(tmp_path, **changes):
         tiny.ply(base)
         write_cameras(tmp_path / "cameras.json", tiny.cameras(3))
     settings = {"steps": 0, "seed": 0, "views": "given"}
-    return replace(Job(Base(base, tmp_path / "cameras.json", backend="reference"), tmp_path / "out.ply", 0.5, settings=settings), **changes)
+    return replace(Job(Base(base, tmp_path / "cameras.json"), tmp_path / "out.ply", 0.5, settings=settings), **changes)
 
 
 # The command
@@ -371,7 +371,7 @@ def test_tiles_do_not_travel(tmp_path):
 def test_a_model_folder_travels(tmp_path, suffix, given):
     folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
     (folder / "cfg_args").write_text("Namespace(sh_degree=1, white_background=True)")
-    job = Job(Base(folder / given, backend="reference"), tmp_path / f"here{suffix}", 0.5, settings={"steps": 0, "seed": 0, "views": "given"})
+    job = Job(Base(folder / given), tmp_path / f"here{suffix}", 0.5, settings={"steps": 0, "seed": 0, "views": "given"})
     assert run_job(job).status == "done"
     away = replace(job, target=tmp_path / f"away{suffix}")
     assert unpack(do_parcel(pack(away), run_job), away).status == "done"
@@ -384,7 +384,7 @@ def test_given_cameras_have_the_image_size_of_the_training(tmp_path, given):
     """Its options lie in the model folder, whether that or a file in it is named."""
     folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
     (folder / "cfg_args").write_text("Namespace(sh_degree=1, resolution=2)")
-    base = Base(folder / given, cameras=folder / "cameras.json", backend="reference")
+    base = Base(folder / given, cameras=folder / "cameras.json")
     views = base.load().cameras
     assert {view.size for view in views} == {(tiny.HEIGHT // 2, tiny.WIDTH // 2)}
     assert base.asked()["cameras"] == digest_of(views)
@@ -414,7 +414,7 @@ def test_what_comes_back_never_replaces_the_base(tmp_path):
 def test_a_model_folder_comes_back_as_a_whole(tmp_path):
     folder = tiny.folder(tmp_path / "base", tiny.cameras(3))
     settings = {"steps": 0, "seed": 0, "views": "given"}
-    job = Job(Base(folder, backend="reference"), tmp_path / "away", 0.5, settings=settings, overwrite=True)
+    job = Job(Base(folder), tmp_path / "away", 0.5, settings=settings, overwrite=True)
     delivery = do_parcel(pack(job), run_job)
     old = tmp_path / "away" / "point_cloud" / "iteration_99999" / "point_cloud.ply"
     old.parent.mkdir(parents=True)
@@ -562,7 +562,7 @@ def test_side_by_side_makes_the_same_bytes_as_one_after_the_other(run, scenes, t
 def test_ctrl_c_saves_the_state_of_every_running_job(run, scenes, tmp_path, engine):
     if "--dask" in engine:
         pytest.importorskip("distributed")
-    words = ["adapt", scenes / "chair", scenes / "lego", "--scale", "1/2", "--scale", "1/4", "--backend", "reference", "--views", "given"]
+    words = ["adapt", scenes / "chair", scenes / "lego", "--scale", "1/2", "--scale", "1/4", "--views", "given"]
     command = [sys.executable, "-m", "mipmap_plugin", *map(str, words), "--steps", "100000", "--recipe", "paper", *engine]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, env=saving_often(tmp_path / "site")

@@ -48,7 +48,7 @@ BRIEF = dict(steps=1, extra_views=1, validation_views=2, warm_up=0, views_per_st
 
 
 def wrapped(count=12):
-    return wrap_model(tiny.model(count, degree=0), cameras=tiny.cameras(2, width=16, height=12), backend="reference")
+    return wrap_model(tiny.model(count, degree=0), cameras=tiny.cameras(2, width=16, height=12))
 
 
 def request(viewer="antialiased", **options):
@@ -241,7 +241,7 @@ def test_levels_of_other_cameras_are_not_gone_on_with(tmp_path, change):
 
 @pytest.mark.usefixtures("small_orbits")
 def test_levels_of_another_vertical_are_not_gone_on_with(tmp_path):
-    base, other = (wrap_model(tiny.model(), backend="reference", up=up) for up in ("z", None))
+    base, other = (wrap_model(tiny.model(), up=up) for up in ("z", None))
     asked = request(coarsest=0.9, steps=0, extra_views=2)
     make_levels(base, asked, tmp_path / "state")
     with pytest.raises(SettingsError, match="holds levels of another base, viewer or settings"):
@@ -384,13 +384,13 @@ def test_splats_in_no_picture_have_no_part_in_the_size_of_a_pixel():
     eye = views[0].center.float()
     hidden = replace(behind, means=behind.means + eye + 0.2 * eye / eye.norm())
     both = Gaussians(*(torch.cat(pair) for pair in zip(_columns(ball), _columns(hidden), strict=True)))
-    sizes = [base_pixel(wrap_model(VanillaModel.from_gaussians(each), cameras=views, backend="reference")) for each in (ball, both, hidden)]
+    sizes = [base_pixel(wrap_model(VanillaModel.from_gaussians(each), cameras=views)) for each in (ball, both, hidden)]
     assert sizes[0] == sizes[1] and 0 < sizes[2] < sizes[0] / 5
 
 
 def test_a_ladder_is_saved_when_its_base_is_gone(tmp_path):
     base = tiny.ply(tmp_path / "base.ply", degree=0)
-    ladder = wrap_model(base, cameras=tiny.cameras(2, width=16, height=12), backend="reference").levels("classic", coarsest=1.0)
+    ladder = wrap_model(base, cameras=tiny.cameras(2, width=16, height=12)).levels("classic", coarsest=1.0)
     base.unlink()
     assert (ladder.save(tmp_path / "ladder") / MANIFEST).is_file()
 
@@ -436,7 +436,7 @@ def test_levels_for_mip_splatting_start_from_finer_ones_that_are_kept(tmp_path):
 def test_an_interrupted_command_says_that_finished_levels_are_kept(tmp_path, monkeypatch, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
     words = ["levels", str(base), "--viewer", "antialiased", "--output", str(tmp_path / "ladder"), "--coarsest", "1/2", "--recipe", "instant"]
-    words += ["--views", "given", "--backend", "reference"]
+    words += ["--views", "given"]
 
     def ends(*_):
         raise KeyboardInterrupt
@@ -574,7 +574,7 @@ def test_a_damaged_unfinished_ladder_is_told(tmp_path):
 @pytest.mark.parametrize("by", ["auto", "zoom", "distance"])
 def test_what_no_viewer_draws_has_no_levels(tmp_path, write, by):
     write(tmp_path / "base")
-    base = wrap_model(tmp_path / "base", cameras=tiny.cameras(2), backend="reference")
+    base = wrap_model(tmp_path / "base", cameras=tiny.cameras(2))
     with pytest.raises(SettingsError, match="levels are files for viewers, so adapt it to one scale at a time"):
         make_levels(base, request("supersplat", by=by))
 
@@ -593,7 +593,7 @@ def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
     with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
         make_levels(wrapped(), request(coarsest=1 / 8), resume=tmp_path / "state")
     with pytest.raises(SettingsError, match="levels of another base, viewer or settings"):
-        make_levels(on_backend(wrapped(), "cpu"), request(), resume=tmp_path / "state")
+        make_levels(on_backend(wrapped(), "reference"), request(), resume=tmp_path / "state")
     (tmp_path / "state" / "request.json").write_text("")
     with pytest.raises(SceneError, match=r"request\.json: is not JSON"):
         make_levels(wrapped(), request(), resume=tmp_path / "state")
@@ -605,7 +605,7 @@ def test_levels_of_another_ladder_are_not_taken(tmp_path, monkeypatch):
 
 def test_the_command_makes_a_ladder_and_prints_it(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2, width=16, height=12), count=12)
-    options = ["--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given", "--backend", "reference"]
+    options = ["--viewer", "antialiased", "--coarsest", "1/2", "--ratio", "2", "--recipe", "instant", "--views", "given"]
     words = ["levels", str(base), "--output", str(tmp_path / "ladder"), "--json", *options]
     assert cli.main(words) == 0
     manifest = json.loads(capsys.readouterr().out)
@@ -627,7 +627,7 @@ def test_levels_are_measured_by_views_that_show_something():
     there = torch.eye(4, dtype=torch.float64)
     there[:3, 3] = away.double()
     cameras = [*tiny.cameras(3), *(view.moved(there) for view in tiny.cameras(3))]
-    base = wrap_model(VanillaModel.from_gaussians(both), cameras=cameras, backend="reference")
+    base = wrap_model(VanillaModel.from_gaussians(both), cameras=cameras)
     yardstick = Yardstick(base, seed=0)
     assert len(yardstick._images) == 4 and all(image.std() > 0 for image in yardstick._images.values())
 

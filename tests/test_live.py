@@ -68,7 +68,7 @@ def test_the_numbers_are_those_of_the_live_model(kind):
 def test_adapting_never_changes_the_live_model(kind):
     thing = live_objects(splats(60))[kind]
     before = [(tensor.clone(), tensor._version, tensor.requires_grad, tensor.data_ptr()) for tensor in tensors_of(thing)]
-    adapted = wrap_model(thing, cameras=tiny.cameras(), backend="reference").adapt(1 / 4, steps=2, extra_views=1)
+    adapted = wrap_model(thing, cameras=tiny.cameras()).adapt(1 / 4, steps=2, extra_views=1)
     assert adapted.report.gaussians_before == 60
     for tensor, (value, version, requires_grad, place) in zip(tensors_of(thing), before, strict=True):
         assert torch.equal(tensor, value)
@@ -225,7 +225,7 @@ def test_live_anchors_decode_as_those_of_the_file(layout, tmp_path):
 def test_adapting_live_anchors_leaves_them_and_a_saved_one_loads_the_same(layout, tmp_path):
     thing = ScaffoldGaussianModel(layout)
     before = [(tensor.detach().clone(), tensor._version, tensor.data_ptr()) for tensor in thing.tensors()]
-    adapted = wrap_model(thing, cameras=tiny.cameras(), backend="reference").adapt(1 / 4, steps=2, extra_views=1)
+    adapted = wrap_model(thing, cameras=tiny.cameras()).adapt(1 / 4, steps=2, extra_views=1)
     for tensor, (value, version, place) in zip(thing.tensors(), before, strict=True):
         assert torch.equal(tensor, value) and (tensor._version, tensor.data_ptr(), tensor.grad) == (version, place, None)
     adapted.model.save(tmp_path / "saved", provenance={})

@@ -85,7 +85,7 @@ def test_rendered_as_an_independent_sum_of_the_files_own_numbers(tmp_path, famil
     model = load_model(folder(tmp_path / "model", family))
     assert (model.family, (model.trained.screen_filter, model.trained.eps2d)) == (family, FILTERS[family])
     view = tiny.cameras(1)[0]
-    image = wrap_model(model, cameras=[view], backend="reference").render(view).image
+    image = wrap_model(model, cameras=[view]).render(view).image
     expected = brute_force(by_the_formulas(splats(), family != "analytic"), view, FILTERS[family][1], screen_filter=FILTERS[family][0])[0]
     assert expected.max() > 0.2
     torch.testing.assert_close(image.double(), expected, atol=1e-5, rtol=0)
@@ -110,12 +110,12 @@ def test_saved_and_loaded_again(tmp_path, family, name):
 def test_adapted_in_its_own_filter_it_is_closer_to_the_base(tmp_path, family, scale, least):
     base = ball(family)
     raw = {name: tensor.clone() for name, tensor in base.parameters().items()}
-    wrapped = wrap_model(base, cameras=tiny.cameras(), backend="reference")
+    wrapped = wrap_model(base, cameras=tiny.cameras())
     adapted = wrapped.adapt(scale, steps=20, extra_views=4, returns="last")
     assert quality(adapted, wrapped, scale) > quality(wrapped, wrapped, scale) + least
     assert (adapted.effects.screen_filter, adapted.effects.eps2d) == FILTERS[family]
     assert all(torch.equal(base.parameters()[name], tensor) for name, tensor in raw.items())
-    loaded = wrap_model(adapted.save(tmp_path / "adapted.ply"), cameras=[], backend="reference")
+    loaded = wrap_model(adapted.save(tmp_path / "adapted.ply"), cameras=[])
     small = wrapped.cameras[0].zoomed(scale)
     torch.testing.assert_close(loaded.render(small).image, adapted.render(small).image, atol=1e-5, rtol=0)
 
@@ -134,7 +134,7 @@ def quality(model, base, scale):
 def test_the_filters_go_with_their_rows_and_do_not_move():
     base = ball()
     pruning = dict(steps=12, extra_views=0, prune_every=5, min_opacity=0.3, returns="last")
-    adapted = wrap_model(base, cameras=tiny.cameras(), backend="reference").adapt(0.25, **pruning)
+    adapted = wrap_model(base, cameras=tiny.cameras()).adapt(0.25, **pruning)
     left = adapted.model.parameters()[CARRIED].detach()
     assert 0 < len(left) < len(base)
     assert torch.isin(left, base.filter_3d).all() and len(left) == len(adapted.model.parameters()["means"])
@@ -185,7 +185,7 @@ def test_a_fused_file_is_recognized_by_its_options_or_given_its_filter(tmp_path)
     assert inside.model.family == "3dgs" and (inside.effects().screen_filter, inside.effects().eps2d) == ("mip", 0.1)
     bare = load_model(ply_files.write(tmp_path / "fused.ply", plain))
     assert bare.trained.screen_filter == "classic" and any("fused" in note for note in bare.notes)
-    wrapped = wrap_model(bare, cameras=tiny.cameras(), screen_filter="mip", backend="reference")
+    wrapped = wrap_model(bare, cameras=tiny.cameras(), screen_filter="mip")
     assert (wrapped.effects().screen_filter, wrapped.effects().eps2d) == ("mip", 0.1)
     adapted = wrapped.adapt(0.25, steps=0)
     assert adapted.effects == wrapped.effects() and adapted.model.trained.screen_filter == "mip"

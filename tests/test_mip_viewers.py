@@ -29,7 +29,7 @@ BRIEF = dict(steps=2, extra_views=2, merge_to=1.0, warm_up=0)
 
 
 def wrapped(path, family: str = "mip") -> Wrapped:
-    return wrap_model(folder(path / "model", family), cameras=tiny.cameras(), backend="reference")
+    return wrap_model(folder(path / "model", family), cameras=tiny.cameras())
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -38,7 +38,7 @@ def test_fused_splats_look_as_the_base_does(tmp_path, family):
     fused = base.model.fused()
     assert fused.family == "3dgs" and not fused.trained.keeps_filter
     assert not any(tensor.requires_grad for tensor in fused.parameters().values())
-    fused_model = wrap_model(fused, cameras=tiny.cameras(), backend="reference")
+    fused_model = wrap_model(fused, cameras=tiny.cameras())
     for view in tiny.cameras(2):
         image = base.render(view).image
         assert image.max() > 0.2
@@ -85,7 +85,7 @@ def test_what_is_made_for_a_viewer_is_a_checkpoint_of_3dgs(tmp_path, family, vie
     assert (again.family, again.trained.screen_filter, again.trained.eps2d) == ("3dgs", tag, 0.3)
     assert len(wrap_model(again).cameras) == 4
     view = tiny.cameras(1)[0].zoomed(1 / 4)
-    loaded = wrap_model(again, backend="reference", background=(0.0, 0.0, 0.0))
+    loaded = wrap_model(again, background=(0.0, 0.0, 0.0))
     torch.testing.assert_close(loaded.render(view, viewer=viewer).image, adapted.render(view).image, atol=1e-5, rtol=0)
 
 
@@ -99,14 +99,14 @@ def of_mip_splatting(columns):
 @pytest.mark.parametrize("base", ["3dgs", "mip"])
 @pytest.mark.parametrize("name", ["made.ply", "made"])
 def test_what_is_made_for_mip_splatting_has_the_filter_that_its_loader_requires(tmp_path, base, name):
-    own = wrapped(tmp_path) if base == "mip" else wrap_model(tiny.folder(tmp_path / "base", tiny.cameras()), backend="reference")
+    own = wrapped(tmp_path) if base == "mip" else wrap_model(tiny.folder(tmp_path / "base", tiny.cameras()))
     adapted = own.adapt(1 / 4, viewer="mip", **BRIEF)
     columns = read_ply(adapted.save(tmp_path / name)).columns
     assert [*columns][-1] == "filter_3D" and not columns["filter_3D"].any()
     splats, (scales, opacities) = adapted.model.gaussians(None).detach(), of_mip_splatting(columns)
     np.testing.assert_allclose(scales, splats.scales, rtol=1e-5)
     np.testing.assert_allclose(opacities, splats.opacities, rtol=1e-5)
-    again, view = wrap_model(tmp_path / name, backend="reference", background=(0.0, 0.0, 0.0)), tiny.cameras(1)[0].zoomed(1 / 4)
+    again, view = wrap_model(tmp_path / name, background=(0.0, 0.0, 0.0)), tiny.cameras(1)[0].zoomed(1 / 4)
     assert (again.model.family, again.trained.eps2d) == ("mip", 0.1)
     torch.testing.assert_close(again.render(view, viewer="mip").image, adapted.render(view).image, atol=1e-5, rtol=0)
 
@@ -146,7 +146,7 @@ def test_the_base_as_it_is_is_what_the_viewer_shows_of_its_file(tmp_path, viewer
 
 def test_only_fused_splats_may_be_merged(tmp_path):
     twins = {name: np.repeat(column, 2) for name, column in splats().items()}
-    base = wrap_model(folder(tmp_path / "model", columns=twins), cameras=tiny.cameras(), backend="reference")
+    base = wrap_model(folder(tmp_path / "model", columns=twins), cameras=tiny.cameras())
     left = len(base.adapt(1 / 4, viewer="playcanvas", steps=0, merge_to=0.5).model)
     assert 0.5 <= left / len(base.model) < 0.6  # some are hardly shown, and are not merged
     with pytest.raises(SettingsError, match="none are merged"):
@@ -160,7 +160,7 @@ def test_without_a_viewer_the_filter_stays(tmp_path):
 
 def test_splats_that_were_fused_elsewhere_leave_the_kernel_size_behind_too(tmp_path):
     plain = {name: column for name, column in splats().items() if name != "filter_3D"}
-    base = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras(), backend="reference")
+    base = wrap_model(folder(tmp_path / "model", columns=plain), cameras=tiny.cameras())
     base.adapt(1, viewer="spark", **BRIEF).save(tmp_path / "made")
     assert (load_model(tmp_path / "made").trained.screen_filter, load_model(tmp_path / "made").trained.eps2d) == ("mip", 0.3)
 
@@ -171,7 +171,7 @@ def test_who_draws_the_base_has_its_filter_too(tmp_path, monkeypatch):
     no_analytic = ["it does not integrate"]
     monkeypatch.setattr(ReferenceBackend, "lacking", lambda self, needs: no_analytic if needs.screen_filter == "analytic" else lacking(self, needs))
     with pytest.raises(BackendUnavailable, match="it does not integrate"):
-        wrapped(tmp_path, "analytic").adapt(1, viewer="classic", **BRIEF)
+        wrap_model(folder(tmp_path / "model", "analytic"), cameras=tiny.cameras(), backend="reference").adapt(1, viewer="classic", **BRIEF)
 
 
 def test_inspect_says_how_viewers_show_it(tmp_path):
@@ -183,7 +183,7 @@ def test_inspect_says_how_viewers_show_it(tmp_path):
 def test_the_command_converts_it(tmp_path, capsys):
     base = folder(tmp_path / "model")
     write_cameras(base / "cameras.json", tiny.cameras())
-    words = ["adapt", base, "--scale", "1", "--viewer", "spark", "--recipe", "instant", "--backend", "reference"]
+    words = ["adapt", base, "--scale", "1", "--viewer", "spark", "--recipe", "instant"]
     assert main([str(word) for word in words]) == 0
     what, where = capsys.readouterr().out.splitlines()
     assert what.startswith("x1 in spark: ") and where.startswith(str(tmp_path / "model_x1_spark"))
@@ -191,6 +191,6 @@ def test_the_command_converts_it(tmp_path, capsys):
 
 
 def test_the_command_says_that_a_file_without_a_viewer_is_for_its_own_project(tmp_path, capsys):
-    words = ["adapt", folder(tmp_path / "model"), "--scale", "1/4", "--recipe", "instant", "--backend", "reference"]
+    words = ["adapt", folder(tmp_path / "model"), "--scale", "1/4", "--recipe", "instant"]
     assert main([str(word) for word in words]) == 0
     assert "made for its own project, whose filter it keeps; for others give --viewer spark, supersplat, ..." in capsys.readouterr().out

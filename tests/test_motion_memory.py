@@ -207,7 +207,7 @@ def test_a_run_evaluates_the_field_a_few_times_a_moment_whatever_its_views(tmp_p
     evaluated, changes = [], HexPlane.changes
     monkeypatch.setattr(HexPlane, "changes", lambda field, means, time: evaluated.append(len(means)) or changes(field, means, time))
     cameras = at_times(30)
-    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=cameras, backend="reference")
+    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=cameras)
     adapted = wrapped.adapt(1 / 2, steps=40, extra_views=10, moments=4, validation_views=4)
     assert sum(evaluated) / 60 < 60  # of 160 pictures of steps, and 50 others
     assert adapted.report.views.endswith("at their own times, each at the nearest of 4 moments")
@@ -216,14 +216,14 @@ def test_a_run_evaluates_the_field_a_few_times_a_moment_whatever_its_views(tmp_p
 
 def test_the_bases_moments_are_evaluated_in_a_phase_of_their_own(tmp_path, monkeypatch):
     """A truth costs no evaluation, so that the time left follows from what truths and steps cost."""
-    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=at_times(9), backend="reference")
+    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=at_times(9))
     evaluated, changes = [], HexPlane.changes
     monkeypatch.setattr(HexPlane, "changes", lambda field, means, time: evaluated.append(time) or changes(field, means, time))
     ahead = []
     monkeypatch.setattr(StartSearch, "best", lambda search: ahead.append(len(evaluated)) or best(search))
     adapted = wrapped.adapt(1 / 2, recipe="instant", extra_views=0, moments=5, validation_views=4)
     assert adapted.report.seconds["motion"] > 0 and len(set(evaluated[: ahead[0]])) >= 5
-    static = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(1 / 2, recipe="instant")
+    static = wrap_model(tiny.model(), cameras=tiny.cameras()).adapt(1 / 2, recipe="instant")
     assert "motion" not in static.report.seconds
 
 
@@ -241,7 +241,7 @@ def test_photographs_stay_at_their_own_moments(tmp_path):
     path = folder / "transforms_train.json"
     timed = [{**frame, "time": view.time} for frame, view in zip(json.loads(path.read_text())["frames"], train, strict=True)]
     path.write_text(json.dumps({"frames": timed}))
-    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=train, backend="reference")
+    wrapped = wrap_model(moving.write_hexplane(tmp_path / "m"), cameras=train)
     adapted = wrapped.adapt(2, images=load_scene(folder), steps=1, extra_views=1, moments=2)
     assert adapted.report.views.endswith("at their own times, 6 of them real images")
     assert [view.time for view in adapted.adapted_to[:6]] == [view.time for view in train]
@@ -250,7 +250,7 @@ def test_photographs_stay_at_their_own_moments(tmp_path):
 def test_a_resumed_run_comes_to_the_same(tmp_path):
     """What it evaluates the field at is part of its state."""
     folder, settings = moving.write_hexplane(tmp_path / "m"), dict(steps=12, extra_views=2, validation_views=4, returns="last", prune_every=5)
-    whole = wrap_model(folder, backend="reference").adapt(1 / 2, **settings).model.parameters()
+    whole = wrap_model(folder).adapt(1 / 2, **settings).model.parameters()
 
     def interrupt(step, seconds, render):
         if step == 8:
@@ -261,7 +261,7 @@ def test_a_resumed_run_comes_to_the_same(tmp_path):
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(resume, "SAVE_EVERY_S", 0.0)
-        wrap_model(folder, backend="reference").adapt(1 / 2, resume=state, observe=interrupt, **settings)
-    resumed = wrap_model(folder, backend="reference").adapt(1 / 2, resume=state, **settings).model.parameters()
+        wrap_model(folder).adapt(1 / 2, resume=state, observe=interrupt, **settings)
+    resumed = wrap_model(folder).adapt(1 / 2, resume=state, **settings).model.parameters()
     for name, tensor in whole.items():
         torch.testing.assert_close(resumed[name], tensor, rtol=1e-4, atol=1e-4)

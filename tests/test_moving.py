@@ -37,10 +37,10 @@ def test_jittered_views_take_the_times_of_the_cameras():
 
 
 def test_the_report_says_how_a_moving_scene_was_sampled_and_that_of_a_static_one_has_no_times(tmp_path):
-    moves = wrap_model(moving.write_deformable(tmp_path / "m"), backend="reference").adapt(4, recipe="instant")
+    moves = wrap_model(moving.write_deformable(tmp_path / "m")).adapt(4, recipe="instant")
     times = "104 of them without a time of their own, spread over 0..1, each at the nearest of 24 moments"
     assert moves.report.views == f"4 train views and 100 around them, {times}"
-    static = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference").adapt(4, recipe="instant")
+    static = wrap_model(tiny.model(), cameras=tiny.cameras()).adapt(4, recipe="instant")
     assert "time" not in static.report.views
 
 
@@ -58,7 +58,7 @@ def test_inspect_says_that_the_scene_moves(tmp_path, capsys, write):
 
 
 def test_render_shows_the_moments_that_are_asked_for(tmp_path, capsys):
-    folder, words = moving.write_hexplane(tmp_path / "m"), ["--backend", "reference", "--view", tiny.cameras(1)[0].name]
+    folder, words = moving.write_hexplane(tmp_path / "m"), ["--view", tiny.cameras(1)[0].name]
     for output, times in (("one", ["0"]), ("two", ["0.25", "1"])):
         assert main(["render", str(folder), "--output", str(tmp_path / output), *words, *(w for t in times for w in ("--time", t))]) == 0
     [one], two = sorted((tmp_path / "one").iterdir()), sorted((tmp_path / "two").iterdir())
@@ -69,7 +69,7 @@ def test_render_shows_the_moments_that_are_asked_for(tmp_path, capsys):
 def test_a_view_has_the_exposure_of_its_name_at_each_moment(tmp_path):
     folder, name = moving.write_hexplane(tmp_path / "m"), tiny.cameras(1)[0].name
     (folder / "exposure.json").write_text(json.dumps({name: [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}))
-    words = ["render", str(folder), "--backend", "reference", "--view", name, "--time", "0.25", "--time", "1"]
+    words = ["render", str(folder), "--view", name, "--time", "0.25", "--time", "1"]
     assert main([*words, "--output", str(tmp_path / "plain")]) == main([*words, "--output", str(tmp_path / "exposed"), "--exposure"]) == 0
     plain, exposed = ({picture.name: picture.read_bytes() for picture in (tmp_path / each).iterdir()} for each in ("plain", "exposed"))
     assert len(plain) == 2 and plain.keys() == exposed.keys() and plain != exposed

@@ -21,7 +21,7 @@ NOTEBOOK = Path(__file__).parents[1] / "examples" / "notebook.ipynb"
 
 @pytest.fixture(scope="module")
 def base():
-    return wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="reference")
+    return wrap_model(tiny.model(), cameras=tiny.cameras(3))
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_a_notebook_shows_a_table_and_a_picture(request, shown):
 
 def test_no_name_of_a_file_becomes_markup(tmp_path):
     ply = tiny.ply(tmp_path / "<b>bold.ply")
-    assert "<b>bold" not in wrap_model(ply, cameras=tiny.cameras(1), backend="reference")._repr_html_()
+    assert "<b>bold" not in wrap_model(ply, cameras=tiny.cameras(1))._repr_html_()
 
 
 def test_the_views_of_an_adapted_model_have_its_scale(base, adapted):
@@ -78,7 +78,7 @@ def test_a_plot_without_matplotlib_is_one_sentence(adapted, monkeypatch):
 
 def test_render_takes_the_scale_that_a_file_was_adapted_to(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(2))
-    words = ["--backend", "reference"]
+    words = []
     assert main(["adapt", str(base), "--scale", "1/4", "--recipe", "instant", *words]) == 0
     for name, options, size in [("own", [], (8, 6)), ("asked", ["--scale", "1/2"], (16, 12))]:
         assert main(["render", str(tmp_path / "base_x0.25"), "--output", str(tmp_path / name), *options, *words]) == 0
@@ -91,7 +91,7 @@ def test_render_takes_the_scale_that_a_file_was_adapted_to(tmp_path, capsys):
 
 
 def test_render_takes_the_viewer_that_a_file_was_adapted_for(tmp_path, capsys):
-    base, words = tiny.folder(tmp_path / "base", tiny.cameras(1)), ["--backend", "reference"]
+    base, words = tiny.folder(tmp_path / "base", tiny.cameras(1)), []
     drawn = {}
     for viewer in ("spark", "portable"):
         made = tmp_path / f"base_x0.25_{viewer}"
@@ -118,7 +118,7 @@ def test_a_file_for_a_viewer_of_a_package_that_is_absent_says_so(tmp_path, capsy
 
 @pytest.mark.usefixtures("small_orbits")
 def test_the_scale_is_read_from_the_header_or_from_the_report(tmp_path):
-    base = wrap_model(tiny.ply(tmp_path / "base.ply"), backend="reference")
+    base = wrap_model(tiny.ply(tmp_path / "base.ply"))
     saved = base.adapt(2, recipe="instant").save(tmp_path / "a.ply")
     assert adapted_scale(saved) == 2 and adapted_scale(load_model(saved).source) == 2
     assert adapted_scale(tmp_path / "base.ply") is None and adapted_scale(None) is None

@@ -19,7 +19,7 @@ DOUBT = "they may be of another scene, or their cameras in another frame; check 
 
 @pytest.fixture
 def base():
-    return wrap_model(tiny.model(), cameras=tiny.cameras(3), backend="reference")
+    return wrap_model(tiny.model(), cameras=tiny.cameras(3))
 
 
 def seen(base, cameras, noise=0.0):
@@ -37,7 +37,7 @@ def doubt(base, views):
 @pytest.mark.parametrize(("seed", "told"), [(0, False), (5, True)], ids=["its own scene", "another"])
 def test_evaluate_tells_of_photographs_of_another_scene(tmp_path, capsys, seed, told):
     base, images = tiny.folder(tmp_path / "base"), tiny.scene(tmp_path / "scene", tiny.cameras(4, seed=9, split="test"), seed=seed)
-    assert main(["evaluate", str(base), "--images", str(images), "--scale", "1/2", "--backend", "reference", "--no-report"]) == 0
+    assert main(["evaluate", str(base), "--images", str(images), "--scale", "1/2", "--no-report"]) == 0
     assert (DOUBT in capsys.readouterr().err) == told
 
 

@@ -29,7 +29,7 @@ from mipmap_plugin.pages.record import Page, Picture, Zoom, zoom_name
 from mipmap_plugin.pages.reports import adaptation_zoom, evaluation_page
 
 TITLES = {"base": "base", "adapted": "adapted", "supersampled": "supersampling, 4 x 4", "truth": "truth"}
-BRIEF = ["--backend", "reference", "--views", "given", "--steps", "2"]
+BRIEF = ["--views", "given", "--steps", "2"]
 
 
 def pictures(size: int = 8) -> list[Picture]:
@@ -63,7 +63,7 @@ class OfFewSettings(ReferenceBackend):
 def test_viewers_that_the_backend_lacks_are_left_out_with_its_reason(model_folder, tmp_path):
     register_backend("few", OfFewSettings)
     words = ["adapt", str(model_folder), "--scale", "1/2", "--report", "--output", str(tmp_path / "a.ply"), *BRIEF]
-    assert main(["few" if word == "reference" else word for word in words]) == 0
+    assert main([*words, "--backend", "few"]) == 0
     zoom = record_of(tmp_path / "a.ply.report.html")["zooms"][0]
     why = r"Not drawn: backend 'few' cannot do this, but \w+ can: it does not support another least alpha"
     assert zoom["viewers"] == [] and re.match(why, zoom["no_viewers"])
@@ -158,7 +158,7 @@ def test_a_file_for_a_viewer_is_compared_with_the_base_in_that_viewer(model_fold
 
 
 def test_a_file_for_several_viewers_is_told_of_by_the_worst_of_them(model_folder):
-    base = wrap_model(model_folder, backend="reference")
+    base = wrap_model(model_folder)
     camera, gallery = base.cameras[0], Gallery(base, "itself")
     truth, row = base.render(camera).image, Row("", 1 / 2, "P3", 20.0, None, 3.0, 1.0, 9, scene="ball")
     for name in ("base in spark", "base in classic", "instant in spark", "instant in classic"):
@@ -193,7 +193,7 @@ def test_the_page_tells_of_the_default_recipe_by_name_in_whatever_order_recipes_
 
 
 def test_a_recipe_at_two_scales_is_adapted_at_both(model_folder):
-    gallery = Gallery(wrap_model(model_folder, backend="reference"), "itself")
+    gallery = Gallery(wrap_model(model_folder), "itself")
     image = torch.zeros(8, 8, 3)
     for scale in (1 / 2, 1 / 4):
         gallery.restored("default", {"scale": scale})
@@ -203,7 +203,7 @@ def test_a_recipe_at_two_scales_is_adapted_at_both(model_folder):
 
 def test_evaluate_without_an_output_takes_a_free_name_in_this_folder(model_folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    words = ["evaluate", "base", "--images", str(tiny.scene(tmp_path / "scene")), "--scale", "1", "--backend", "reference"]
+    words = ["evaluate", "base", "--images", str(tiny.scene(tmp_path / "scene")), "--scale", "1"]
     assert [main([*words]), main([*words]), main([*words, "--no-report"])] == [0, 0, 0]
     assert sorted(path.name for path in tmp_path.glob("*.html")) == ["base.evaluation-2.html", "base.evaluation.html"]
     assert capsys.readouterr().out.count("page: base.evaluation") == 2
@@ -247,7 +247,7 @@ def test_the_page_of_a_tradeoff_has_the_points_of_its_json(model_folder, tmp_pat
         "--no-renderers",
         "--no-picture",
     ]
-    assert main([str(word) for word in (*words, "--backend", "reference", "--views", "1", "--no-picture", "--report")]) == 0
+    assert main([str(word) for word in (*words, "--views", "1", "--no-picture", "--report")]) == 0
     record, written = record_of(folder / "report.html"), json.loads((folder / "tradeoff.json").read_text())
     assert record["tradeoffs"] == written["scales"] and record["provenance"] == written["machine"]
     assert capsys.readouterr().out.splitlines()[-1] == f"page: {folder / 'report.html'}"
@@ -312,7 +312,7 @@ def test_a_large_image_is_drawn_in_viewers_as_the_window_around_its_middle(monke
 
 
 def test_zooming_in_is_compared_with_the_base_after_shrinking(model_folder):
-    base = wrap_model(model_folder, backend="reference")
+    base = wrap_model(model_folder)
     zoom = adaptation_zoom(base, base.adapt(2, recipe="instant"))
     assert [picture.role for picture in zoom.pictures] == ["base", "adapted", "other"]
     assert zoom.truth.startswith("the base's own image, with which the image is compared after shrinking")

@@ -62,7 +62,7 @@ def test_the_truth_is_the_image_where_there_is_one_and_the_bases_elsewhere(scene
 
 
 def test_adapting_to_images_says_so_and_leads_elsewhere(scene):
-    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    model = wrap_model(tiny.model(), cameras=tiny.cameras())
     settings = dict(steps=3, extra_views=1)
     adapted, alone = model.adapt(2, images=scene, **settings), model.adapt(2, **settings)
     assert adapted.report.views == "3 train views and 1 around them, 3 of them real images"
@@ -72,13 +72,13 @@ def test_adapting_to_images_says_so_and_leads_elsewhere(scene):
 def test_photographs_are_learned_from_at_any_zoom_in(scene, monkeypatch):
     """Also where the base's own image has nothing to teach."""
     monkeypatch.setattr("mipmap_plugin.recipes.DEFAULT_IN", DEFAULT_IN | {"steps": 2})
-    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    model = wrap_model(tiny.model(), cameras=tiny.cameras())
     assert model.adapt(1.05, images=scene).report.curve[-1].step == 2
     assert model.adapt(1.05).report.curve[-1].step == 0
 
 
 def test_a_run_is_not_resumed_with_other_images(scene, tmp_path, monkeypatch):
-    model, state = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference"), tmp_path / "state"
+    model, state = wrap_model(tiny.model(), cameras=tiny.cameras()), tmp_path / "state"
     train = tiny.cameras(3, width=2 * tiny.WIDTH, height=2 * tiny.HEIGHT)
     others = load_scene(tiny.scene(tmp_path / "others", train=train, seed=6))
     with monkeypatch.context() as patched:
@@ -91,29 +91,29 @@ def test_a_run_is_not_resumed_with_other_images(scene, tmp_path, monkeypatch):
 
 
 def test_images_that_cannot_take_part_are_refused(scene):
-    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    model = wrap_model(tiny.model(), cameras=tiny.cameras())
     for scale, settings in ((1 / 2, {}), (2, dict(compare_at="target"))):
         with pytest.raises(SettingsError, match="real images can be used only for a zoom-in"):
             model.adapt(scale, images=scene, **settings)
     with pytest.raises(SettingsError, match="the checkpoint has no cameras, so that the scale of the images is not known"):
-        wrap_model(tiny.model(), backend="reference").adapt(2, images=scene)
+        wrap_model(tiny.model()).adapt(2, images=scene)
 
 
 def test_images_of_which_none_is_adapted_to_are_refused(scene):
     """The report would count them all the same."""
-    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    model = wrap_model(tiny.model(), cameras=tiny.cameras())
     with pytest.raises(SettingsError, match="none of the views that are adapted to has a photograph"):
         model.adapt(2, images=scene, steps=1, views="orbit")
 
 
 def test_a_scene_without_training_images_is_refused(tmp_path):
-    model = wrap_model(tiny.model(), cameras=tiny.cameras(), backend="reference")
+    model = wrap_model(tiny.model(), cameras=tiny.cameras())
     with pytest.raises(SettingsError, match="there are no training images to adapt to"):
         model.adapt(2, images=load_scene(tiny.scene(tmp_path / "tests_only")))
 
 
 def test_the_command_takes_a_folder_of_images(folder, tmp_path, capsys):
     base = tiny.folder(tmp_path / "base")
-    words = ["adapt", base, "--scale", "2", "--images", folder, "--steps", "1", "--backend", "reference", "--json"]
+    words = ["adapt", base, "--scale", "2", "--images", folder, "--steps", "1", "--json"]
     assert main([str(word) for word in words]) == 0
     assert "3 of them real images" in json.loads(capsys.readouterr().out)[0]["views"]

@@ -39,8 +39,8 @@ def pair():
     return "pair"
 
 
-def wrapped(**trained):
-    return wrap_model(tiny.model(40, TrainedScale(**trained)), cameras=tiny.cameras(), backend="reference")
+def wrapped(backend="auto", **trained):
+    return wrap_model(tiny.model(40, TrainedScale(**trained)), cameras=tiny.cameras(), backend=backend)
 
 
 def colored(*shades):
@@ -135,7 +135,7 @@ def test_each_viewer_draws_for_the_gradient(monkeypatch, pair):
             drawn.append((effects.screen_filter, effects.eps2d))
         return render(self, gaussians, camera, effects)
 
-    model = wrapped()
+    model = wrapped("reference")
     monkeypatch.setattr(ReferenceBackend, "render", watched)
     model.adapt(1 / 4, viewer=pair, **BRIEF)
     first, second = ((find_viewer(name).screen_filter, find_viewer(name).eps2d) for name in PAIR)
@@ -166,7 +166,7 @@ def test_a_backend_has_to_have_what_each_viewer_asks_for():
 def test_a_file_for_two_viewers_is_better_in_its_worst_than_one_for_either(pair):
     def worst(viewer):
         adapted = wrapped().adapt(1 / 2, viewer=viewer, steps=120, extra_views=8, merge_to=1.0, views_per_step=2, warm_up=0, validation_views=4)
-        files, found = wrap_model(adapted.model, backend="reference"), []
+        files, found = wrap_model(adapted.model), []
         for view in tiny.cameras(2, seed=9):  # that nothing was adapted to
             truth = wrapped().render(view.zoomed(1 / 2), 1 / 2, "scaled", supersampling=2).image
             found.append([psnr(files.render(view.zoomed(1 / 2), viewer=name).image, truth) for name in PAIR])
@@ -200,7 +200,7 @@ def test_an_adapted_model_is_drawn_by_each_of_its_viewers(pair):
 
 def test_the_command_writes_a_portable_file_beside_another(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(3))
-    words = ["adapt", base, "--scale", "1/4", "--viewer", "spark", "--viewer", "portable", "--recipe", "instant", "--backend", "reference"]
+    words = ["adapt", base, "--scale", "1/4", "--viewer", "spark", "--viewer", "portable", "--recipe", "instant"]
     assert cli.main([str(word) for word in (*words, "--log", tmp_path / "log")]) == 0
     what, where = capsys.readouterr().out.splitlines()[2:]
     assert what.startswith("x0.25 in portable: ") and where.startswith(str(tmp_path / "base_x0.25_portable")) and where.endswith("made for portable")

@@ -28,11 +28,11 @@ def folder(tmp_path):
 
 def evaluate(folder, output):
     words = ["evaluate", folder / "base", "--images", folder / "scene", "--scale", "1/2", "--recipe", "paper", "--steps", "20"]
-    return [*map(str, words), "--backend", "reference", "--output", str(folder / output)]
+    return [*map(str, words), "--output", str(folder / output)]
 
 
 def tradeoff(folder, output):
-    words = ["tradeoff", folder / "base", "--scale", "1/2", "--recipe", "default", "--steps", "20", "--backend", "reference"]
+    words = ["tradeoff", folder / "base", "--scale", "1/2", "--recipe", "default", "--steps", "20"]
     words += ["--output", folder / output, "--supersampling", "2", "--repeats", "1", "--views", "1"]
     return [*map(str, words), "--no-renderers", "--no-picture"]
 
@@ -95,7 +95,7 @@ def test_a_folder_with_other_things_is_not_deleted(folder, capsys, command):
 def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
     """Which is not in the checkpoint's own bytes."""
     monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
-    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--backend", "reference"]
+    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2"]
     psnrs = []
     for white in (False, True):
         options = folder / "base" / "cfg_args"
@@ -108,7 +108,7 @@ def test_rows_of_another_background_are_measured_again(folder, monkeypatch):
 def test_rows_of_another_truth_are_measured_again(folder, monkeypatch):
     """As of an older version, whose protocol made another of the same photographs."""
     monkeypatch.setattr("mipmap_plugin.commands.evaluate.shutil", SimpleNamespace(rmtree=lambda *_, **__: None))
-    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--protocol", "P1", "--backend", "reference"]
+    words = ["evaluate", str(folder / "base"), "--images", str(folder / "scene"), "--scale", "1/2", "--protocol", "P1"]
     rows = []
     for truncate in (False, True, True):
         monkeypatch.setitem(PROTOCOLS, "P1", replace(PROTOCOLS["P1"], truncate=truncate))

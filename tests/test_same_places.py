@@ -26,7 +26,7 @@ def _small_pictures(monkeypatch):
 
 
 def poses(path, **options) -> torch.Tensor:
-    return torch.stack([view.viewmat for view in wrap_model(path, backend="reference", **options).views()])
+    return torch.stack([view.viewmat for view in wrap_model(path, **options).views()])
 
 
 def heights(views, along: int = 2) -> list[float]:
@@ -38,7 +38,7 @@ def heights(views, along: int = 2) -> list[float]:
 def files(tmp_path):
     """A base, and a file that was adapted from it, whose splats have other means."""
     base = tiny.ply(tmp_path / "base.ply")
-    adapted = wrap_model(base, backend="reference").adapt(SCALE, recipe="instant", extra_views=4)
+    adapted = wrap_model(base).adapt(SCALE, recipe="instant", extra_views=4)
     with torch.no_grad():
         adapted.model.parameters()["means"].add_(0.01)
     return base, adapted.save(tmp_path / "adapted.ply")
@@ -57,17 +57,17 @@ def test_an_adapted_file_is_seen_from_where_its_base_is(files, kept):
 def test_and_so_is_what_is_adapted_from_it_again(files, tmp_path):
     base, _ = files
     fewer = {"recipe": "instant", "most_splats": 20, "extra_views": 4}
-    first = wrap_model(base, backend="reference").adapt(1.0, viewer="classic", **fewer).save(tmp_path / "first.ply")
-    second = wrap_model(first, backend="reference").adapt(SCALE, recipe="instant", extra_views=4).save(tmp_path / "second.ply")
+    first = wrap_model(base).adapt(1.0, viewer="classic", **fewer).save(tmp_path / "first.ply")
+    second = wrap_model(first).adapt(SCALE, recipe="instant", extra_views=4).save(tmp_path / "second.ply")
     assert torch.equal(poses(second), poses(base))
 
 
 @pytest.mark.filterwarnings("ignore:no cameras")
 def test_and_so_is_what_is_adapted_in_tiles(files, tmp_path):
     base, _ = files
-    first = wrap_model(base, backend="reference").adapt(1.0, viewer="classic", recipe="instant", most_splats=20, extra_views=4)
+    first = wrap_model(base).adapt(1.0, viewer="classic", recipe="instant", most_splats=20, extra_views=4)
     first.save(tmp_path / "first.ply")
-    words = ["--scale", "1/4", "--recipe", "instant", "--backend", "reference", "--tiles", "2"]
+    words = ["--scale", "1/4", "--recipe", "instant", "--tiles", "2"]
     for path in (base, tmp_path / "first.ply"):
         assert main(["adapt", str(path), "--output", str(tmp_path / "tiled.ply"), "--overwrite", *words]) == 0
         assert torch.equal(poses(tmp_path / "tiled.ply"), poses(base))
@@ -86,7 +86,7 @@ def test_a_report_without_an_orbit_is_taken_as_one_of_before(files, orbit):
 def test_a_header_tells_the_vertical_but_for_what_a_program_writes_into_every_file(tmp_path, comment, up):
     base = tiny.ply(tmp_path / "base.ply")
     base.write_bytes(base.read_bytes().replace(b"element vertex", f"comment {comment}\nelement vertex".encode(), 1))
-    assert wrap_model(base, backend="reference").orbit().up == up
+    assert wrap_model(base).orbit().up == up
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_a_header_tells_the_vertical_but_for_what_a_program_writes_into_every_fi
     ids=["nerfstudio", "gsplat", "gsplat, as COLMAP has it"],
 )
 def test_a_project_that_turns_its_scenes_tells_the_vertical(tmp_path, make, up):
-    base = wrap_model(make(tmp_path / "r", splats()), backend="reference")
+    base = wrap_model(make(tmp_path / "r", splats()))
     assert base.orbit().up == up
     adapted = base.adapt(SCALE, recipe="instant", extra_views=40)
     assert (min(heights(adapted.adapted_to)) > -0.2) == bool(up) and (", with z up," in adapted.report.views) == bool(up)
@@ -106,7 +106,7 @@ def test_a_project_that_turns_its_scenes_tells_the_vertical(tmp_path, make, up):
 
 def test_with_what_is_up_as_many_views_look_from_above_the_horizon(files):
     base, _ = files
-    around, above = (wrap_model(base, backend="reference", **up) for up in ({}, {"up": "-x"}))
+    around, above = (wrap_model(base, **up) for up in ({}, {"up": "-x"}))
     assert len(above.views()) == len(around.views()) and -1 < min(heights(around.views(), 0)) < -0.9
     seen = [-height for height in heights(above.views(), 0)]
     assert -0.18 < min(seen) < 0 and 0.9 < max(seen) < 0.99
@@ -118,7 +118,7 @@ def test_with_what_is_up_as_many_views_look_from_above_the_horizon(files):
 
 def test_an_adapted_file_keeps_what_was_up_unless_it_is_said_anew(tmp_path, files):
     base, _ = files
-    adapted = wrap_model(base, backend="reference", up="y").adapt(SCALE, recipe="instant", extra_views=4).save(tmp_path / "up.ply")
+    adapted = wrap_model(base, up="y").adapt(SCALE, recipe="instant", extra_views=4).save(tmp_path / "up.ply")
     assert torch.equal(poses(adapted), poses(base, up="y")) and not torch.equal(poses(adapted), poses(base))
     assert torch.equal(poses(adapted, up="x"), poses(base, up="x"))
 
@@ -126,7 +126,7 @@ def test_an_adapted_file_keeps_what_was_up_unless_it_is_said_anew(tmp_path, file
 @pytest.mark.filterwarnings("ignore:no cameras")
 def test_tiles_and_pictures_are_of_what_is_up(tmp_path, files):
     base, _ = files
-    words = ["--up", "-y", "--backend", "reference", "--overwrite"]
+    words = ["--up", "-y", "--overwrite"]
     assert main(["adapt", str(base), "--output", str(tmp_path / "tiled.ply"), "--scale", "1/4", "--recipe", "instant", "--tiles", "2", *words]) == 0
     assert torch.equal(poses(tmp_path / "tiled.ply"), poses(base, up="-y"))
     report = json.loads((tmp_path / "tiled.ply.adaptation.json").read_text())
@@ -138,7 +138,7 @@ def test_tiles_and_pictures_are_of_what_is_up(tmp_path, files):
 
 def test_without_cameras_it_is_told_where_views_look_from(files, recwarn):
     for up in ({}, {"up": "z"}):
-        wrap_model(files[0], backend="reference", **up).adapt(SCALE, recipe="instant", extra_views=2)
+        wrap_model(files[0], **up).adapt(SCALE, recipe="instant", extra_views=2)
     around, above = [str(each.message) for each in recwarn if str(each.message).startswith("no cameras")]
     assert "from all around" in around and "say what is up (--up" in around
     assert "from above the horizon, with z up" in above and "--up" not in above
@@ -147,7 +147,7 @@ def test_without_cameras_it_is_told_where_views_look_from(files, recwarn):
 def test_cameras_leave_what_is_up_to_orbits_that_are_asked_for(tmp_path):
     folder = tiny.folder(tmp_path / "base")
     with pytest.warns(UserWarning, match="^up z: there are cameras, whose views are taken"):
-        base = wrap_model(folder, backend="reference", up="z")
+        base = wrap_model(folder, up="z")
     assert base.adapt(SCALE, recipe="instant").report.views.startswith("4 train views")
     adapted = base.adapt(SCALE, recipe="instant", views="orbit", extra_views=40)
     assert min(heights(adapted.adapted_to)) > -0.18 and ", with z up," in adapted.report.views

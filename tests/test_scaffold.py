@@ -127,7 +127,7 @@ def test_gradients_reach_what_may_move_and_not_the_anchors(folder):
 
 def gain(model, scale, **settings):
     """dB against the pseudo truth over the base's own render at the new scale, on the views adapted to; and the adapted model."""
-    wrapped = wrap_model(model, cameras=VIEWS, backend="reference")
+    wrapped = wrap_model(model, cameras=VIEWS)
     adapted = wrapped.adapt(scale, views="given", check_every=10, **{"steps": 30, **settings})
     config = recipe("default", scale, resize="pil-bicubic")
     truth = PseudoTruth(BaseImages(model, adapted.backend, wrapped.effects()), scale, config)
@@ -188,10 +188,10 @@ def test_a_splat_that_is_flat_does_not_stretch_its_anchor(folder):
 
 def test_a_zoom_out_leaves_anchors_out_and_the_report_says_how_many(folder, monkeypatch):
     model = load_model(folder)
-    whole = wrap_model(model, cameras=VIEWS, backend="reference").adapt(1 / 4, views="given", steps=1)
+    whole = wrap_model(model, cameras=VIEWS).adapt(1 / 4, views="given", steps=1)
     assert "40 of 40 anchors are left; the splats counted are those of one view" in whole.report.notes  # few splats a pixel
     monkeypatch.setattr("mipmap_plugin.adaptation.start.thinning.PER_PIXEL", 0.0)
-    adapted = wrap_model(model, cameras=VIEWS, backend="reference").adapt(1 / 4, views="given", steps=1, merge_to=0.5, merging_costs=99)
+    adapted = wrap_model(model, cameras=VIEWS).adapt(1 / 4, views="given", steps=1, merge_to=0.5, merging_costs=99)
     kept = len(adapted.model.parameters()["means"])
     assert adapted.report.returned.startswith(("the start, the closed form of a part of the base", "the last state"))
     assert kept == 20
@@ -201,7 +201,7 @@ def test_a_zoom_out_leaves_anchors_out_and_the_report_says_how_many(folder, monk
 
 @pytest.mark.parametrize("steps", [0, 2])
 def test_the_curve_counts_splats_and_no_anchors(folder, steps):
-    report = wrap_model(load_model(folder), cameras=VIEWS, backend="reference").adapt(1 / 4, views="given", steps=steps, returns="last").report
+    report = wrap_model(load_model(folder), cameras=VIEWS).adapt(1 / 4, views="given", steps=steps, returns="last").report
     assert report.curve[-1].gaussians == report.gaussians_after > len(load_model(folder).parameters()["means"])
 
 
@@ -244,12 +244,12 @@ def test_a_baked_view_is_a_plain_file_that_shows_the_same(folder, tmp_path):
     model = load_model(folder)
     baked = load_model(model.bake(VIEWS[0]).save(tmp_path / "view.ply", provenance={}))
     assert baked.family == "3dgs"
-    one, other = (wrap_model(shown, cameras=VIEWS, backend="reference").render(VIEWS[0]).image for shown in (model, baked))
+    one, other = (wrap_model(shown, cameras=VIEWS).render(VIEWS[0]).image for shown in (model, baked))
     torch.testing.assert_close(one, other, atol=1e-5, rtol=0)
 
 
 def test_without_cameras_an_orbit_goes_around_the_anchors(folder):
-    adapted = wrap_model(load_model(folder), backend="reference").adapt(1 / 16, steps=1, extra_views=2)
+    adapted = wrap_model(load_model(folder)).adapt(1 / 16, steps=1, extra_views=2)
     assert adapted.report.views == "2 views of a generated orbit at 800 px (the checkpoint came without cameras)"
 
 

@@ -20,10 +20,10 @@ def away(count):
 
 
 def test_cameras_that_see_nothing_are_left_out():
-    base, some = wrap_model(tiny.model(), cameras=[*away(30), *tiny.cameras(3)], backend="reference"), tiny.cameras(3)
+    base, some = wrap_model(tiny.model(), cameras=[*away(30), *tiny.cameras(3)]), tiny.cameras(3)
     with pytest.warns(UserWarning, match="30 of 33 cameras see no splat, or hardly any, and are left out"):
         adapted = base.adapt(0.5, steps=0, extra_views=8)
-    alone = wrap_model(tiny.model(), cameras=some, backend="reference").adapt(0.5, steps=0, extra_views=8)
+    alone = wrap_model(tiny.model(), cameras=some).adapt(0.5, steps=0, extra_views=8)
     assert adapted.report.views == alone.report.views and adapted.report.validation == pytest.approx(alone.report.validation)
     base.refuse_undrawn()  # of all its cameras, one in eleven sees the model
 
@@ -42,4 +42,4 @@ def test_cameras_stay_where_none_of_training_sees_anything():
     given = [*away(2), *tests]
     assert seeing(given, tiny.model(), 0.2) == given
     with pytest.raises(SettingsError, match="none of the 20 views shows a splat"):
-        wrap_model(tiny.model(), cameras=away(20), backend="reference").adapt(0.5, steps=0, views="given")
+        wrap_model(tiny.model(), cameras=away(20)).adapt(0.5, steps=0, views="given")

@@ -8,11 +8,10 @@ import subprocess
 import sys
 import zipfile
 
+import pressing
 import pytest
 import tiny
-import torch
 
-from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.jobs.job import Job
@@ -65,16 +64,12 @@ def test_what_was_unpacked_is_removed(tmp_path):
 
 @pytest.mark.parametrize("number", signals.SIGNALS)
 def test_a_run_keeps_its_state(tmp_path, monkeypatch, capsys, number):
-    render, told = ReferenceBackend.render, []
+    def told():
+        signal.raise_signal(number)
+        signal.raise_signal(number)
 
-    def telling(self, gaussians, camera, effects):
-        if gaussians.means.requires_grad and torch.is_grad_enabled() and camera.width > 1 and not told:  # in a step
-            told.append(signal.raise_signal(number))
-            signal.raise_signal(number)
-        return render(self, gaussians, camera, effects)
-
-    monkeypatch.setattr(ReferenceBackend, "render", telling)
-    words = ["--scale", "1/4", "--backend", "reference", "--views", "given", "--steps", "3", "--output", str(tmp_path / "new.ply")]
+    pressing.in_step(monkeypatch, told)(1)
+    words = ["--scale", "1/4", "--views", "given", "--steps", "3", "--output", str(tmp_path / "new.ply")]
     assert main(["adapt", str(tiny.folder(tmp_path / "base")), *words]) == 128 + number
     assert "interrupted at step 1; run the same command again to continue" in capsys.readouterr().err
     assert (tmp_path / "new.ply.resume").exists() and not (tmp_path / "new.ply").exists()
@@ -119,7 +114,7 @@ def test_a_job_whose_worker_is_told_to_end_is_done_again(tmp_path):
         if not told:
             told.append(os.kill(worker._process.pid, signal.SIGTERM))
 
-    job = Job(Base(tiny.folder(tmp_path / "base"), backend="reference"), tmp_path / "out.ply", 0.5, settings={"steps": 0, "views": "given"})
+    job = Job(Base(tiny.folder(tmp_path / "base")), tmp_path / "out.ply", 0.5, settings={"steps": 0, "views": "given"})
     try:
         assert do(job, worker, tell_once).status == "done" and told
     finally:

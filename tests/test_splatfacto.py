@@ -42,7 +42,7 @@ def activated(raw) -> Gaussians:
 @pytest.mark.parametrize(("mode", "bands"), [("classic", 3), ("antialiased", 3), ("classic", 0)])
 def test_it_renders_as_an_independent_evaluation_in_float64(tmp_path, mode, bands):
     raw, camera = splats(bands=bands), tiny.cameras()[0]
-    wrapped = wrap_model(splatfacto_folder(tmp_path / "r", raw, mode), backend="reference")
+    wrapped = wrap_model(splatfacto_folder(tmp_path / "r", raw, mode))
     expected, _ = brute_force(activated(raw), camera, screen_filter=mode, near=0.01, background=(0.1490, 0.1647, 0.2157))
     assert torch.allclose(wrapped.render(camera).image.double(), expected, atol=1e-5)
 
@@ -152,10 +152,10 @@ def test_without_its_transform_the_cameras_cannot_be_placed(tmp_path, content):
 @pytest.mark.parametrize("scale", [1 / 4, 4])
 def test_adapting_raises_the_quality(tmp_path, scale):
     folder, cameras = splatfacto_folder(tmp_path / "r", splats(60)), tiny.cameras()
-    base = wrap_model(folder, cameras=cameras, backend="reference", background=(0.0, 0.0, 0.0))
+    base = wrap_model(folder, cameras=cameras, background=(0.0, 0.0, 0.0))
     adapted = base.adapt(scale, steps=16 if scale < 1 else 0, extra_views=2)
     saved = adapted.save(tmp_path / "out")
-    again = wrap_model(tmp_path / "out", cameras=cameras, backend="reference", background=(0.0, 0.0, 0.0))
+    again = wrap_model(tmp_path / "out", cameras=cameras, background=(0.0, 0.0, 0.0))
     camera, truth = cameras[0].zoomed(scale), aim(base, cameras[0], scale)
     assert psnr(again.render(camera).image, truth) > psnr(base.render(camera).image, truth) + 2
     assert saved.with_name(saved.name + ".adaptation.json").is_file()

@@ -25,7 +25,7 @@ SCALE, COUNT = 1 / 4, 80
 
 
 def adapted(count=COUNT, scale=SCALE, **settings):
-    model = wrap_model(tiny.model(count), cameras=tiny.cameras(), backend="reference")
+    model = wrap_model(tiny.model(count), cameras=tiny.cameras())
     return model.adapt(scale, **{"steps": 0, "merge_to": 1.0, "extra_views": 4, **settings})
 
 
@@ -46,7 +46,7 @@ def test_a_start_takes_no_memory_for_what_it_has_of_the_base_and_what_is_returne
         return "the start, the closed form", choose(self, states)[1]
 
     monkeypatch.setattr(Validation, "choose", start)
-    base = wrap_model(tiny.model(COUNT), cameras=tiny.cameras(), backend="reference")
+    base = wrap_model(tiny.model(COUNT), cameras=tiny.cameras())
     returned = base.adapt(SCALE, steps=steps, merge_to=1.0, extra_views=4).model
 
     def places(model):
@@ -248,5 +248,5 @@ def test_a_start_is_computed_from_as_many_views_as_show_enough(monkeypatch):
         return real(gaussians, views, *rest)[0], 0.2 if len(counts) == 1 else 1.0
 
     monkeypatch.setattr(start, "weighed", weighed)
-    wrap_model(tiny.model(COUNT), cameras=tiny.cameras(60), backend="reference").adapt(SCALE, recipe="instant", extra_views=0)
+    wrap_model(tiny.model(COUNT), cameras=tiny.cameras(60)).adapt(SCALE, recipe="instant", extra_views=0)
     assert counts == [12, 48]

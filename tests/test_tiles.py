@@ -80,7 +80,7 @@ def job(tmp_path):
     """A scene that is adapted in tiles in a moment."""
     folder = tiny.folder(tmp_path / "scene", tiny.cameras(3, width=20, height=16), count=80)
     settings = {"steps": 4, "seed": 0, "views": "given", "validation_views": 2, "views_per_step": 1, "merge_to": 1.0}
-    return Job(Base(folder, backend="reference"), tmp_path / "out.ply", 0.5, settings=settings)
+    return Job(Base(folder), tmp_path / "out.ply", 0.5, settings=settings)
 
 
 # Cuts
@@ -552,7 +552,7 @@ def test_a_model_folder_is_written_as_one(job, tmp_path):
 
 def test_a_model_folder_is_written_beside_the_checkpoint(job, capsys):
     """Where the scale in its name looks like a suffix."""
-    words = ["adapt", str(job.base.checkpoint), "--scale", "1/2", "--steps", "0", "--views", "given", "--backend", "reference", "--tiles", "2"]
+    words = ["adapt", str(job.base.checkpoint), "--scale", "1/2", "--steps", "0", "--views", "given", "--tiles", "2"]
     assert main([*words, "--cameras", str(job.base.checkpoint.with_name("{name}") / "cameras.json")]) == 0
     assert (job.base.checkpoint.with_name("scene_x0.5") / "point_cloud").is_dir()
 
@@ -809,7 +809,7 @@ def test_no_folder_is_claimed_if_one_cannot_be(job):
 
 
 def test_the_command(job, capsys):
-    options = ["--scale", "1/2", "--steps", "0", "--views", "given", "--backend", "reference", "--output", str(job.target)]
+    options = ["--scale", "1/2", "--steps", "0", "--views", "given", "--output", str(job.target)]
     assert main(["adapt", str(job.base.checkpoint), *options, "--tiles", "2"]) == 0
     out = capsys.readouterr().out
     assert "x0.5, 2 tiles:" in out and str(job.target) in out
@@ -820,7 +820,7 @@ def test_the_command(job, capsys):
 
 
 def test_the_command_for_several_scales_skips_what_is_finished(job, capsys):
-    options = ["--steps", "0", "--views", "given", "--backend", "reference", "--tiles", "2", "--scale", "1/2"]
+    options = ["--steps", "0", "--views", "given", "--tiles", "2", "--scale", "1/2"]
     assert main(["adapt", str(job.base.checkpoint), *options, "--json"]) == 0
     capsys.readouterr()
     assert main(["adapt", str(job.base.checkpoint), *options, "--scale", "1/4", "--json"]) == 0
@@ -834,7 +834,7 @@ def test_the_command_says_how_to_go_on_with_several_scales(job, capsys, monkeypa
         yield
 
     monkeypatch.setattr(run, "adapt_all_in_tiles", interrupted)
-    options = ["adapt", str(job.base.checkpoint), "--steps", "0", "--backend", "reference", "--tiles", "2", "--scale", "1/2"]
+    options = ["adapt", str(job.base.checkpoint), "--steps", "0", "--tiles", "2", "--scale", "1/2"]
     two = ["--scale", "1/4"]
     for further, again in (([], "again to go on"), (two, "again to go on"), ([*two, "--overwrite"], "with --skip-existing")):
         assert main([*options, *further]) == 130

@@ -34,7 +34,7 @@ MODES = {
 def adapted() -> dict[str, torch.Tensor]:
     """The parameters of an adapted model, and a picture of it."""
     raw = {name: tensor.clone() for name, tensor in BALL.items()}
-    made = wrap_model(raw, cameras=CAMERAS, backend="reference").adapt(0.5, steps=3, extra_views=2)
+    made = wrap_model(raw, cameras=CAMERAS).adapt(0.5, steps=3, extra_views=2)
     return {**made.model.parameters(), "image": made.render(made.views()[0], outputs=("depth",)).image}
 
 

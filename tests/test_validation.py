@@ -51,7 +51,7 @@ MANY = 2 * VALIDATION_EVERY  # cameras, of which two are kept back
 
 
 def wrapped(count=40, cameras=None):
-    return wrap_model(tiny.model(count), cameras=cameras or tiny.cameras(), backend="reference")
+    return wrap_model(tiny.model(count), cameras=cameras or tiny.cameras())
 
 
 def same(model, other) -> bool:
@@ -430,7 +430,7 @@ def with_extras() -> VanillaModel:
 @pytest.mark.parametrize(("at", "pruned"), [(2, True), (3, True), (5, False)])  # at a check that takes back, and between two
 def test_a_resumed_run_takes_back_as_the_whole_one_did(tmp_path, at, pruned):
     settings = {**HARMFUL, "prune_every": 1 if pruned else 50, "min_opacity": 0.4, "steps": 7, "check_every": 2}
-    model = wrap_model(with_extras(), cameras=tiny.cameras(), backend="reference")
+    model = wrap_model(with_extras(), cameras=tiny.cameras())
     whole = model.adapt(SCALE, **settings)
     with pytest.raises(Interrupted):
         model.adapt(SCALE, resume=tmp_path / "run", observe=lambda step, *_: step == at and signal.raise_signal(signal.SIGINT), **settings)

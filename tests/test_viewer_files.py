@@ -26,7 +26,7 @@ def write_flat(path):
 
 
 def wrapped(**trained):
-    return wrap_model(tiny.model(40, TrainedScale(**trained)), cameras=tiny.cameras(), backend="reference")
+    return wrap_model(tiny.model(40, TrainedScale(**trained)), cameras=tiny.cameras())
 
 
 @pytest.mark.parametrize("viewer", ["spark", "playcanvas"])
@@ -87,7 +87,7 @@ def test_at_scale_one_a_viewer_comes_closer_to_the_bases_own_picture(viewer):
 def test_the_command_writes_a_file_for_each_viewer_and_says_what_it_holds(tmp_path, capsys):
     base = tiny.folder(tmp_path / "base", tiny.cameras(3))
     words = ["adapt", base, "--scale", "1/4", "--viewer", "spark", "--viewer", "playcanvas", "--steps", "2", "--views", "given"]
-    assert main([*map(str, words), "--backend", "reference", "--log", str(tmp_path / "log")]) == 0
+    assert main([*map(str, words), "--log", str(tmp_path / "log")]) == 0
     out, log = capsys.readouterr().out, (tmp_path / "log").read_text()
     for viewer in ("spark", "playcanvas"):
         ply = tmp_path / f"base_x0.25_{viewer}" / "point_cloud/iteration_30000/point_cloud.ply"
@@ -98,6 +98,6 @@ def test_the_command_writes_a_file_for_each_viewer_and_says_what_it_holds(tmp_pa
 
 
 def test_the_command_says_whom_a_file_without_a_viewer_is_for(tmp_path, capsys):
-    words = ["adapt", tiny.folder(tmp_path / "base", tiny.cameras(3)), "--scale", "1/4", "--recipe", "instant", "--backend", "reference"]
+    words = ["adapt", tiny.folder(tmp_path / "base", tiny.cameras(3)), "--scale", "1/4", "--recipe", "instant"]
     assert main([str(word) for word in words]) == 0
     assert "made for renderers that draw as 3DGS does (INRIA, gsplat, nerfstudio); for others give --viewer spark" in capsys.readouterr().out

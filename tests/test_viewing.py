@@ -42,7 +42,7 @@ SIZE = (48, 64)  # height, width
 
 @pytest.fixture
 def base():
-    return wrap_model(tiny.model(), cameras=tiny.cameras(4), backend="reference")
+    return wrap_model(tiny.model(), cameras=tiny.cameras(4))
 
 
 @pytest.fixture
@@ -167,7 +167,7 @@ def test_the_supersampled_base_is_the_mean_of_the_look_that_was_trained(base, sc
 @pytest.mark.parametrize("write", [anchor_checkpoints.write, moving.write_deformable, mip_checkpoints.folder], ids=["anchors", "moving", "filtered"])
 def test_every_kind_of_family_is_drawn(tmp_path, write, screen):
     write(tmp_path / "base")
-    base = wrap_model(tmp_path / "base", cameras=tiny.cameras(4), backend="reference")
+    base = wrap_model(tmp_path / "base", cameras=tiny.cameras(4))
     stage = Stage(base, [File("base", base)], Supersampled("supersampled", base))
     for look in (Look("base"), Look("supersampled"), Look("base", pixel=2)):
         picture = stage.draw(look, screen)
@@ -194,11 +194,11 @@ def ladder(folder, shown_from=(0.7, None)):
 
 def test_a_ladder_shows_the_level_of_the_zoom(tmp_path, base, screen):
     (tmp_path / "ladder").mkdir()
-    levels = open_source(ladder(tmp_path / "ladder"), base, "reference")
+    levels = open_source(ladder(tmp_path / "ladder"), base, "auto")
     assert isinstance(levels, Levels) and levels.name == "ladder"
     assert [levels.shown(zoom) for zoom in (4.0, 0.7, 0.69, 0.01)] == ["ladder, level_0.ply"] * 2 + ["ladder, level_1.ply"] * 2
     assert [levels.splats(Request(screen, zoom))[1] for zoom in (1.0, 0.5)] == [60, 40]
-    alone = File("level_1", wrap_model(tmp_path / "ladder/level_1.ply", cameras=base.cameras, backend="reference"))
+    alone = File("level_1", wrap_model(tmp_path / "ladder/level_1.ply", cameras=base.cameras))
     assert torch.equal(levels.render(Request(screen, 0.5)), alone.render(Request(screen, 0.5)))
 
 
@@ -217,7 +217,7 @@ def test_a_damaged_ladder_is_refused(tmp_path, base, text):
 
 
 def test_an_adapted_file_is_shown_on_the_background_of_the_base(tmp_path, screen):
-    base = wrap_model(tiny.model(), cameras=tiny.cameras(4), backend="reference", background=(1.0, 1.0, 1.0))
+    base = wrap_model(tiny.model(), cameras=tiny.cameras(4), background=(1.0, 1.0, 1.0))
     adapted = base.adapt(1 / 2, recipe="instant")
     shown = of_adapted("new", adapted, base).render(Request(screen, 0.5))
     assert torch.equal(shown, adapted.render(screen).image) and shown[0, 0].min() == 1
@@ -373,7 +373,7 @@ class TestMoving:
     @pytest.fixture
     def base(self, tmp_path):
         moments = [replace(view, time=time) for view, time in zip(tiny.cameras(4), (0.3, 0.7, None, 0.1), strict=True)]
-        return wrap_model(moving.write_deformable(tmp_path / "moving"), cameras=moments, backend="reference")
+        return wrap_model(moving.write_deformable(tmp_path / "moving"), cameras=moments)
 
     def test_the_moment_of_the_slider_is_drawn(self, page, base, screen):
         assert page._controls.look().time == 0.3  # that of the view that is shown first
@@ -415,7 +415,7 @@ class TestWithoutCameras:
 
     @pytest.fixture
     def base(self):
-        return wrap_model(tiny.model(), backend="reference", up="-x")
+        return wrap_model(tiny.model(), up="-x")
 
     def test_it_stands_upright_from_the_beginning(self, page):
         server = page._server
@@ -493,7 +493,7 @@ def test_a_run_is_told_from_its_beginning_to_its_end(base):
 
 def test_without_viser_the_command_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert main(["view", str(tiny.ply(tmp_path / "base.ply")), "--backend", "reference", "--no-browser"]) == 2
+    assert main(["view", str(tiny.ply(tmp_path / "base.ply")), "--no-browser"]) == 2
     assert capsys.readouterr().err.strip() == f"mipmap-plugin: {NO_VISER}"
     assert "pip install 'mipmap-plugin[view]'" in NO_VISER and "pip install '.[view]'" in NO_VISER
 
@@ -513,7 +513,7 @@ def test_a_viewer_is_listed_once_under_the_name_that_was_asked_for(base):
     (["--threads", "0"], "threads must be at least 1"),
 ])  # fmt: skip
 def test_wrong_options_are_told(tmp_path, capsys, options, message):
-    words = ["view", str(tiny.ply(tmp_path / "base.ply")), "--backend", "reference", "--no-browser"]
+    words = ["view", str(tiny.ply(tmp_path / "base.ply")), "--no-browser"]
     assert main([*words, *options]) == 2 and message in capsys.readouterr().err
 
 

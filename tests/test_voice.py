@@ -16,7 +16,7 @@ from mipmap_plugin.cli import main
 from mipmap_plugin.commands.voice import options, say, speaking, wrapped
 from mipmap_plugin.errors import SettingsError
 
-QUICK = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference"]
+QUICK = ["--scale", "1/2", "--recipe", "instant"]
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def base(tmp_path):
     return str(tiny.folder(tmp_path / "base", tiny.cameras(3)))
 
 
-LEVELS = ["levels", "--viewer", "spark", "--coarsest", "1", "--recipe", "instant", "--backend", "reference", "--by", "zoom"]
+LEVELS = ["levels", "--viewer", "spark", "--coarsest", "1", "--recipe", "instant", "--by", "zoom"]
 
 
 @pytest.mark.parametrize("words", [["adapt", *QUICK], LEVELS], ids=["adapt", "levels"])
@@ -88,7 +88,7 @@ def test_a_log_has_the_command_what_was_said_the_details_and_what_went_wrong(bas
     assert main(["adapt", base, *QUICK, "--log", str(log)]) == 2  # the file exists already
     text = log.read_text()
     assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d mipmap-plugin adapt ", text)
-    for part in ("x0.5: ", "made for renderers that draw as 3DGS does", "seconds: ", "; backend reference", "exists already; pass --overwrite"):
+    for part in ("x0.5: ", "made for renderers that draw as 3DGS does", "seconds: ", "; backend cpu", "exists already; pass --overwrite"):
         assert part in text
     assert text.count("mipmap-plugin adapt ") == 2
 

@@ -47,7 +47,7 @@ def test_one_ply_is_read_wherever_its_name_leads(tmp_path, ply, name):
 @pytest.mark.usefixtures("small_orbits")
 def test_adapt_writes_a_ply_beside_it(tmp_path, ply):
     archive(tmp_path / "phone.zip", {"scan.ply": ply})
-    assert main(["adapt", str(tmp_path / "phone.zip"), "--scale", "1/2", "--recipe", "instant", "--backend", "reference"]) == 0
+    assert main(["adapt", str(tmp_path / "phone.zip"), "--scale", "1/2", "--recipe", "instant"]) == 0
     assert len(load_model(tmp_path / "phone_x0.5.ply")) == 60
 
 
@@ -89,7 +89,7 @@ def test_a_ply_that_is_no_base_is_told_of_by_the_archives_name(tmp_path, ply):
     refused(archive(tmp_path / "nan.zip", {"a.ply": no_number}), "^the PLY in .*nan.zip: none of its 60 splats is finite")
     filtered = write(tmp_path / "mip.ply", {**columns, "filter_3D": np.ones(60, np.float32)}).read_bytes()
     refused(archive(tmp_path / "mip.zip", {"a.ply": filtered}), "mip.zip holds a PLY of Mip-Splatting; unpack it")
-    made = wrap_model(tmp_path / "own.ply", backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "made.ply")
+    made = wrap_model(tmp_path / "own.ply").adapt(1 / 2, recipe="instant").save(tmp_path / "made.ply")
     refused(archive(tmp_path / "made.zip", {"a.ply": made.read_bytes()}), "made.zip holds a file that was adapted; unpack it")
 
 
@@ -106,7 +106,7 @@ def packed(path, folder, top="my model", beside=None):
 
 @pytest.mark.parametrize("top", ["my model", "", "../../up", "deep/er"])
 def test_a_model_folder_is_read_with_its_cameras(tmp_path, folder, top):
-    base, before = wrap_model(packed(tmp_path / "a.zip", folder, top), backend="reference"), {*tmp_path.rglob("*")}
+    base, before = wrap_model(packed(tmp_path / "a.zip", folder, top)), {*tmp_path.rglob("*")}
     assert torch.equal(base.model.parameters()["means"], load_model(folder).parameters()["means"])
     assert [view.name for view in base.cameras] == [view.name for view in tiny.cameras()]
     assert {*tmp_path.rglob("*")} == before and detect(tmp_path / "a.zip").path == base.model.source
@@ -114,7 +114,7 @@ def test_a_model_folder_is_read_with_its_cameras(tmp_path, folder, top):
 
 def test_what_is_adapted_from_it_is_a_folder_beside_it(tmp_path, folder):
     packed(tmp_path / "a.zip", folder)
-    words = ["adapt", str(tmp_path / "a.zip"), "--scale", "1/2", "--recipe", "instant", "--backend", "reference"]
+    words = ["adapt", str(tmp_path / "a.zip"), "--scale", "1/2", "--recipe", "instant"]
     assert main(words) == 0 and len(load_model(tmp_path / "a_x0.5")) == 60
     assert (tmp_path / "a_x0.5" / "cameras.json").is_file()
 
@@ -178,18 +178,18 @@ def test_commands_tell_what_is_wrong_by_the_archives_name(tmp_path, folder, caps
     columns["x"][3] = np.nan
     write(splats, columns)
     path = packed(tmp_path / "a.zip", folder)
-    wrap_model(folder, backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "made")
+    wrap_model(folder).adapt(1 / 2, recipe="instant").save(tmp_path / "made")
     made = packed(tmp_path / "made.zip", tmp_path / "made")
-    words = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--output", str(tmp_path / "out"), *tiles]
+    words = ["--scale", "1/2", "--recipe", "instant", "--output", str(tmp_path / "out"), *tiles]
     assert (main(["adapt", str(path), *words]), main(["adapt", str(made), *words, "--overwrite"])) == (0, 2)
     said = capsys.readouterr().err
     assert f"{path}/point_cloud" in said and f"{made}/point_cloud" in said and tempfile.gettempdir() + "/mipmap" not in said
 
 
 def test_a_list_tells_what_is_wrong_by_the_archives_name(tmp_path, folder, capsys):
-    wrap_model(folder, backend="reference").adapt(1 / 2, recipe="instant").save(tmp_path / "made")
+    wrap_model(folder).adapt(1 / 2, recipe="instant").save(tmp_path / "made")
     made = packed(tmp_path / "made.zip", tmp_path / "made")
-    words = ["--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--output", str(tmp_path / "out")]
+    words = ["--scale", "1/2", "--recipe", "instant", "--output", str(tmp_path / "out")]
     assert main(["adapt", str(made), str(packed(tmp_path / "a.zip", folder)), *words]) != 0
     told = capsys.readouterr()
     assert f"{made}/point_cloud" in told.out and tempfile.gettempdir() + "/mipmap" not in told.out + told.err
@@ -201,6 +201,6 @@ def test_workers_leave_nothing_unpacked(tmp_path, folder, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", None)
     for name in ("a", "b"):
         packed(tmp_path / f"{name}.zip", folder)
-    assert main(["adapt", str(tmp_path / "*.zip"), "--scale", "1/2", "--recipe", "instant", "--backend", "reference", "--jobs", "2"]) == 0
+    assert main(["adapt", str(tmp_path / "*.zip"), "--scale", "1/2", "--recipe", "instant", "--jobs", "2"]) == 0
     assert len(list((tmp_path / "temporary").glob("mipmap-plugin-*"))) == 2  # of this process, which has not ended
     assert (tmp_path / "a_x0.5").is_dir() and (tmp_path / "b_x0.5").is_dir()

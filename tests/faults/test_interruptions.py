@@ -58,7 +58,7 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 def adapted(path: Path, scale: float):
-    return wrap_model(path, cameras=tiny.cameras(2, width=8, height=6), backend="reference").adapt(scale, recipe="instant")
+    return wrap_model(path, cameras=tiny.cameras(2, width=8, height=6)).adapt(scale, recipe="instant")
 
 
 # A full disk
@@ -81,7 +81,7 @@ def test_a_full_disk_leaves_the_old_output_and_nothing_else(tmp_path, name):
 
 
 @pytest.mark.parametrize("words", [
-    ["render", "--backend", "reference"], ["tradeoff", "--scale", "1/4", "--recipe", "instant", "--no-picture"],
+    ["render"], ["tradeoff", "--scale", "1/4", "--recipe", "instant", "--no-picture"],
     ["adapt", "--scale", "1/4", "--tiles", "2"],
 ])  # fmt: skip
 def test_a_full_disk_leaves_no_empty_folders(tmp_path, capsys, words):
@@ -93,14 +93,14 @@ def test_a_full_disk_leaves_no_empty_folders(tmp_path, capsys, words):
 
 
 def test_a_run_that_is_not_kept_leaves_no_empty_folders(tmp_path):
-    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2))
     model.adapt(1 / 4, steps=1, resume=tmp_path / "new" / "out" / "state")
     assert not (tmp_path / "new").exists()
 
 
 def test_a_full_disk_while_a_run_is_kept_does_not_end_it(tmp_path, monkeypatch):
     monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
-    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2))
     goes_on = pytest.warns(UserWarning, match="the run continues, but could not be resumed if it were killed: .* cannot be written")
     with disk_that_holds(100), goes_on:
         done = model.adapt(1 / 4, steps=2, resume=tmp_path / "state")
@@ -109,7 +109,7 @@ def test_a_full_disk_while_a_run_is_kept_does_not_end_it(tmp_path, monkeypatch):
 
 def test_a_full_disk_when_the_finished_model_is_saved_leaves_its_state(tmp_path, monkeypatch):
     monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
-    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"
     done = model.adapt(1 / 4, steps=3, resume=state)
     with disk_that_holds(100), pytest.raises(OutputError):
         done.save(tmp_path / "new.ply")
@@ -178,29 +178,29 @@ import os, signal, sys
 sys.path.insert(0, {tests!r})
 import tiny, torch
 from mipmap_plugin.adaptation.optimization import resume
-from mipmap_plugin.backends.reference import ReferenceBackend
+from mipmap_plugin.adaptation.optimization.by_rows import ByRows
 from mipmap_plugin.wrap import wrap_model
 torch.set_num_threads(1)
 resume.SAVE_EVERY_S = 0.0
-render, calls = ReferenceBackend.render, []
-def counted(self, gaussians, *scene):
-    calls.append(gaussians.means.requires_grad and torch.is_grad_enabled() and scene[0].width > 1)  # in a step
-    if sum(calls) == {call}:
+move, moved = ByRows.step, []
+def counted(self, optimizer):
+    moved.append(1)
+    if len(moved) == {step}:
         os.kill(os.getpid(), signal.SIGKILL)
-    return render(self, gaussians, *scene)
-ReferenceBackend.render = counted
-model = wrap_model(tiny.model(20), cameras=tiny.cameras(3), backend="reference")
+    move(self, optimizer)
+ByRows.step = counted
+model = wrap_model(tiny.model(20), cameras=tiny.cameras(3))
 model.adapt(1 / 4, steps=6, extra_views=2, views_per_step=2, warm_up=0, resume={state!r})
 """
 
 
 def test_a_killed_run_goes_on_from_its_last_state_to_the_same_bytes(tmp_path):
-    """Two views a step: it is killed in the middle of the fourth step."""
+    """It is killed in the middle of the fourth step, with its views drawn and nothing moved."""
     state = tmp_path / "state"
-    code = RUN.format(tests=str(Path(tiny.__file__).parent), call=8, state=str(state))
+    code = RUN.format(tests=str(Path(tiny.__file__).parent), step=4, state=str(state))
     killed = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
-    model = wrap_model(tiny.model(20), cameras=tiny.cameras(3), backend="reference")
+    model = wrap_model(tiny.model(20), cameras=tiny.cameras(3))
     assert torch.load(state, weights_only=True)["step"] == 3
     resumed, whole = (model.adapt(1 / 4, steps=6, extra_views=2, views_per_step=2, warm_up=0, resume=path) for path in (state, None))
     saved = [each.save(tmp_path / f"{i}.ply").read_bytes() for i, each in enumerate((resumed, whole))]
@@ -214,7 +214,7 @@ def test_a_killed_run_goes_on_from_its_last_state_to_the_same_bytes(tmp_path):
 @pytest.mark.parametrize("spoilt", ["fingerprint", "planned"], ids=["other settings", "other contents"])
 def test_a_state_of_another_version_is_named_and_stays(tmp_path, monkeypatch, versions, spoilt):
     monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
-    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"
     living = model.adapt(1 / 4, steps=1, resume=state)
     del living  # not saved
     content = load_torch(state) | {"versions": versions, spoilt: None}
@@ -231,7 +231,7 @@ def test_a_state_of_another_version_is_named_and_stays(tmp_path, monkeypatch, ve
 @pytest.mark.parametrize("content", [5, {}, {"fingerprint": None}, [torch.ones(2)]], ids=str)
 def test_a_state_that_is_none_is_refused(tmp_path, content):
     torch.save(content, tmp_path / "state")
-    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2))
     with pytest.raises(SettingsError, match="state: this state belongs to another base, settings or views"):
         model.adapt(1 / 4, steps=1, resume=tmp_path / "state")
 

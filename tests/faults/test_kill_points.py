@@ -121,7 +121,7 @@ class Adapting:
         self.state = self.out.with_name(self.out.name + ".resume")
 
     def __call__(self) -> None:
-        model = wrap_model(self.base, cameras=tiny.cameras(2, width=8, height=6), backend="reference")
+        model = wrap_model(self.base, cameras=tiny.cameras(2, width=8, height=6))
         model.adapt(1 / 2, steps=2, extra_views=0, views_per_step=1, resume=self.state).save(self.out, overwrite=True)
 
 

@@ -24,7 +24,7 @@ from mipmap_plugin.levels.room import room_for
 from mipmap_plugin.models import load_model
 from mipmap_plugin.wrap import wrap_model
 
-INSTANT = ["--recipe", "instant", "--backend", "reference"]
+INSTANT = ["--recipe", "instant"]
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_a_rank_of_a_training_is_a_part_of_the_base(tmp_path):
 
 def test_what_was_adapted_before_may_be_overwritten_also_among_the_base(tmp_path):
     folder = tiny.folder(tmp_path / "base", tiny.cameras(2))
-    model = wrap_model(folder / "point_cloud/iteration_30000/point_cloud.ply", backend="reference")
+    model = wrap_model(folder / "point_cloud/iteration_30000/point_cloud.ply")
     out = folder / "point_cloud/iteration_30000/point_cloud_x0.5.ply"
     for scale in (1 / 2, 1 / 4):
         model.adapt(scale, recipe="instant").save(out, overwrite=True)
@@ -124,7 +124,7 @@ def test_what_cannot_be_saved_is_refused_before_any_work(tmp_path, refused, monk
     assert "is a folder, which no file replaces" in refused("adapt", base, *words[:-2], "--overwrite", "--output", _named(full, "full.ply"))
     splats = anchors / "point_cloud/iteration_30000/point_cloud.ply"
     beside = splats.with_name("new.ply")
-    assert "holds other networks" in refused("adapt", splats, "--scale", "1/2", "--backend", "reference", "--output", beside)
+    assert "holds other networks" in refused("adapt", splats, "--scale", "1/2", "--output", beside)
     monkeypatch.setattr(files.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(100, 90, 10))
     assert "its disk has 10 bytes free, and the base takes" in refused("adapt", base, *words, tmp_path / "new.ply")
 
@@ -187,7 +187,7 @@ def test_other_commands_spare_the_checkpoint_too(tmp_path, refused):
         assert "is the base checkpoint itself" in refused("evaluate", folder, *words)
     (tmp_path / "out").mkdir()
     (tmp_path / "out/train_view_0.png").symlink_to(folder / "cameras.json")
-    assert "is the base checkpoint itself" in refused("render", folder, "--output", tmp_path / "out", "--overwrite", "--backend", "reference")
+    assert "is the base checkpoint itself" in refused("render", folder, "--output", tmp_path / "out", "--overwrite")
     assert contents(folder) == before
 
 
@@ -223,7 +223,7 @@ def test_no_model_appears_without_its_report(tmp_path, monkeypatch):
 
 def test_runs_with_one_output_keep_their_states_in_files_of_their_own(tmp_path, monkeypatch):
     monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
-    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"
     first = model.adapt(1 / 4, steps=1, resume=state)
     second = model.adapt(1 / 4, steps=2, resume=state)
     assert torch.load(state, weights_only=True)["step"] == 1 and torch.load(tmp_path / "state.2", weights_only=True)["step"] == 2
@@ -235,7 +235,7 @@ def test_runs_with_one_output_keep_their_states_in_files_of_their_own(tmp_path, 
 
 def test_each_interrupted_run_goes_on_from_its_own_state(tmp_path, monkeypatch):
     monkeypatch.setattr(resume, "SAVE_EVERY_S", 0.0)
-    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference"), tmp_path / "state"
+    model, state = wrap_model(tiny.model(10), cameras=tiny.cameras(2)), tmp_path / "state"
     living = [model.adapt(1 / 4, steps=steps, resume=state) for steps in (1, 2)]
     curves = [each.report.curve for each in living]
     del living  # neither was saved
@@ -246,7 +246,7 @@ def test_each_interrupted_run_goes_on_from_its_own_state(tmp_path, monkeypatch):
 
 def test_a_state_is_nobodys_pipe_or_folder(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2))
     for name, told in {"pipe": "is a pipe", ".": "is a folder"}.items():
         with pytest.raises(OutputExists, match=told):
             model.adapt(1 / 4, steps=1, resume=tmp_path / name)
@@ -257,7 +257,7 @@ def test_a_state_that_cannot_be_kept_costs_a_warning(tmp_path, monkeypatch):
         raise OSError(30, "Read-only file system")
 
     monkeypatch.setattr("mipmap_plugin.adaptation.optimization.resume.claim_state_file", refused)
-    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2), backend="reference")
+    model = wrap_model(tiny.model(10), cameras=tiny.cameras(2))
     with pytest.warns(UserWarning, match=r"state cannot be written \(Read-only file system\), so that this run could not be resumed"):
         assert model.adapt(1 / 4, steps=1, resume=tmp_path / "state").report.ended_by == "1 steps"
 

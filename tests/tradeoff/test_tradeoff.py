@@ -28,8 +28,8 @@ from mipmap_plugin.wrap import Interrupted, wrap_model
 PLAN = Plan(recipes=("default",), steps=(6,), backends=("reference",), supersampling=(2,), renderers=False, repeats=2)
 
 
-def wrapped(views=None):
-    return wrap_model(tiny.model(30), cameras=tiny.cameras(3) if views is None else views, backend="reference")
+def wrapped(views=None, backend="auto"):
+    return wrap_model(tiny.model(30), cameras=tiny.cameras(3) if views is None else views, backend=backend)
 
 
 def poses(cameras):
@@ -80,7 +80,7 @@ def test_without_photographs_no_view_that_is_judged_on_is_adapted_to(views, judg
 
 
 def test_without_cameras_the_views_that_are_judged_on_look_from_above_what_is_said_to_be_up():
-    views = base_itself(wrap_model(tiny.model(30), backend="reference", up="x"), 1 / 4, None).views
+    views = base_itself(wrap_model(tiny.model(30), up="x"), 1 / 4, None).views
     assert all(view.viewmat[2, 0] < 0.18 and view.viewmat[0, 0].abs() < 1e-9 for view in views)
 
 
@@ -112,9 +112,9 @@ def test_everything_that_needs_no_adapting_stands_beside_the_adapted(points):
 def test_a_filter_that_the_backend_lacks_is_named(monkeypatch):
     few = replace(ReferenceBackend.capabilities, screen_filters=frozenset({"classic", "antialiased", "mip", "analytic"}))
     monkeypatch.setattr(ReferenceBackend, "capabilities", few)
-    [note] = measuring.left_out(wrapped(), PLAN)
+    model = wrapped(backend="reference")
+    [note] = measuring.left_out(model, PLAN)
     assert re.match(r"there is no window filter, since backend 'reference' cannot do this(, but cpu can)?: .*not window$", note)
-    model = wrapped()
     names = [baseline.name for baseline in measuring._baselines(model, base_itself(model, 1 / 4, 1), 1 / 4, PLAN) if baseline.kind == "filter"]
     assert names == ["scaled", "antialiased", "analytic", "mip"]
     one = measuring.Point(1 / 4, "base", "base", "reference", 30, ms_per_frame=measuring.NOTHING)
@@ -278,7 +278,7 @@ def command(tmp_path, *more):
     folder = tmp_path / "base"
     if not folder.exists():
         tiny.folder(folder, tiny.cameras(3))
-    some = ["--recipe", "default", "--steps", "2", "--backend", "reference", "--supersampling", "2"]
+    some = ["--recipe", "default", "--steps", "2", "--supersampling", "2"]
     some += ["--no-renderers", "--repeats", "1", "--views", "1"]
     return cli.main(["tradeoff", str(folder), "--scale", "1/4", "--output", str(tmp_path / "new"), "--no-picture", *some, *more])
 
