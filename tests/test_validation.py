@@ -104,6 +104,12 @@ def test_no_more_cameras_are_kept_back_than_half_of_the_validation_views():
     assert (len(left), len(judged)) == (MANY - 1, 2)
 
 
+@pytest.mark.parametrize(("steps", "views"), [(0, 8), (1, 4), (360, 16)])
+def test_a_start_is_chosen_by_more_views_than_a_few_steps_are(steps, views):
+    assert len(held_back(tiny.cameras(MANY), "train", steps=steps)[1]) == views
+    assert len(held_back(tiny.cameras(MANY), "train", steps=steps, validation_views=2)[1]) == 2
+
+
 def test_without_cameras_validation_has_an_orbit_of_its_own(monkeypatch):
     monkeypatch.setattr("mipmap_plugin.adaptation.views.ORBIT_PIXELS", 24)
     left, judged = held_back([], "jittered")

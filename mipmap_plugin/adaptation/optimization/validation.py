@@ -36,6 +36,10 @@ VALIDATION_EVERY = 16
 RENDERS_PER_VIEW = 25
 MIN_VIEWS = 4
 
+# As few where no step is taken: nothing makes up for a start that is chosen wrongly. With 4, of which one or two see little but the sky, an object
+# is left as it is (at x1/4 24.0 dB in place of 28.1, at x2 38.7 in place of 43.1), and this takes 0.1 s more.
+MIN_VIEWS_OF_START = 8
+
 # px: validation uses at most this much of a view along each side, so that large images stay cheap.
 WINDOW = 768
 
@@ -186,7 +190,8 @@ def split_validation(
 
 def count_of_views(config: AdaptConfig) -> int:
     """How many views there are for validation."""
-    return min(config.validation_views, max(MIN_VIEWS, config.steps * config.views_per_step // RENDERS_PER_VIEW))
+    fewest = MIN_VIEWS if config.steps else MIN_VIEWS_OF_START
+    return min(config.validation_views, max(fewest, config.steps * config.views_per_step // RENDERS_PER_VIEW))
 
 
 def _validation_views(
