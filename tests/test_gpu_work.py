@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import sys
 import time
@@ -58,6 +59,15 @@ def done(works, seconds=120.0, until=WHOLE):
     return [record for _, record in carry_out(works, began, began + seconds, until)]
 
 
+@pytest.fixture
+def forked(monkeypatch):
+    """Processes that import nothing anew, for pieces that compute nothing."""
+    if "fork" not in multiprocessing.get_all_start_methods():
+        pytest.skip("needs fork")
+    monkeypatch.setattr("gpu_work.get_context", lambda _: multiprocessing.get_context("fork"))
+
+
+@pytest.mark.usefixtures("forked")
 def test_what_breaks_a_piece_is_a_line_and_the_next_piece_begins():
     first, *records = done([piece(nothing_but_an_error), piece(the_end_of_the_process), piece(broken_context), piece(numbers, 5, 6)])
     assert first == Failure("b", "nothing_but_an_error", "ZeroDivisionError: by zero")
@@ -65,12 +75,14 @@ def test_what_breaks_a_piece_is_a_line_and_the_next_piece_begins():
     assert records[4].reason.startswith("AcceleratorError") and records[5:] == [DONE, 5, 6, DONE]
 
 
+@pytest.mark.usefixtures("forked")
 def test_what_takes_too_long_is_cut_off_and_not_done(monkeypatch):
-    monkeypatch.setattr("gpu_work.STARTING_S", 3.0)
+    monkeypatch.setattr("gpu_work.STARTING_S", 1.0)
     records = done([piece(numbers, 4, seconds=30.0), piece(what_never_ends), piece(numbers, 5, seconds=30.0)])
     assert records == [4, DONE, 1, Failure("b", "what_never_ends", "it was cut off, for its time was over", late=True), 5, DONE]
 
 
+@pytest.mark.usefixtures("forked")
 def test_parts_wait_for_others_where_their_share_of_the_time_is_over():
     works = [piece(numbers, 1), piece(numbers, 2, part="other"), piece(numbers, 3, part="other", seconds=1e6)]
     *records, last = done(works, until={"part": 0.0, "other": 1.0})
