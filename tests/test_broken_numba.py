@@ -21,7 +21,7 @@ def run(tmp_path):
     places = f"{package.parent}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
 
     def do(backend):
-        words = ["adapt", str(tiny.folder(tmp_path / "base")), "--scale", "1/2", "--steps", "1", "--backend", backend]
+        words = ["adapt", str(tiny.folder(tmp_path / "base")), "--scale", "1/2", "--steps", "1", "--views", "given", "--backend", backend]
         environment = {**os.environ, "PYTHONPATH": places}
         done = subprocess.run([sys.executable, "-m", "mipmap_plugin", *words], capture_output=True, text=True, env=environment)
         return done.returncode, [line for line in done.stderr.splitlines() if "numba" in line]
