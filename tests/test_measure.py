@@ -233,5 +233,5 @@ def test_the_same_pose_at_another_time_is_another_view():
 @pytest.mark.parametrize("recipe", ["instant", "default", "paper"])
 def test_an_adapted_model_knows_the_views_that_it_was_adapted_to(recipe):
     model = wrapped()
-    adapted = model.adapt(1 / 4, recipe=recipe, steps=0 if recipe == "instant" else 1, extra_views=3, views="jittered")
+    adapted = model.adapt(1 / 4, recipe=recipe, steps=0 if recipe == "instant" else 1, extra_views=3, views="jittered", validation_views=4)
     assert len(adapted.adapted_to) == 5 + 4 and views_seen(model.cameras, adapted.adapted_to) == model.cameras
