@@ -70,7 +70,9 @@ class Stages:
         if not self.cameras and config.views != "orbit":
             warn(orbited(base.source, orbit_of(base, self.request.up)))
         refuse_broken(base, next(iter(self.cameras), ONE_PIXEL), steps=config.steps > 0)
-        cameras = seeing(self.cameras, base, self.request.images.effects.near_plane)
+        near = self.request.images.effects.near_plane
+        # The splats of a moving scene are elsewhere at other moments.
+        cameras = self.cameras if base.traits.moves else seeing(self.cameras, base.parameters()["means"], near)
         if first is None:
             return Session(self.request, scale, config, cameras, self.photographs).run(self.resume, self.observe)
         session = Session(self.request, 1.0, first, cameras, None)

@@ -10,7 +10,6 @@ from torch import Tensor
 from mipmap_plugin.adaptation.views import showing
 from mipmap_plugin.adaptation.warn import warn
 from mipmap_plugin.camera import Camera
-from mipmap_plugin.models.base import SplatModel
 
 # Splats that are looked for at most, round by round: nearly every camera sees one of the first, and only those that do not look for more.
 SAMPLES = 1 << 8, 1 << 14, 1 << 16
@@ -19,16 +18,16 @@ SAMPLES = 1 << 8, 1 << 14, 1 << 16
 LARGER = 2
 
 
-def seeing(cameras: Sequence[Camera], model: SplatModel, near: float) -> list[Camera]:
-    """The cameras that see something of the model, with a warning of how many do not. `near`: the near plane, in world units.
+def seeing(cameras: Sequence[Camera], means: Tensor, near: float) -> list[Camera]:
+    """The cameras that see something of splats at `means` [N, 3], with a warning of how many do not. `near`: the near plane, in world units.
 
     Of many splats some are looked for, so that a camera that sees a few of a million counts as blind. All cameras stay where none sees anything,
-    or none that the base was trained on, and those of a moving model, whose splats are elsewhere at other moments.
+    or none that the base was trained on.
     """
-    if len(cameras) < 2 or model.traits.moves:
+    if len(cameras) < 2:
         return list(cameras)
     frames = {_larger(camera): camera for camera in cameras}
-    found = {frames[frame] for frame in _seeing(list(frames), model.parameters()["means"], near)}
+    found = {frames[frame] for frame in _seeing(list(frames), means, near)}
     kept = [camera for camera in cameras if camera in found]
     blind = len(cameras) - len(kept)
     if not blind or not any(camera.split == "train" for camera in kept):

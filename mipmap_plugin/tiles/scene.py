@@ -15,6 +15,7 @@ from torch import Tensor
 
 from mipmap_plugin.adaptation.optimization.amount import affordable_for
 from mipmap_plugin.adaptation.optimization.validation import split_validation
+from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.target.resize import fitting
 from mipmap_plugin.adaptation.views import choose_views, orbit_of, orbited
 from mipmap_plugin.backends import choose_backend
@@ -200,7 +201,7 @@ class TiledScene:
     @cached_property
     def views(self) -> Views:
         """The views of the whole scene, the same as without tiles."""
-        cameras, orbit = self.wrapped.cameras, self.orbit
+        cameras, orbit = seeing(self.wrapped.cameras, self.base.places[:, :3], self.target.near_plane), self.orbit
         if not cameras and self.config.views != "orbit":
             warnings.warn(orbited(self.checkpoint.path, orbit), stacklevel=1)
         chosen, note = choose_views(cameras, orbit, self.config)

@@ -21,6 +21,7 @@ from mipmap_plugin.adaptation.optimization.resume import StateKeeper
 from mipmap_plugin.adaptation.optimization.run import Task
 from mipmap_plugin.adaptation.optimization.validation import HARM_DB, Validation, split_validation
 from mipmap_plugin.adaptation.report import Report, filters, versions
+from mipmap_plugin.adaptation.seeing import seeing
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
 from mipmap_plugin.adaptation.start.compilation import warm_up
 from mipmap_plugin.adaptation.start.pixel_size import enough_views, pixel_size, seen_pixel_size
@@ -92,8 +93,8 @@ class Scene:
 
     @cached_property
     def views(self) -> list[Camera]:
-        """Those of the training."""
-        return self.base.views()
+        """Those of the training that see something."""
+        return seeing(self.base.views(), self.splats.means, self.target.near_plane)
 
     def pixel_of(self, means: Tensor) -> Tensor:
         return pixel_size(means, self.views)
@@ -145,9 +146,9 @@ class LevelRun:
     def __post_init__(self) -> None:
         scene, self.config, orbit = self.scene, self.scene.config(self.number), self.scene.base.orbit()
         self.size = scene.rule.middle(self.number)
-        chosen, note = choose_views(scene.base.cameras, orbit, self.config)
-        chosen = evenly(chosen, _most_views(self.config))
-        views, held_out = split_validation(scene.base.cameras, chosen, orbit, 1.0, self.config)
+        cameras = scene.views if scene.base.cameras else []
+        chosen, note = choose_views(cameras, orbit, self.config)
+        views, held_out = split_validation(cameras, evenly(chosen, _most_views(self.config)), orbit, 1.0, self.config)
         begins: dict[Camera, Camera] = {}
 
         def walked(starts: Sequence[Camera]) -> list[Camera]:
@@ -261,8 +262,7 @@ class LevelRun:
         return hashlib.sha256(json.dumps([*facts, *map(digest_of_parameters, self.finer), digest_of(self.views)]).encode()).hexdigest()
 
     def _report(self, student: SplatModel, curve: list[CurvePoint], ended_by: str, best: str, psnrs: dict[str, float]) -> Report:
-        scene, any_camera = self.scene, self.scene.base.any_camera()
-        effects = scene.base.effects()
+        scene, effects = self.scene, self.scene.base.effects()
         return Report(
             scale=scene.scale(self.number),
             base=scene.base.model.digest or digest_of_parameters(scene.base.model),
@@ -273,7 +273,7 @@ class LevelRun:
             filters=filters(1.0, self.config, effects, [scene.target]),
             effects=explain(scene.target, scene.splats, effects_of(scene.base.model), self.config, 1.0),
             gaussians_before=len(scene.splats),
-            gaussians_after=len(student.gaussians(any_camera)),
+            gaussians_after=len(student.gaussians(scene.base.any_camera())),
             seconds=self.seconds,
             ended_by=ended_by + fewer_note(scene.asked(self.number).steps, self.config),
             returned=best,
