@@ -47,7 +47,7 @@ def test_a_killed_worker_loses_one_job_which_is_resumed(farm, tmp_path):
     address = json.loads(wait_until(lambda: farm.file.exists() and farm.file.read_text()))["address"]
     settings = {"steps": 1500, "seed": 0, "views": "given", "check_every": 5}
     bases = [tiny.folder(tmp_path / f"base_{seed}", tiny.cameras(3), seed=seed) for seed in range(3)]
-    jobs = [Job(Base(base), tmp_path / f"{base.name}.ply", 0.5, recipe="paper", settings=settings) for base in bases]
+    jobs = [Job(Base(base, backend="reference"), tmp_path / f"{base.name}.ply", 0.5, recipe="paper", settings=settings) for base in bases]
     with ThreadPoolExecutor(1) as pool:
         outcomes = pool.submit(lambda: list(on_dask(jobs, address, threads=1)))
         victim = farm("worker", "--nthreads", "1", "--no-nanny", "--no-dashboard")
@@ -73,7 +73,7 @@ def test_a_job_that_dask_gives_up_is_handed_out_again(farm, tmp_path):
     farm("scheduler", "--port", "0", "--no-dashboard", DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
     address = json.loads(wait_until(lambda: farm.file.exists() and farm.file.read_text()))["address"]
     settings = {"steps": 300, "seed": 0, "views": "given", "check_every": 5}
-    base = Base(tiny.folder(tmp_path / "base", tiny.cameras(3)))
+    base = Base(tiny.folder(tmp_path / "base", tiny.cameras(3)), backend="reference")
     job = Job(base, tmp_path / "out.ply", 0.5, recipe="paper", settings=settings)
     with ThreadPoolExecutor(1) as pool:
         outcomes = pool.submit(lambda: list(on_dask([job], address, threads=1)))
@@ -88,7 +88,7 @@ def test_a_job_that_dask_gives_up_is_handed_out_again(farm, tmp_path):
 @pytest.mark.slow
 def test_workers_of_this_machine(tmp_path, capsys):
     bases = [str(tiny.folder(tmp_path / name, tiny.cameras(3))) for name in ("a", "b")] + [str(tmp_path / "nowhere")]
-    words = ["--scale", "1/2", "--views", "given", "--steps", "2", "--dask", "local:2"]
+    words = ["--scale", "1/2", "--backend", "reference", "--views", "given", "--steps", "2", "--dask", "local:2"]
     assert main(["adapt", *bases, *words]) == 2
     assert "3 jobs: " in (out := capsys.readouterr().out) and "2 done" in out and "nowhere does not exist" in out
 
@@ -122,7 +122,7 @@ def test_files_that_are_sent_come_back_adapted(tmp_path):
 
     base = tiny.folder(tmp_path / "base", tiny.cameras(3))
     settings = {"steps": 2, "seed": 0, "views": "given"}
-    jobs = [Job(Base(base), tmp_path / f"{name}.ply", 0.5, settings=settings) for name in ("a", "b", "c", "d", "e")]
+    jobs = [Job(Base(base, backend="reference"), tmp_path / f"{name}.ply", 0.5, settings=settings) for name in ("a", "b", "c", "d", "e")]
     outcomes = list(on_dask(jobs, "local:2", threads=1, send_files=True))
     assert [outcome.status for outcome in outcomes] == ["done"] * 5 and {outcome.file for outcome in outcomes} == {job.target for job in jobs}
     assert len({job.target.read_bytes() for job in jobs}) == 1
@@ -136,7 +136,7 @@ def test_a_checkpoint_that_cannot_be_sent_fails_alone(tmp_path):
     good, existing = tiny.folder(tmp_path / "base", tiny.cameras(3)), tmp_path / "existing.ply"
     existing.write_text("here")
     bases = [tmp_path / "nowhere", good, good]
-    jobs = [Job(Base(base), target, 0.5) for base, target in zip(bases, [tmp_path / "a", tmp_path / "b", existing], strict=True)]
+    jobs = [Job(Base(base, backend="reference"), target, 0.5) for base, target in zip(bases, [tmp_path / "a", tmp_path / "b", existing], strict=True)]
     outcomes, sent = farm._sent(jobs, SimpleNamespace(scatter=lambda parcel, hash: parcel))
     assert [job for job, _ in sent] == [jobs[1]]
     assert [outcome.status for outcome in outcomes] == ["failed"] * 2
