@@ -234,7 +234,7 @@ def test_the_pretence_holds():
     "words",
     [
         "render BASE --output OUT --scale 1/2 --depth --normals --supersampling 2",
-        "adapt BASE --scale 1/2 --steps 2 --output OUT --report",
+        "adapt BASE --scale 1/2 --steps 2 --views given --output OUT --report",
     ],
     ids=lambda words: words.split()[0],
 )
