@@ -1,10 +1,10 @@
-"""What interrupts a run in the middle of a step."""
+"""What interrupts a run while it takes a step."""
 
 from mipmap_plugin.adaptation.optimization import loop
 
 
 def in_step(monkeypatch, act):
-    """Returned is what, called with n, has `act` called in the nth step from then on, whatever the backend."""
+    """Return a function: called with n, it has `act` called as the nth step from then on begins, whatever the backend."""
     step, waiting = loop._step, []
 
     def interrupted(*arguments):

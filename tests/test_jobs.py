@@ -200,10 +200,13 @@ def test_a_checkpoint_given_twice_is_one(tmp_path, monkeypatch):
     assert find_checkpoints([Path("b[1].ply")]) == [Path("b[1].ply")]  # a name, though it looks like a pattern
 
 
-def test_a_list_of_cameras_is_no_checkpoint(tmp_path):
+def test_a_list_of_cameras_beside_checkpoints_is_left_out_and_told_of(run, tmp_path):
     tiny.ply(tmp_path / "a.ply")
     write_cameras(tmp_path / "cameras.json", tiny.cameras(3))
-    assert find_checkpoints([tmp_path / "*"]) == find_checkpoints(tmp_path.iterdir()) == [tmp_path / "a.ply"]
+    words = ["--scale", "1/2", "--output", tmp_path / "out", "--cameras", tmp_path / "cameras.json", *NO_STEP]
+    code, out, err = run("adapt", tmp_path / "*", *words)
+    assert code == 0 and "1 job: 1 done" in out and f"left out, because they list cameras: {tmp_path / 'cameras.json'}" in err
+    assert run("adapt", tmp_path / "cameras.json", "--jobs", "2", *words)[0] == 2
 
 
 def test_a_list_that_is_no_text(tmp_path):

@@ -115,11 +115,14 @@ def jobs_of(checkpoint: Path, request: Request, base: Base, *, several: bool) ->
 
 
 def _checkpoints(given: Sequence[Path]) -> list[Path]:
-    """The checkpoints of the command and of its list, without outputs of earlier runs, which a pattern such as output/* finds too."""
+    """The checkpoints of the command and of its list, without lists of cameras and outputs of earlier runs, which output/* finds too."""
     found = find_checkpoints(given)
-    if not found:
+    cameras = [path for path in found if path.name == "cameras.json"]
+    if len(cameras) == len(found):
         raise SettingsError(NO_CHECKPOINT)
-    checkpoints, outputs = without_outputs(found)
+    if cameras:
+        note(f"left out, because they list cameras: {', '.join(map(str, cameras))}")
+    checkpoints, outputs = without_outputs(path for path in found if path not in cameras)
     if outputs and not checkpoints:
         raise SettingsError(f"{outputs[0]}: this was adapted already; give the checkpoint that it was made of")
     if outputs:

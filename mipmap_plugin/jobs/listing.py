@@ -26,15 +26,12 @@ def read_list(path: Path) -> list[Path]:
 
 
 def find_checkpoints(given: Iterable[Path]) -> list[Path]:
-    """The checkpoints that are given by name or as patterns (*, ?, **), in their order, each once. Raises SettingsError if a pattern fits none.
-
-    A list of cameras, which folder/* finds beside the checkpoints, is none of them.
-    """
+    """The checkpoints that are given by name or as patterns (*, ?, **), in their order, each once. Raises SettingsError if a pattern fits none."""
     found: dict[Path, Path] = {}
     for path in given:
         for each in _matches(path) if is_pattern(path) else [path]:
             found.setdefault(each.resolve(), each)
-    return [path for path in found.values() if path.name != "cameras.json"]
+    return list(found.values())
 
 
 def is_pattern(path: Path) -> bool:

@@ -96,7 +96,7 @@ def _step(run: Run, task: Task, config: AdaptConfig, views: Sequence[Camera], ca
     task.follow(run.student)
     progress = run.progress(config)
     set_rates(run.optimizer, config, progress, run.steering.rate_factor(run.step, config), frozen=frozen_parameters(run))
-    growing = run.gradients is not None  # which needs the gradients of each view
+    growing = run.gradients is not None  # by the gradients of each view, which no step by rows has
     at_once = 1 if growing else views_at_once(cameras[view] for view in views)
     run.by_rows = None if growing or len(views) > at_once else ByRows.of(run.student, task.render_to_step, run.by_rows)
     if run.by_rows is not None:

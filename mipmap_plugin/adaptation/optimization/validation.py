@@ -37,7 +37,7 @@ RENDERS_PER_VIEW = 25
 MIN_VIEWS = 4
 
 # At least as many where no step is taken: nothing makes up for a start that is chosen wrongly. With 4, of which one or two see little but the sky,
-# an object is left as it is (at x1/4 24.0 dB in place of 28.1, at x2 38.7 in place of 43.1), and 8 take up to 0.3 s more.
+# an object is left as it is (at x1/4 24.0 dB in place of 28.1, at x2 38.7 in place of 43.1), and 8 take 0.1 to 0.8 s more.
 MIN_VIEWS_OF_START = 8
 
 # px: validation uses at most this much of a view along each side, so that large images stay cheap.
