@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import anchor_checkpoints
+import gltf_files
 import moving
 import numpy as np
 import ply_files
@@ -134,6 +135,20 @@ def _dot_splat(path: Path) -> Path:
     return path / "a.splat"
 
 
+def _glb(path: Path) -> Path:
+    path.mkdir()
+    return gltf_files.glb(path / "a.glb", tiny.gaussians(8))
+
+
+def _gltf(path: Path) -> Path:
+    path.mkdir()
+    made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians(8)))
+    made["buffers"][0]["uri"] = "a.bin"
+    (path / "a.bin").write_bytes(data)
+    (path / "a.gltf").write_text(json.dumps(made))
+    return path / "a.gltf"
+
+
 def _spz(path: Path) -> Path:
     path.mkdir()
     count, bytes_a_splat = 10, 9 + 1 + 3 + 3 + 3  # version 2: center, opacity, color, scales, rotation
@@ -255,6 +270,8 @@ SAMPLES: dict[str, Sample] = {
     "png, palette": Sample(_pictures("PNG", "P"), PICTURE, PICTURES, open=open_images),
     "jpeg": Sample(_pictures("JPEG", "RGB"), PICTURE, BINARY, open=open_images),
     ".splat": Sample(_dot_splat, "a.splat", BINARY, open=open_exchange),
+    "glb": Sample(_glb, "a.glb", BINARY),
+    "gltf": Sample(_gltf, "a.gltf", ("of_json", *TEXT)),
     ".spz": Sample(_spz, "a.spz", BINARY, open=open_exchange),
     "COLMAP cameras": Sample(_colmap, "sparse/0/cameras.bin", BINARY, is_scene=True),
     "COLMAP images": Sample(_colmap, "sparse/0/images.bin", BINARY, is_scene=True),

@@ -99,6 +99,8 @@ def _kind_of_json(head: bytes) -> str:
         return "glb"
     if b".webp" in head or b"meta.json" in head:
         return "sog"
+    if b'"asset"' in head and any(name in head for name in (b'"bufferViews"', b'"accessors"', b'"nodes"')):
+        return "glb"
     return "gsplat-png" if all(name in head for name in (b'"means"', b'"shape"', b'"mins"', b'"quats"')) else "unknown"
 
 

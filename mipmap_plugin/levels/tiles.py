@@ -25,6 +25,7 @@ from torch import Tensor
 from mipmap_plugin.camera import ONE_PIXEL
 from mipmap_plugin.errors import TEMPORARY
 from mipmap_plugin.formats.atomic import new_folder, write_json
+from mipmap_plugin.formats.gltf import BINARY_CHUNK, JSON_CHUNK, MAGIC, SPLATTING, SPZ_INSIDE
 from mipmap_plugin.formats.splat_transform import write_exchange
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import read_manifest
@@ -41,15 +42,14 @@ SCREEN_ERROR = 16
 AXES = (0, 2, 1)
 HALF_TURN = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 
-SPLATTING, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
+COMPRESSION = SPZ_INSIDE[0]
 EXTENSIONS = {"extensionsUsed": [SPLATTING, COMPRESSION], "extensionsRequired": [SPLATTING, COMPRESSION]}
 
 # The header of an SPZ file, inside its gzip: magic number, version, count of splats, SH degree (github.com/nianticlabs/spz, 3).
 SPZ_HEADER = struct.Struct("<IIIB")
 
-# glTF 2.0: the codes of types of numbers, and the magic numbers of a GLB and its two chunks.
+# glTF 2.0: the codes of types of numbers.
 BYTE, FLOAT = 5121, 5126
-GLB, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
 
 # Standard deviations at which a splat ends, for bounding boxes.
 REACH = 3.0
@@ -114,7 +114,7 @@ def glb(spz: bytes, low: list[float], high: list[float]) -> bytes:
     text = json.dumps(document).encode()
     chunks = [(JSON_CHUNK, text + b" " * (-len(text) % 4)), (BINARY_CHUNK, spz + b"\0" * (-len(spz) % 4))]
     body = b"".join(struct.pack("<I4s", len(content), kind) + content for kind, content in chunks)
-    return struct.pack("<4sII", GLB, 2, 12 + len(body)) + body
+    return struct.pack("<4sII", MAGIC, 2, 12 + len(body)) + body
 
 
 def write_tiles(folder: Path, *, overwrite: bool = False) -> Path:

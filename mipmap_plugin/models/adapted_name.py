@@ -17,8 +17,8 @@ COMPRESSED = EXCHANGE["compressed"][1]
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
     """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder.
 
-    Exchange formats that can only be read are written as a PLY, as is a PLY in a zip archive, and files of third-party families as these say
-    (`Family.saves`), but for a viewer as a PLY. Files that other projects save with torch become a folder, as those of INRIA are.
+    Exchange formats that can only be read are written as a PLY, as are glTF and a PLY in a zip archive, and files of third-party families
+    as these say (`Family.saves`), but for a viewer as a PLY. Files that other projects save with torch become a folder, as those of INRIA are.
     """
     name = checkpoint.resolve().name
     read, written = _endings(checkpoint, name, for_viewer=viewer is not None)
@@ -47,6 +47,6 @@ def _endings(checkpoint: Path, name: str, *, for_viewer: bool) -> tuple[str, str
     if opened(checkpoint) != checkpoint:  # a folder in a zip archive
         return Path(name).suffix, ""
     if family in BUILT_IN:
-        return (Path(name).suffix, ".ply") if family.name == "zipped" else ("", "")
+        return (Path(name).suffix, ".ply") if family.name in ("zipped", "gltf") else ("", "")
     own = Path(name).suffix if family.saves is None else family.saves
     return Path(name).suffix, ".ply" if for_viewer else own

@@ -15,7 +15,7 @@ from mipmap_plugin.models.places import REPORT
 from mipmap_plugin.models.zipped_folder import opened, told_of_archives
 
 # Suffixes of files of splats besides PLY, and of photographs.
-EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat"), (".jpg", ".jpeg", ".png")
+EXCHANGED, PHOTOGRAPHS = (".spz", ".sog", ".splat", ".ksplat", ".glb", ".gltf"), (".jpg", ".jpeg", ".png")
 OWN_SUFFIXES = (".ply", ".pt", ".ckpt", *EXCHANGED)
 
 # The families of this package.
@@ -137,7 +137,6 @@ def _why_not(files: Files) -> str:
         chunk = "the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)"
         return f"{path} is a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; give {chunk}"
     return {
-        "glb": f"{path} is glTF, which is not read here, nor by splat-transform; export a PLY from the program that made it",
         "torchscript": f"{path} is a TorchScript network, one companion of an anchor model; give the model folder that holds its point_cloud.ply",
         "zip": f"{path} is a zip archive; unpack it and give the PLY or the folder in it",
         "gzip": f"{path} is a gzip file; unpack it first",

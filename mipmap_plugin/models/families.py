@@ -165,6 +165,7 @@ BUILT_IN = (
         "exchange", "exchange format (SPZ, SOG, KSPLAT, SPLAT, compressed PLY)", exchange,
         load=f"{LOADERS}.exchanged:load_exchanged", place=("", r"(lod-)?meta\.json"),
     ),
+    family("gltf", "glTF (KHR_gaussian_splatting)", certain(lambda files: files.kind == "glb", "its first bytes"), load=f"{LOADERS}.gltf:load_gltf"),
     family("zipped", "PLY in a zip archive", zipped, load=f"{LOADERS}.zipped:load_zipped"),
     # Recognized in order to be refused with a clear message.
     family(

@@ -5,6 +5,8 @@ Constants and order are those of PlenOctrees (sxyu/plenoctree, Apache-2.0), shar
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -49,3 +51,16 @@ def colors(sh: Tensor, means: Tensor, eye: Tensor, degree: int) -> Tensor:
     at_eye = length == 0
     directions = torch.where(at_eye, rays.new_tensor([0.0, 0.0, 1.0]), rays / torch.where(at_eye, 1.0, length))
     return (basis(directions, degree)[..., None] * sh[:, :bands]).sum(1).add(0.5).clamp_min(0)
+
+
+def rotated(sh: Tensor, rotation: Tensor) -> Tensor:
+    """Coefficients [N, (degree + 1)², 3] of splats that were turned by `rotation` [3, 3]: their color towards R d is what it was towards d.
+
+    A basis function of turned directions is a sum of those of its own degree; the factors are solved for in float64.
+    """
+    degree = math.isqrt(sh.shape[1]) - 1
+    directions = torch.randn(4 * sh.shape[1], 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    factors: Tensor = torch.linalg.lstsq(basis(directions, degree), basis(directions @ rotation.double(), degree)).solution
+    turned: Tensor = factors.to(sh) @ sh
+    return turned

@@ -1,0 +1,197 @@
+"""Splats in glTF are those of a PLY, turned from y up; what is not read is said in a sentence."""
+
+import base64
+import copy
+import json
+from dataclasses import replace
+
+import gltf_files
+import numpy as np
+import pytest
+import tiny
+import torch
+from gltf_files import EXTENSION
+
+from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.models import detect, load_model
+from mipmap_plugin.models.adapted_name import adapted_name
+from mipmap_plugin.splatting.harmonics import basis
+from mipmap_plugin.splatting.projection import axes_of
+
+HALF_TURN = torch.diag(torch.tensor([-1.0, -1.0, 1.0]))  # from y up to a PLY's frame, about z
+# A rotation by 120 degrees about (1, 1, 1), x -> y -> z -> x, as a quaternion xyzw.
+CYCLE, CYCLED = [0.5, 0.5, 0.5, 0.5], torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+
+
+def covariances(splats):
+    axes = axes_of(splats.quats, splats.scales)
+    return axes @ axes.transpose(1, 2)
+
+
+def towards(splats, directions):
+    """The colors [N, D, 3] of splats towards directions [D, 3]."""
+    return basis(directions, splats.sh_degree) @ splats.sh
+
+
+def assert_moved(read, splats, turn, size=1.0, shift=(0.0, 0.0, 0.0)):
+    """`read` are `splats`, turned, scaled and moved, and look towards R d as they looked towards d."""
+    directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(0)), dim=1)
+    torch.testing.assert_close(read.means, size * splats.means @ turn.T + torch.tensor(shift), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(covariances(read), size**2 * turn @ covariances(splats) @ turn.T, atol=1e-6, rtol=1e-4)
+    torch.testing.assert_close(read.opacities, splats.opacities, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(towards(read, directions @ turn.T), towards(splats, directions), atol=1e-4, rtol=1e-4)
+
+
+def sentence(path):
+    with pytest.raises(CheckpointError) as caught:
+        load_model(path)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_splats_are_turned_to_the_frame_of_a_ply(tmp_path, degree):
+    splats = tiny.gaussians(degree=degree)
+    model = load_model(gltf_files.glb(tmp_path / "a.glb", splats))
+    assert (model.sh_degree, model.source, len(model.digest)) == (degree, tmp_path / "a.glb", 64)
+    assert_moved(model.gaussians(), splats, HALF_TURN)
+
+
+def test_nodes_turn_scale_and_move_splats(tmp_path):
+    """A node that turns and scales lies in one that moves, given as a matrix, column by column."""
+    splats = tiny.gaussians(degree=3)
+    matrix = np.eye(4)
+    matrix[:3, 3] = 1, 2, 3
+    nodes = [{"matrix": matrix.T.flatten().tolist(), "children": [1]}, {"mesh": 0, "rotation": CYCLE, "scale": [2, 2, 2]}]
+    made, data = gltf_files.document(gltf_files.attributes(splats), nodes=nodes)
+    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians()
+    assert_moved(read, splats, HALF_TURN @ CYCLED, 2.0, (-1.0, -2.0, 3.0))
+
+
+def test_primitives_are_joined_and_other_meshes_left_out(tmp_path):
+    parts = tiny.gaussians(10, degree=1), tiny.gaussians(20, degree=0, seed=1)
+    made, data = gltf_files.document(*map(gltf_files.attributes, parts))
+    made["meshes"].append({"primitives": [{"attributes": {"POSITION": 0}}]})
+    made["nodes"].append({"mesh": 2})
+    made["scenes"][0]["nodes"].append(2)
+    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians()
+    assert len(read) == 30 and read.sh_degree == 1 and not read.sh[10:, 1:].any()
+    torch.testing.assert_close(read.sh[10:, 0], parts[1].sh[:, 0])
+
+
+def test_whole_numbers_are_fractions_of_the_largest(tmp_path):
+    splats = tiny.gaussians()
+    named = gltf_files.attributes(splats)
+    for name, kind in {"ROTATION": "<i2", "SCALE": "<u2", "OPACITY": "<u1"}.items():
+        named[f"{EXTENSION}:{name}"] = (named[f"{EXTENSION}:{name}"] * np.iinfo(kind).max).round().astype(kind)
+    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named))).gaussians()
+    turned = HALF_TURN @ covariances(splats) @ HALF_TURN
+    torch.testing.assert_close(covariances(read), turned, atol=1e-4, rtol=0)
+    torch.testing.assert_close(read.opacities, splats.opacities, atol=1 / 500, rtol=0)
+
+
+def test_rows_may_lie_apart(tmp_path):
+    """Positions and sizes, row by row, as files of meshes keep them."""
+    splats = tiny.gaussians()
+    made, data = gltf_files.document(gltf_files.attributes(splats))
+    rows = np.concatenate([splats.means.numpy(), splats.scales.numpy()], axis=1)
+    names = made["meshes"][0]["primitives"][0]["attributes"]
+    made["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": rows.nbytes, "byteStride": 24})
+    for name, offset in {"POSITION": 0, f"{EXTENSION}:SCALE": 12}.items():
+        made["accessors"][names[name]] |= {"bufferView": len(made["bufferViews"]) - 1, "byteOffset": offset}
+    assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data + rows.tobytes())).gaussians(), splats, HALF_TURN)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_as_json_its_bytes_lie_beside_it_or_inside(tmp_path, inside):
+    splats = tiny.gaussians()
+    made, data = gltf_files.document(gltf_files.attributes(splats))
+    made["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{base64.b64encode(data).decode()}" if inside else "a%20b.bin"
+    (tmp_path / "a.gltf").write_text(json.dumps(made))
+    if not inside:
+        assert "lacks its buffer a b.bin; put that file beside it" in sentence(tmp_path / "a.gltf")
+        (tmp_path / "a b.bin").write_bytes(data)
+    assert_moved(load_model(tmp_path).gaussians(), splats, HALF_TURN)
+
+
+def test_of_a_draft_colors_and_opacities_are_those_of_points_and_sizes_logarithms(tmp_path):
+    splats = tiny.gaussians(degree=0)
+    splats = replace(splats, sh=splats.sh.clamp(-1.5, 1.5))
+    named = gltf_files.attributes(splats)
+    opacity, dc = named.pop(f"{EXTENSION}:OPACITY"), named.pop(f"{EXTENSION}:SH_DEGREE_0_COEF_0")
+    colors = np.concatenate([0.5 + 0.28209479177387814 * dc, opacity], axis=1).astype(np.float32)
+    sizes = np.log(named[f"{EXTENSION}:SCALE"])
+    drafted = {"POSITION": named["POSITION"], "_ROTATION": named[f"{EXTENSION}:ROTATION"], "_SCALE": sizes, "COLOR_0": colors}
+    assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(drafted))).gaussians(), splats, HALF_TURN)
+
+
+def test_certain_opacities_and_flat_splats_are_finite(tmp_path):
+    splats = tiny.gaussians()
+    splats.opacities[:2] = torch.tensor([0.0, 1.0])
+    splats.scales[0, 0] = 0
+    model = load_model(gltf_files.glb(tmp_path / "a.glb", splats))
+    assert len(model) == 60 and all(raw.isfinite().all() for raw in model.parameters().values())
+
+
+def test_what_is_adapted_from_it_is_a_ply(tmp_path):
+    path = gltf_files.glb(tmp_path / "scan.glb", tiny.gaussians())
+    assert adapted_name(path, 1 / 4, "spark") == "scan_x0.25_spark.ply" and detect(tmp_path).family == "gltf"
+
+
+# What is refused
+
+
+def test_meshes_without_splats(tmp_path):
+    made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians()))
+    del made["meshes"][0]["primitives"][0]["extensions"]
+    assert "is glTF without Gaussian splats" in sentence(gltf_files.write_glb(tmp_path / "a.glb", made, data))
+
+
+def changed(made, *path, to):
+    """A copy with another value at a place."""
+    made = copy.deepcopy(made)
+    place = made
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = to
+    return made
+
+
+SAID = ("meshes", 0, "primitives", 0, "extensions", EXTENSION)
+
+
+@pytest.mark.parametrize(
+    ("path", "to", "told"),
+    [
+        ((*SAID, "kernel"), "cube", "have the kernel 'cube'"),
+        ((*SAID, "colorSpace"), "lin_rec709_display", "its colors are in 'lin_rec709_display'"),
+        (("nodes", 0, "scale"), [1, 2, 1], "stretches them unevenly"),
+        (("nodes", 0, "scale"), [-1, 1, 1], "mirrors its splats"),
+        (("nodes", 0, "scale"), [0, 0, 0], "stretches them unevenly"),
+        (("nodes", 0, "children"), [0], "lies in two others"),
+        (("accessors", 0, "sparse"), {}, "accessor 0 is sparse"),
+        (("bufferViews", 0, "extensions"), {"EXT_meshopt_compression": {}}, "compressed by meshopt"),
+        (("bufferViews", 0, "byteStride"), 0, "the rows of view 0 overlap"),
+        (("bufferViews", 0, "byteLength"), 10**9, "ends before its view 0"),
+        (("accessors", 0, "count"), 10**9, "is a damaged glTF file"),
+        (("accessors", 0, "count"), 59, "its attributes do not fit each other"),
+        (("accessors", 1, "type"), "VEC3", "its attributes do not fit each other"),
+        (("accessors", 0, "bufferView"), 99, "is a damaged glTF file"),
+        (("buffers", 0, "uri"), "../a.bin", "does not lie in its folder"),
+        (("buffers", 0, "uri"), "https://example.com/a.bin", "does not lie in its folder"),
+    ],
+)
+def test_what_is_not_read_is_said_in_a_sentence(tmp_path, path, to, told):
+    made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians()))
+    assert told in sentence(gltf_files.write_glb(tmp_path / "a.glb", changed(made, *path, to=to), data))
+
+
+def test_missing_attributes_are_named(tmp_path):
+    named = gltf_files.attributes(tiny.gaussians())
+    del named[f"{EXTENSION}:SCALE"], named[f"{EXTENSION}:OPACITY"]
+    assert "lacks SCALE, COLOR_0" in sentence(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named)))
+
+
+def test_a_file_that_is_cut_off_is_damaged(tmp_path):
+    path = gltf_files.glb(tmp_path / "a.glb", tiny.gaussians())
+    path.write_bytes(path.read_bytes()[:-100])
+    assert "is a damaged glTF file" in sentence(path)
