@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import zipfile
 
+import numpy as np
 import ply_files
 import pytest
 import torch
@@ -78,6 +80,34 @@ def test_a_4d_gaussian_splatting_checkpoint_has_its_own_sentence(tmp_path):
     torch.save(((3, torch.zeros(2, 3), {"state": {}, "param_groups": groups}), 30_000), tmp_path / "chkpnt_best.pth")
     with pytest.raises(CheckpointError, match="fudan-zvg"):
         load_model(tmp_path / "chkpnt_best.pth")
+
+
+def test_a_checkpoint_of_3dgrut_has_its_own_sentence(tmp_path):
+    names = ("positions", "rotation", "scale", "density", "features_albedo", "features_specular")
+    torch.save({name: torch.zeros(2, 3) for name in names} | {"optimizer": {"param_groups": []}}, tmp_path / "ckpt_last.pt")
+    with pytest.raises(CheckpointError, match=r"3DGRUT.*give the PLY that it exports"):
+        load_model(tmp_path / "ckpt_last.pt")
+
+
+def test_a_ply_of_3dgrut_is_read_with_a_note(tmp_path):
+    up = {name: np.full(4, value, np.float32) for name, value in {"nx": 0, "ny": 0, "nz": 1}.items()}
+    assert any("3DGRUT" in note for note in load_model(write(tmp_path / "a.ply", {**COLUMNS, **up})).notes)
+    askew = up | {"nz": np.linspace(0.9, 1, 4, dtype=np.float32)}
+    assert not any("3DGRUT" in note for note in load_model(write(tmp_path / "b.ply", {**COLUMNS, **askew})).notes)
+
+
+def test_beta_kernels_are_refused_by_name(tmp_path):
+    columns = {name: column for name, column in COLUMNS.items() if not name.startswith("f_")}
+    with pytest.raises(CheckpointError, match="Deformable Beta Splatting"):
+        load_model(write(tmp_path / "a.ply", {**columns, **named("sh0_0", "sh0_1", "sh0_2", "beta")}))
+
+
+@pytest.mark.parametrize("ending", ["usd", "usda", "usdc", "usdz"])
+def test_usd_has_its_own_sentence(tmp_path, ending):
+    with zipfile.ZipFile(path := tmp_path / f"a.{ending}", "w") as archive:
+        archive.writestr("default.usda", "#usda 1.0")
+    with pytest.raises(CheckpointError, match="is USD, which is not read here; export a PLY"):
+        load_model(path)
 
 
 def test_a_hierarchy_has_its_own_sentence(tmp_path):

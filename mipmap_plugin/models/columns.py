@@ -24,6 +24,7 @@ CHUNK = 8192
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")  # always 0 in 3DGS, and never drawn
+GRUT_NORMAL = (0, 0, 1)  # that nv-tlabs/3dgrut writes for every splat
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -86,6 +87,16 @@ def extra_names(columns: Mapping[str, np.ndarray]) -> list[str]:
     known |= set() if any(columns[name].any() for name in NORMAL if name in columns) else set(NORMAL)
     known |= set() if DC[0] in columns else set(RGB)
     return [name for name in columns if name not in known]
+
+
+def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
+    """What is said of extra columns, in sentences; `filter_3D` has its family's own."""
+    names = [name for name in extras if name != FILTER_3D]
+    notes = [f"extra columns are carried along: {', '.join(names)}"] if names else []
+    if all(name in extras and (extras[name] == value).all() for name, value in zip(NORMAL, GRUT_NORMAL, strict=True)):
+        kernel = "whose particles are Gaussians only of degree 2, which is not its default"
+        notes.append(f"its normals are those that 3DGRUT writes: if it was trained with 3DGRT, {kernel}, it is drawn otherwise here")
+    return notes
 
 
 def rest_names(columns: Iterable[str]) -> tuple[str, ...]:

@@ -133,6 +133,8 @@ def _why_not(files: Files) -> str:
         return f"{path} is a NumPy archive that no family knows; give a PLY file or a model folder, or register its family"
     if path.suffix.lower() in (".lcc", ".lcc2"):
         return f"{path} is LCC of XGRIDS, which is not read here; convert it: splat-transform {path.name} {path.stem}.ply"
+    if path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz"):
+        return f"{path} is USD, which is not read here; export a PLY from the program that made it"
     if path.suffix == ".hier":
         chunk = "the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)"
         return f"{path} is a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; give {chunk}"

@@ -19,6 +19,9 @@ Recognize = Callable[[Files], Match | None]
 # Names that only the optimizer of fudan-zvg's 4D Gaussian Splatting has; that project saves no PLY.
 FUDAN = ("scaling_t", "rotation_r")
 
+# Names of parameters in the checkpoints of nv-tlabs/3dgrut.
+GRUT = ("features_albedo", "density")
+
 ANCHOR_COLUMNS = {"f_offset_0", "f_anchor_feat_0"}
 FILTERED = ("mip", "gof", "analytic")
 FLAT_OR_FILTERED = (*FILTERED, "2dgs")
@@ -206,6 +209,18 @@ BUILT_IN = (
             "{path} lists the pictures of gsplat's PngCompression, which are quantized; give the ckpts/ckpt_*.pt that they were made from",
         ),
         place=("", r"meta\.json"),
+    ),
+    family(
+        "beta", "Deformable Beta Splatting", certain(
+            lambda files: {"beta", "sh0_0"} <= files.columns, "columns beta, sh0_0",
+            "{path} is of Deformable Beta Splatting, whose kernels are no Gaussians, which is not read here",
+        ),
+    ),
+    family(
+        "3dgrut", "3DGRUT", certain(
+            lambda files: files.words(*GRUT) == set(GRUT), "its parameters' names",
+            "{path} is of 3DGRUT, whose checkpoints are not read here; give the PLY that it exports (export_ply.enabled=true)",
+        ),
     ),
     family("fudan", "4D Gaussian Splatting (fudan-zvg)", fudan),
     family(

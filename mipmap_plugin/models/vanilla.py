@@ -21,7 +21,7 @@ from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_written, refuse
 from mipmap_plugin.formats.tags import recorded_filter, render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
-from mipmap_plugin.models.columns import FILTER_3D, extra_columns, to_columns, to_parameters, whole_opacities
+from mipmap_plugin.models.columns import FILTER_3D, extra_columns, notes_on, to_columns, to_parameters, whole_opacities
 from mipmap_plugin.models.detect import Checkpoint, detect_as
 from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposures
 from mipmap_plugin.models.health import LARGEST, without_invalid
@@ -294,7 +294,6 @@ def read_splats(checkpoint: Checkpoint, kind: type[Model]) -> Model:
     model.notes += companion_notes(options, model.sh_degree, model.traits.exposures, taken_as_classic)
     if screen_filter not in (None, "2dgs") and not has_filter:  # flat splats have a note of their own
         model.notes.append(f"the header says that the splats are to be drawn {trained.screen_filter} ({trained.eps2d:g} px²)")
-    others = [name for name in extras if name != FILTER_3D]
-    model.notes += [f"extra columns are carried along: {', '.join(others)}"] if others else []
+    model.notes += notes_on(extras)
     model.notes += [FUSED] if "fused" in path.stem and taken_as_classic else []
     return without_invalid(model)
