@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable
 from typing import Any
@@ -19,8 +20,11 @@ _ANTIALIASED = re.compile(r"antialiased\s+([01])\b", re.IGNORECASE)
 # "kernel_size" does not end with = and a number (959a3ec, io/ply.rs); so these are before all others of this package.
 _WEB_SPLAT = re.compile(r"(mip|kernel_size)=[\w.]+$")
 
-# nerfstudio names its vertical so; Brush's exports have the same comment with y, whatever is up in them.
+# nerfstudio names its vertical so. Brush's exports had the same comment with y, whatever is up in them; since July 2026 they have the least variance
+# of the cameras' places, of which the first two numbers are those of what is up, and the third is that of what is down (`estimate_up`, 018c949c).
 _Z_UP = re.compile(r"vertical axis:\s*z\b", re.IGNORECASE)
+_OF_BRUSH = re.compile(r"vertical axis: (\S+) (\S+) (\S+)$", re.IGNORECASE)
+BRUSH = "Exported from Brush"
 
 _MODES = {"default": "classic", "0": "classic", "mip": "antialiased", "1": "antialiased", "2dgs": "2dgs"}
 
@@ -38,8 +42,17 @@ def render_mode(comments: Iterable[str]) -> str | None:
 
 
 def vertical_of(comments: Iterable[str]) -> tuple[float, float, float] | None:
-    """What is up in a file that says so; None in any other."""
-    return (0.0, 0.0, 1.0) if any(map(_Z_UP.match, comments)) else None
+    """What is up in a file that says so, of length 1; None in any other."""
+    comments = list(comments)
+    if any(map(_Z_UP.match, comments)):
+        return (0.0, 0.0, 1.0)
+    found = next(filter(None, map(_OF_BRUSH.match, comments)), None) if BRUSH in comments else None
+    try:
+        x, y, down = map(float, found.groups()) if found else (0.0, 0.0, 0.0)
+    except ValueError:
+        return None
+    length = math.hypot(x, y, down)
+    return (x / length, y / length, -down / length) if 0 < length < math.inf else None
 
 
 def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any], eps2d: float | None = None) -> list[str]:
