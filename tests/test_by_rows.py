@@ -167,6 +167,18 @@ def test_the_kernel_of_a_step_against_float64(nesterov):
     torch.testing.assert_close(model.parameters()["opacities"].detach().double(), opacity, atol=2e-4, rtol=1e-3)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-38, 1e-29, 1e-22, 1e-18, 1e-15, 1e-12])
+def test_quaternions_of_any_length_stay_finite(size):
+    """The gradients of short ones are large, and their squares larger: those of the shortest are treated as zero."""
+    model = student()
+    with torch.no_grad():
+        model.parameters()["quats"][::2] *= size
+    optimizer = make_optimizer(model, recipe("default", 1 / 4), pixel=0.1)
+    for _ in range(3):
+        step_by_rows(model, optimizer)
+    assert all(raw.isfinite().all() for raw in model.parameters().values())
+
+
 def of(model, previous=None) -> ByRows | None:
     return ByRows.of(model, SteppingRenderer(BACKEND.stepper, [Effects(1)]), previous)
 

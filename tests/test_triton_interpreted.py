@@ -319,3 +319,17 @@ def test_a_step_moves_all_numbers_of_splats_without_bands():
     rates = dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1.0)
     stepper.step(AdamStep(raw, first, second, rates, betas=(0.9, 0.9), correction=1.0, eps=1e-8))
     assert all((raw[name] != before[name]).all() for name in raw)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-38, 1e-29, 1e-22, 1e-15])
+def test_steps_of_very_short_quaternions_are_finite(size):
+    """The squares of their gradients would overflow float32."""
+    g, view = gaussians(4, 0, dtype=torch.float32), camera(4, 4)
+    raw = {name: getattr(g, name).clone() for name in ("means", "quats", "scales", "opacities", "sh")}
+    raw["quats"] *= size
+    first, second = ({name: torch.zeros_like(tensor) for name, tensor in raw.items()} for _ in range(2))
+    stepper, rates = TritonBackend().stepper(raw), dict.fromkeys(("means", "quats", "scales", "opacities", "sh0", "shN"), 1e-3)
+    for _ in range(3):
+        stepper.differentiate(0, stepper.render(0, view, Effects(0)).image)
+        stepper.step(AdamStep(raw, first, second, rates, betas=(0.9, 0.9), correction=1.0, eps=1e-8))
+    assert all(tensor.isfinite().all() for tensor in raw.values())

@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Quaternions whose largest component is smaller are treated as zero: the gradient grows as the norm shrinks, and would overflow float32.
-LEAST_QUATERNION = 1e-30
+# Quaternions whose largest component is smaller are treated as zero, whose rotation is the identity: the gradient grows as the norm shrinks, and its
+# square, which Adam takes, would overflow float32. 3DGS draws them so too: it divides by 1e-12 at least (torch's `normalize`).
+LEAST_QUATERNION = 1e-15
 
 
 def rotations(quats: Tensor) -> Tensor:
@@ -37,7 +38,7 @@ def unit_quaternions(quats: Tensor) -> Tensor:
     Each is divided by its largest component first, so that squares do not overflow (as in `unit`).
     """
     largest = quats.detach().abs().amax(dim=1, keepdim=True)
-    is_zero = largest < torch.finfo(quats.dtype).tiny
+    is_zero = largest < LEAST_QUATERNION
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
     scaled = torch.where(is_zero, identity, quats / torch.where(is_zero, 1.0, largest))
     unit: Tensor = scaled / scaled.norm(dim=1, keepdim=True)

@@ -12,11 +12,15 @@ from mipmap_plugin.backends.cpu_kernels import inner, kernel
 from mipmap_plugin.backends.cpu_kernels.lanes import WIDTH, maximum, minimum, sqrt
 from mipmap_plugin.backends.cpu_kernels.memory import load, pointer, scratch, store
 from mipmap_plugin.backends.cpu_kernels.powers import exp2
+from mipmap_plugin.splatting.rotations import LEAST_QUATERNION
 
 LOG2E = 1 / math.log(2)
 
 # Powers of two within which `exp2` is defined: larger and smaller scales and opacities are not drawn any differently.
 LARGEST_POWER = 125.0
+
+# The squared norm of quaternions up to which they are treated as zero.
+LEAST_SQUARED = LEAST_QUATERNION**2
 
 new_rest = scratch(WIDTH, types.float32)
 
@@ -51,7 +55,7 @@ def through_activations(start, stop, splats, grads, raw):
         for k in range(4):
             along += d_quats[4 * i + k] * quats[4 * (start + i) + k]
             squared += np.float64(raw_quats[4 * (start + i) + k]) ** 2
-        per_norm = 1 / math.sqrt(squared) if squared > 0 else 0.0  # a zero quaternion is drawn as the identity, whatever its neighbors are
+        per_norm = 1 / math.sqrt(squared) if squared > LEAST_SQUARED else 0.0  # a zero quaternion is the identity, whatever its neighbors are
         for k in range(4):
             d_quats[4 * i + k] = (d_quats[4 * i + k] - along * quats[4 * (start + i) + k]) * per_norm
 
@@ -107,10 +111,10 @@ def activate(start, stop, raw, splats):
         squared = 0.0
         for k in range(4):
             squared += np.float64(quats[4 * i + k]) ** 2
-        per_norm = 1 / math.sqrt(squared) if squared > 0 else 0.0
+        per_norm = 1 / math.sqrt(squared) if squared > LEAST_SQUARED else 0.0
         for k in range(4):
             units[4 * i + k] = quats[4 * i + k] * per_norm
-        if squared == 0:
+        if squared <= LEAST_SQUARED:
             units[4 * i] = 1
 
 
