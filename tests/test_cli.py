@@ -11,6 +11,7 @@ import weakref
 from dataclasses import replace
 from pathlib import Path
 
+import moving
 import numpy as np
 import pressing
 import pytest
@@ -336,6 +337,12 @@ def test_render_says_that_no_view_shows_anything(run, tmp_path):
     code, out, err = run("render", tiny.ply(tmp_path / "a.ply"), "--output", tmp_path / "out", "--cameras", scene)
     assert (code, out) == (0, f"2 pictures in {tmp_path / 'out'}\n")
     assert "none of the 2 views shows a splat: the cameras seem to be of another scene" in " ".join(err.split())
+
+
+def test_render_says_that_a_viewer_draws_no_such_splats(run, tmp_path):
+    folder = moving.write_deformable(tmp_path / "moving")  # it comes with cameras
+    code, _, err = run("render", folder, "--output", tmp_path / "out", "--viewer", "spark")
+    assert code == 0 and "spark: a network moves its splats" in err and "what its settings would make of these splats" in " ".join(err.split())
 
 
 def test_render_refuses_names_that_are_not_there_and_pictures_that_are(run, model_folder, tmp_path):

@@ -70,6 +70,8 @@ def render(
     viewer = viewer or own_viewer
     if viewer is not None:
         wrapped.effects(zoom, filter_name, supersampling, viewer)  # check the options before any work
+        if own_viewer is None:
+            _tell_if_not_drawn(wrapped, viewer)
     outputs = [name for name, requested in {"depth": depth, "normals": normals}.items() if requested]
     told = [replace(camera, name=f"{camera.name}_t{camera.time:g}") for camera in views] if len(time) > 1 else views
     pictures = [output / name for name in picture_names(told)]
@@ -84,6 +86,14 @@ def render(
     say(", ".join([f"{count} in {output}", *[" ".join(taken), "which the file was adapted for"] * bool(taken)]))
     if place := base_cameras(wrapped, cameras):
         say(f"seen by the cameras of its base, in {place}; --cameras gives others")
+
+
+def _tell_if_not_drawn(wrapped: Wrapped, viewer: str) -> None:
+    """Warn of splats that no viewer draws: their pictures have its settings all the same."""
+    from mipmap_plugin.models.base import why_no_viewer
+
+    if reason := why_no_viewer(wrapped.model):
+        warnings.warn(f"{viewer}: {reason}; the pictures show what its settings would make of these splats", stacklevel=1)
 
 
 def _check(wrapped: Wrapped, views: Sequence[Camera], exposure: bool) -> None:
