@@ -110,6 +110,14 @@ def test_usd_has_its_own_sentence(tmp_path, ending):
         load_model(path)
 
 
+def test_a_project_of_supersplat_has_its_own_sentence(tmp_path):
+    with zipfile.ZipFile(path := tmp_path / "a.ssproj", "w") as archive:
+        archive.writestr("document.json", "{}")
+        archive.write(write_splats(tmp_path / "splat_0.ply"), "splat_0.ply")
+    with pytest.raises(CheckpointError, match="is a project of SuperSplat, .* export a PLY"):
+        load_model(path)
+
+
 def test_a_hierarchy_has_its_own_sentence(tmp_path):
     (tmp_path / "merged.hier").write_bytes(bytes(range(7)) * 9)
     with pytest.raises(CheckpointError, match=r"Hierarchical 3D Gaussians.*trained_chunks"):

@@ -135,6 +135,8 @@ def _why_not(files: Files) -> str:
         return f"{path} is LCC of XGRIDS, which is not read here; convert it: splat-transform {path.name} {path.stem}.ply"
     if path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz"):
         return f"{path} is USD, which is not read here; export a PLY from the program that made it"
+    if path.suffix.lower() == ".ssproj":
+        return f"{path} is a project of SuperSplat, which moves and tints its splats; open it there and export a PLY"
     if path.suffix == ".hier":
         chunk = "the PLY of one of its chunks (trained_chunks/<name>/point_cloud/iteration_<N>)"
         return f"{path} is a hierarchy of Hierarchical 3D Gaussians, whose splats follow the distance, which is not read here; give {chunk}"
