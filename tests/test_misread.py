@@ -114,7 +114,7 @@ def test_a_project_of_supersplat_has_its_own_sentence(tmp_path):
     with zipfile.ZipFile(path := tmp_path / "a.ssproj", "w") as archive:
         archive.writestr("document.json", "{}")
         archive.write(write_splats(tmp_path / "splat_0.ply"), "splat_0.ply")
-    with pytest.raises(CheckpointError, match="is a project of SuperSplat, .* export a PLY"):
+    with pytest.raises(CheckpointError, match=r"is a project of SuperSplat, .* export a PLY"):
         load_model(path)
 
 
