@@ -13,6 +13,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import gltf_files
 import numpy as np
 import pytest
 import tiny
@@ -26,6 +27,7 @@ from mipmap_plugin.formats.splat_transform import refuse_exchange, refuse_unread
 from mipmap_plugin.levels.tiles import write_tile
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
+from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.surfels import SurfelModel, flat_trained
 from mipmap_plugin.splatting.harmonics import basis
 from mipmap_plugin.splatting.projection import axes_of
@@ -421,6 +423,19 @@ def test_real_splats_survive_each_format(shared_data, tmp_path, ending):
         pytest.skip(str(error))
     saved = base.save(path, provenance={})
     assert (agree(base, load_model(saved), nearest=True) > 0.95).all()
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_gltf_of_spz_is_drawn_as_the_spz_says(tmp_path, tool, inside):
+    """By the extension of today, and by that of a draft."""
+    tiny.model(trained=TrainedScale(screen_filter="antialiased")).save(tool / "answer.ply", provenance={}, overwrite=True)
+    made, _ = gltf_files.document({})
+    compression = {"KHR_gaussian_splatting_compression_spz_2" if inside else "KHR_spz_gaussian_splats_compression": {"bufferView": 0}}
+    extensions = {"KHR_gaussian_splatting": {"extensions": compression}} if inside else compression
+    made["meshes"][0]["primitives"][0]["extensions"] = extensions
+    made |= {"bufferViews": [{"buffer": 0, "byteLength": len(SPZ)}], "buffers": [{"byteLength": len(SPZ)}]}
+    model = load_model(gltf_files.write_glb(tmp_path / "a.glb", made, SPZ))
+    assert len(model) == 60 and model.trained.screen_filter == "antialiased" and "SPZ in it rounds the trained values" in model.notes[1]
 
 
 @needs_tool

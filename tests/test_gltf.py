@@ -48,6 +48,19 @@ def sentence(path):
     return str(caught.value)
 
 
+def changed(made, *path, to):
+    """A copy with another value at a place."""
+    made = copy.deepcopy(made)
+    place = made
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = to
+    return made
+
+
+SAID = ("meshes", 0, "primitives", 0, "extensions", EXTENSION)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_splats_are_turned_to_the_frame_of_a_ply(tmp_path, degree):
     splats = tiny.gaussians(degree=degree)
@@ -113,7 +126,17 @@ def test_as_json_its_bytes_lie_beside_it_or_inside(tmp_path, inside):
     assert_moved(load_model(tmp_path).gaussians(), splats, HALF_TURN)
 
 
-def test_of_a_draft_colors_and_opacities_are_those_of_points_and_sizes_logarithms(tmp_path):
+@pytest.mark.parametrize("space", ["BT.709-sRGB", "BT.709"])
+def test_the_drafts_sizes_are_logarithms_and_their_colors_are_called_otherwise(tmp_path, space):
+    splats = tiny.gaussians()
+    named = gltf_files.attributes(splats)
+    named[f"{EXTENSION}:SCALE"] = np.log(named[f"{EXTENSION}:SCALE"])
+    made, data = gltf_files.document(named)
+    read = load_model(gltf_files.write_glb(tmp_path / "a.glb", changed(made, *SAID, "colorSpace", to=space), data)).gaussians()
+    assert_moved(read, splats, HALF_TURN)
+
+
+def test_the_first_drafts_colors_and_opacities_are_those_of_points(tmp_path):
     splats = tiny.gaussians(degree=0)
     splats = replace(splats, sh=splats.sh.clamp(-1.5, 1.5))
     named = gltf_files.attributes(splats)
@@ -122,6 +145,41 @@ def test_of_a_draft_colors_and_opacities_are_those_of_points_and_sizes_logarithm
     sizes = np.log(named[f"{EXTENSION}:SCALE"])
     drafted = {"POSITION": named["POSITION"], "_ROTATION": named[f"{EXTENSION}:ROTATION"], "_SCALE": sizes, "COLOR_0": colors}
     assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(drafted))).gaussians(), splats, HALF_TURN)
+
+
+def test_one_negative_size_does_not_make_logarithms_of_the_others(tmp_path):
+    splats = tiny.gaussians()
+    splats.scales[0, 0] = -1e-9
+    read = load_model(gltf_files.glb(tmp_path / "a.glb", splats)).gaussians()
+    torch.testing.assert_close(read.scales[1:], splats.scales[1:])
+
+
+def test_attributes_for_other_uses_are_not_read(tmp_path):
+    """A normal may have no bytes, which stands for zeros."""
+    splats = tiny.gaussians()
+    made, data = gltf_files.document(gltf_files.attributes(splats))
+    made["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = len(made["accessors"])
+    made["accessors"].append({"componentType": 5126, "type": "VEC3", "count": 60})
+    assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians(), splats, HALF_TURN)
+
+
+def test_a_zero_quaternion_turns_with_its_node(tmp_path):
+    splats = tiny.gaussians()
+    splats.quats[0] = 0
+    named = gltf_files.attributes(splats)
+    named[f"{EXTENSION}:ROTATION"] = np.nan_to_num(named[f"{EXTENSION}:ROTATION"])
+    made, data = gltf_files.document(named, nodes=[{"mesh": 0, "rotation": CYCLE}])
+    assert_moved(load_model(gltf_files.write_glb(tmp_path / "a.glb", made, data)).gaussians(), splats, HALF_TURN @ CYCLED)
+
+
+def test_the_digest_is_of_all_files(tmp_path):
+    made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians()))
+    made["buffers"][0]["uri"] = "a.bin"
+    (tmp_path / "a.gltf").write_text(json.dumps(made))
+    (tmp_path / "a.bin").write_bytes(data)
+    before = load_model(tmp_path / "a.gltf").digest
+    (tmp_path / "a.bin").write_bytes(bytes(12) + data[12:])  # another place of the first splat
+    assert load_model(tmp_path / "a.gltf").digest != before
 
 
 def test_certain_opacities_and_flat_splats_are_finite(tmp_path):
@@ -146,19 +204,6 @@ def test_meshes_without_splats(tmp_path):
     assert "is glTF without Gaussian splats" in sentence(gltf_files.write_glb(tmp_path / "a.glb", made, data))
 
 
-def changed(made, *path, to):
-    """A copy with another value at a place."""
-    made = copy.deepcopy(made)
-    place = made
-    for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = to
-    return made
-
-
-SAID = ("meshes", 0, "primitives", 0, "extensions", EXTENSION)
-
-
 @pytest.mark.parametrize(
     ("path", "to", "told"),
     [
@@ -176,6 +221,9 @@ SAID = ("meshes", 0, "primitives", 0, "extensions", EXTENSION)
         (("accessors", 0, "count"), 59, "its attributes do not fit each other"),
         (("accessors", 1, "type"), "VEC3", "its attributes do not fit each other"),
         (("accessors", 0, "bufferView"), 99, "is a damaged glTF file"),
+        (("bufferViews", 0, "buffer"), 1, "is a damaged glTF file"),
+        (("accessors", 0, "type"), "MAT9", "which lacks 'MAT9'"),
+        (("nodes",), [{"children": [*range(1, 102)]}, *[{"mesh": 0}] * 101], "101 nodes repeat its meshes"),
         (("buffers", 0, "uri"), "../a.bin", "does not lie in its folder"),
         (("buffers", 0, "uri"), "https://example.com/a.bin", "does not lie in its folder"),
     ],
@@ -183,6 +231,22 @@ SAID = ("meshes", 0, "primitives", 0, "extensions", EXTENSION)
 def test_what_is_not_read_is_said_in_a_sentence(tmp_path, path, to, told):
     made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians()))
     assert told in sentence(gltf_files.write_glb(tmp_path / "a.glb", changed(made, *path, to=to), data))
+
+
+def test_a_file_of_no_splats(tmp_path):
+    assert "holds no splats" in sentence(gltf_files.glb(tmp_path / "a.glb", tiny.gaussians(0)))
+
+
+@pytest.mark.parametrize("missing", ["SH_DEGREE_1_COEF_2", "SH_DEGREE_2_COEF_0"])
+def test_degrees_have_to_be_whole(tmp_path, missing):
+    named = gltf_files.attributes(tiny.gaussians(degree=3))
+    del named[f"{EXTENSION}:{missing}"]
+    assert "its degrees of spherical harmonics are not whole" in sentence(gltf_files.write_glb(tmp_path / "a.glb", *gltf_files.document(named)))
+
+
+def test_a_tileset_names_its_tiles(tmp_path):
+    (tmp_path / "tileset.json").write_text(json.dumps({"asset": {"version": "1.1"}, "geometricError": 1, "extensionsUsed": [EXTENSION]}))
+    assert "is the tileset of 3D Tiles; give one of its tiles" in sentence(tmp_path / "tileset.json")
 
 
 def test_missing_attributes_are_named(tmp_path):

@@ -88,12 +88,13 @@ def test_a_report_without_an_orbit_is_taken_as_one_of_before(files, orbit):
         ("Vertical Axis: z", Z),
         ("Exported from Brush\ncomment Vertical axis: y", None),
         ("Exported from Brush\ncomment Vertical axis: 0 -0.6 0.8", (0.0, -0.6, -0.8)),  # the third number is of what is down
+        ("Exported from Brush\ncomment Vertical axis: 0 -1 0", None),  # of one that said y
         ("Exported from Brush\ncomment Vertical axis: NaN 0 1", None),
         ("Exported from Brush\ncomment Vertical axis: 0 0 0", None),
         ("Exported from Brush\ncomment Vertical axis: up is there", None),
         ("Vertical axis: 0 -0.6 0.8", None),
     ],
-    ids=["nerfstudio", "Brush before", "Brush", "not a number", "nothing", "words", "another program"],
+    ids=["nerfstudio", "Brush before", "Brush", "Brush from before", "not a number", "nothing", "words", "another program"],
 )
 def test_a_header_tells_the_vertical_but_for_what_a_program_writes_into_every_file(tmp_path, comment, up):
     base = tiny.ply(tmp_path / "base.ply")

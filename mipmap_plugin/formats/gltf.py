@@ -26,6 +26,15 @@ SPLATTING = "KHR_gaussian_splatting"
 SPZ_INSIDE = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
 SPZ_ITSELF = "KHR_spz_gaussian_splats_compression"
 
+# Display colors, as the extension calls them, and as its drafts did.
+DISPLAY = ("srgb_rec709_display", "bt.709-srgb", "bt.709")
+
+# Attributes that splats are made of, after a prefix; files have others, for viewers that draw points.
+NEEDED = re.compile(r"POSITION|ROTATION|SCALE|OPACITY|COLOR_0|SH_DEGREE_\d+_COEF_\d+")
+
+# How often the nodes of a scene may repeat its meshes in the mean, each time as splats of their own: more would fill the memory.
+MOST_TIMES = 100
+
 # Codes of types of numbers and of vectors, the magic number of a GLB, and its two kinds of chunks.
 NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 LENGTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
@@ -42,41 +51,48 @@ class Splats:
     Attributes:
         matrix: [4, 4] f8, from their coordinates to those of the scene, which has y up.
         attributes: Arrays [N, ...] f4 by their names without a prefix: POSITION, ROTATION (xyzw), SCALE, OPACITY, SH_DEGREE_0_COEF_0, COLOR_0, ...
-        spz: The bytes of an SPZ file that holds them instead; empty: none does.
+        spz: The bytes of an SPZ file that holds them instead; None: none does.
     """
 
     matrix: np.ndarray
     attributes: dict[str, np.ndarray] = field(default_factory=dict)
-    spz: bytes = b""
+    spz: bytes | None = None
 
 
-def read_gltf(path: Path) -> list[Splats]:
-    """The splats of all primitives in a file's scene. Raises CheckpointError: it is damaged, has none, or keeps them in a way that is not read."""
+def read_gltf(path: Path) -> tuple[list[Splats], list[Path]]:
+    """The splats of all primitives in a file's scene, and the files that they are in.
+
+    Raises CheckpointError for a file that is damaged, has none, or keeps them in a way that is not read.
+    """
     try:
         document = _Document(path)
         splats = list(document.splats())
     except CheckpointError:
         raise
+    except KeyError as error:
+        raise CheckpointError(f"{path} is a damaged glTF file, which lacks {error}; download or export it again") from error
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read: {error.strerror or error}; check who may read it, and the files that it names") from error
     except DAMAGE as error:
         raise CheckpointError(f"{path} is a damaged glTF file ({brief(error)}); download or export it again") from error
     if not splats:
         raise CheckpointError(f"{path} is glTF without Gaussian splats ({SPLATTING}): meshes or points; give a trained model")
-    return splats
+    return splats, [path, *document.files]
 
 
 class _Document:
     def __init__(self, path: Path) -> None:
         self._path = path
-        text, self._binary = _chunks(path.read_bytes())
-        self._json: dict[str, Any] = json.loads(text)
-        self._buffers: dict[int, bytes] = {}
+        self.files: list[Path] = []  # besides that one
+        text, self._binary = _chunks(path)
+        self._json: dict[str, Any] = json.loads(bytes(text))
+        self._buffers: dict[int, memoryview] = {}
 
     def splats(self) -> Iterator[Splats]:
-        for node, matrix in self._nodes():
-            if "mesh" not in node:
-                continue
+        placed = [(node, matrix) for node, matrix in self._nodes() if "mesh" in node]
+        if len(placed) > MOST_TIMES * len(self._json.get("meshes", [])):
+            raise CheckpointError(f"{self._path}: {len(placed):,} nodes repeat its meshes, which is not read here; export it as a PLY")
+        for node, matrix in placed:
             for primitive in self._json["meshes"][node["mesh"]]["primitives"]:
                 extensions = primitive.get("extensions", {})
                 if SPLATTING in extensions or SPZ_ITSELF in extensions:
@@ -104,16 +120,16 @@ class _Document:
         inside = said.get("extensions", {})
         compression = next((inside[name] for name in SPZ_INSIDE if name in inside), extensions.get(SPZ_ITSELF))
         if compression is not None:
-            return Splats(matrix, spz=self._view(compression["bufferView"]))
-        named = {name.removeprefix(f"{SPLATTING}:").removeprefix("_"): self._array(index) for name, index in attributes.items()}
-        return Splats(matrix, named)
+            return Splats(matrix, spz=bytes(self._view(compression["bufferView"])))
+        named = {name.removeprefix(f"{SPLATTING}:").removeprefix("_"): index for name, index in attributes.items()}
+        return Splats(matrix, {name: self._array(index) for name, index in named.items() if NEEDED.fullmatch(name)})
 
     def _refuse(self, said: dict[str, Any]) -> None:
         """Raise CheckpointError for splats that are no Gaussians in display colors, as the extension's basis describes them."""
         if (kernel := said.get("kernel", "ellipse")) != "ellipse":
             raise CheckpointError(f"{self._path}: its splats have the kernel {kernel!r}, and only 'ellipse' is read; export it as a PLY of 3DGS")
-        if (space := said.get("colorSpace", "srgb_rec709_display")) != "srgb_rec709_display":
-            remedy = "export it with 'srgb_rec709_display', or as a PLY"
+        if (space := said.get("colorSpace", DISPLAY[0])).lower() not in DISPLAY:
+            remedy = f"export it with {DISPLAY[0]!r}, or as a PLY"
             raise CheckpointError(f"{self._path}: its colors are in {space!r}, which is not read here; {remedy}")
         known = (*SPZ_INSIDE, SPZ_ITSELF)
         if unknown := [name for name in said.get("extensions", {}) if name not in known and name in self._json.get("extensionsRequired", [])]:
@@ -138,7 +154,7 @@ class _Document:
             values = np.maximum(values / np.float32(np.iinfo(number).max), -1)
         return values[:, 0] if length == 1 else values
 
-    def _view(self, index: int) -> bytes:
+    def _view(self, index: int) -> memoryview:
         view = self._json["bufferViews"][index]
         start, length = view.get("byteOffset", 0), view["byteLength"]
         data = self._buffer(view["buffer"])[start : start + length]
@@ -146,39 +162,43 @@ class _Document:
             raise ValueError(f"buffer {view['buffer']} ends before its view {index}")
         return data
 
-    def _buffer(self, index: int) -> bytes:
+    def _buffer(self, index: int) -> memoryview:
         if index not in self._buffers:
             uri = self._json["buffers"][index].get("uri")
-            self._buffers[index] = self._binary if uri is None else self._from_uri(uri)
+            if uri is None and index:
+                raise ValueError(f"buffer {index} is nowhere")
+            self._buffers[index] = self._binary if uri is None else memoryview(self._from_uri(uri))
         return self._buffers[index]
 
     def _from_uri(self, uri: str) -> bytes:
-        if data := re.match(r"data:[^,]*;base64,", uri):
-            return base64.b64decode(uri[data.end() :])
+        if uri.startswith("data:"):
+            return base64.b64decode(uri[uri.index(";base64,") + len(";base64,") :])
         if any(sign in unquote(uri) for sign in "/\\:"):
             raise CheckpointError(f"{self._path}: its buffer {uri[:80]!r} does not lie in its folder; put it there, or export a .glb")
         file = self._path.with_name(unquote(uri))
         if not file.is_file():
             raise CheckpointError(f"{self._path} lacks its buffer {file.name}; put that file beside it, or export a .glb")
+        self.files.append(file)
         return file.read_bytes()
 
 
-def _chunks(data: bytes) -> tuple[bytes, bytes]:
+def _chunks(path: Path) -> tuple[memoryview, memoryview]:
     """The JSON and the binary chunk of a file; the latter is empty for a .gltf."""
-    if not data.startswith(MAGIC):
-        return data, b""
+    data = memoryview(path.read_bytes())
+    if data[:4] != MAGIC:
+        return data, data[:0]
     _, version, length = struct.unpack_from("<4sII", data)
     if version != 2:
-        raise ValueError(f"version {version}")
+        raise CheckpointError(f"{path} is glTF of version {version}, and only 2 is read; export it again")
     if length > len(data):
         raise ValueError(f"{len(data):,} of its {length:,} bytes are left")
-    found: dict[bytes, bytes] = {}
+    found: dict[bytes, memoryview] = {}
     place = 12
     while place + 8 <= length:
         size, kind = struct.unpack_from("<I4s", data, place)
         found.setdefault(kind, data[place + 8 : place + 8 + size])
         place += 8 + size
-    return found[JSON_CHUNK], found.get(BINARY_CHUNK, b"")
+    return found[JSON_CHUNK], found.get(BINARY_CHUNK, data[:0])
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
@@ -186,7 +206,8 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
         columns: np.ndarray = np.array(node["matrix"], np.float64).reshape(4, 4)
         return np.ascontiguousarray(columns.T)
-    x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    quat: np.ndarray = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    x, y, z, w = quat / np.linalg.norm(quat)
     turn = np.array([
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -55,7 +55,10 @@ def _refuse_placeholder(path: Path, head: bytes) -> None:
 
 
 def kind_of(path: Path) -> str:
-    """One of: ply, spz, sog, gsplat-png, zip, gzip, torch, torchscript, glb, ksplat, splat, unknown. Raises CheckpointError (`read_head`)."""
+    """One of: ply, spz, sog, gsplat-png, zip, gzip, torch, torchscript, glb, 3d-tiles, ksplat, splat, unknown.
+
+    Raises CheckpointError (`read_head`).
+    """
     head = read_head(path)
     if re.match(rb"ply\s", head):
         return "ply"
@@ -95,6 +98,8 @@ def _inflated(head: bytes) -> bytes:
 
 def _kind_of_json(head: bytes) -> str:
     """The type of a JSON file: an unpacked SOG lists images or parts, gsplat's PngCompression lists shapes, glTF names an extension."""
+    if b'"geometricError"' in head:
+        return "3d-tiles"
     if b"KHR_gaussian_splatting" in head:
         return "glb"
     if b".webp" in head or b"meta.json" in head:

@@ -22,6 +22,7 @@ _WEB_SPLAT = re.compile(r"(mip|kernel_size)=[\w.]+$")
 
 # nerfstudio names its vertical so. Brush's exports had the same comment with y, whatever is up in them; since July 2026 they have the least variance
 # of the cameras' places, of which the first two numbers are those of what is up, and the third is that of what is down (`estimate_up`, 018c949c).
+# One that goes on from an export with y has (0, -1, 0).
 _Z_UP = re.compile(r"vertical axis:\s*z\b", re.IGNORECASE)
 _OF_BRUSH = re.compile(r"vertical axis: (\S+) (\S+) (\S+)$", re.IGNORECASE)
 BRUSH = "Exported from Brush"
@@ -52,7 +53,7 @@ def vertical_of(comments: Iterable[str]) -> tuple[float, float, float] | None:
     except ValueError:
         return None
     length = math.hypot(x, y, down)
-    return (x / length, y / length, -down / length) if 0 < length < math.inf else None
+    return (x / length, y / length, -down / length) if 0 < length < math.inf and (x, y, down) != (0, -1, 0) else None
 
 
 def with_tags(comments: Iterable[str], screen_filter: str, provenance: dict[str, Any], eps2d: float | None = None) -> list[str]:

@@ -135,6 +135,8 @@ def _why_not(files: Files) -> str:
         return f"{path} is LCC of XGRIDS, which is not read here; convert it: splat-transform {path.name} {path.stem}.ply"
     if path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz"):
         return f"{path} is USD, which is not read here; export a PLY from the program that made it"
+    if kind == "3d-tiles":
+        return f"{path} is the tileset of 3D Tiles; give one of its tiles (.glb)"
     if path.suffix.lower() == ".ssproj":
         return f"{path} is a project of SuperSplat, which moves and tints its splats; open it there and export a PLY"
     if path.suffix == ".hier":

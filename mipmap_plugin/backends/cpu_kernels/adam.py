@@ -19,9 +19,6 @@ LOG2E = 1 / math.log(2)
 # Powers of two within which `exp2` is defined: larger and smaller scales and opacities are not drawn any differently.
 LARGEST_POWER = 125.0
 
-# The squared norm of quaternions up to which they are treated as zero.
-LEAST_SQUARED = LEAST_QUATERNION**2
-
 new_rest = scratch(WIDTH, types.float32)
 
 
@@ -51,11 +48,9 @@ def through_activations(start, stop, splats, grads, raw):
     for i in range(stop - start):
         opacity = opacities[start + i]
         d_opacities[i] *= opacity * (np.float32(1) - opacity)
-        along, squared = 0.0, 0.0
+        along, per_norm = 0.0, per_norm_of(raw_quats, start + i)
         for k in range(4):
             along += d_quats[4 * i + k] * quats[4 * (start + i) + k]
-            squared += np.float64(raw_quats[4 * (start + i) + k]) ** 2
-        per_norm = 1 / math.sqrt(squared) if squared > LEAST_SQUARED else 0.0  # a zero quaternion is the identity, whatever its neighbors are
         for k in range(4):
             d_quats[4 * i + k] = (d_quats[4 * i + k] - along * quats[4 * (start + i) + k]) * per_norm
 
@@ -108,14 +103,21 @@ def activate(start, stop, raw, splats):
         size = min(WIDTH, stop - i)
         store_some(opacities, i, size, 1 / (1 + exponential(0 - load_some(logits, i, size, rest))), rest)
     for i in range(start, stop):
-        squared = 0.0
-        for k in range(4):
-            squared += np.float64(quats[4 * i + k]) ** 2
-        per_norm = 1 / math.sqrt(squared) if squared > LEAST_SQUARED else 0.0
+        per_norm = per_norm_of(quats, i)
         for k in range(4):
             units[4 * i + k] = quats[4 * i + k] * per_norm
-        if squared <= LEAST_SQUARED:
+        if per_norm == 0:
             units[4 * i] = 1
+
+
+@inner
+def per_norm_of(quats, i):
+    """1 / norm of a quaternion; 0 for one that is treated as zero, which is the identity, whatever its neighbors are."""
+    largest, squared = 0.0, 0.0
+    for k in range(4):
+        largest = max(largest, abs(np.float64(quats[4 * i + k])))
+        squared += np.float64(quats[4 * i + k]) ** 2
+    return 1 / math.sqrt(squared) if largest >= LEAST_QUATERNION else 0.0
 
 
 @inner
