@@ -3,6 +3,7 @@
 from functools import partial
 
 import anchor_checkpoints
+import gltf_files
 import mip_checkpoints
 import moving
 import pytest
@@ -22,6 +23,7 @@ WRITERS = {
     "deformable": moving.write_deformable,
     "4dgs": moving.write_hexplane,
     "gsplat": lambda path: torch_checkpoints.gsplat_folder(path, torch_checkpoints.splats()),
+    "gltf": lambda path: gltf_files.glb(path, tiny.gaussians()),
     "splatfacto": lambda path: torch_checkpoints.splatfacto_folder(path, torch_checkpoints.splats()),
 }
 
