@@ -12,7 +12,10 @@ import tiny
 import torch
 from gltf_files import EXTENSION
 
-from mipmap_plugin.errors import CheckpointError
+from mipmap_plugin.cli import main
+from mipmap_plugin.errors import CheckpointError, OutputExists, SettingsError
+from mipmap_plugin.formats.gltf import read_gltf
+from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.models import detect, load_model
 from mipmap_plugin.models.adapted_name import adapted_name
 from mipmap_plugin.splatting.harmonics import basis
@@ -190,9 +193,40 @@ def test_certain_opacities_and_flat_splats_are_finite(tmp_path):
     assert len(model) == 60 and all(raw.isfinite().all() for raw in model.parameters().values())
 
 
-def test_what_is_adapted_from_it_is_a_ply(tmp_path):
+# What is written
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_is_written_is_read_again(tmp_path, degree):
+    """It is nothing but rounded once, and has y up."""
+    model = tiny.model(degree=degree)
+    before = model.gaussians()
+    written = model.save(tmp_path / "a.glb", provenance={})
+    [primitive], _ = read_gltf(written)
+    torch.testing.assert_close(torch.from_numpy(primitive.attributes["POSITION"]), before.means @ HALF_TURN)
+    assert_moved(load_model(written).gaussians(), before, torch.eye(3))
+    with pytest.raises(OutputExists):
+        model.save(written, provenance={})
+
+
+def test_high_bands_and_columns_have_no_place(tmp_path):
+    with pytest.warns(UserWarning, match="SH bands above degree 3 are dropped, which glTF has no place for"):
+        assert load_model(tiny.model(degree=4).save(tmp_path / "a.glb", provenance={})).sh_degree == 3
+
+
+@pytest.mark.parametrize(("viewer", "ending"), [(None, "_x0.25.glb"), ("three", "_x0.25_three.glb"), ("spark", "_x0.25_spark.ply")])
+def test_what_is_adapted_from_it_is_what_the_viewer_reads(tmp_path, viewer, ending):
     path = gltf_files.glb(tmp_path / "scan.glb", tiny.gaussians())
-    assert adapted_name(path, 1 / 4, "spark") == "scan_x0.25_spark.ply" and detect(tmp_path).family == "gltf"
+    assert adapted_name(path, 1 / 4, viewer) == f"scan{ending}" and detect(tmp_path).family == "gltf"
+
+
+def test_a_viewer_that_does_not_read_it_is_told_of(tmp_path):
+    words = ["adapt", str(tiny.folder(tmp_path / "base")), "--scale", "1/4", "--recipe", "instant", "--output", str(tmp_path / "a.glb")]
+    with pytest.warns(UserWarning, match=r"spark reads no \.glb"):
+        refuse_unread(tmp_path / "a.glb", ["spark", "three"])
+    with pytest.raises(SettingsError, match=r"spark reads no \.glb; give a \.ply by --output"):
+        refuse_unread(tmp_path / "a.glb", ["spark"])
+    assert main([*words, "--viewer", "three"]) == 0 and len(load_model(tmp_path / "a.glb")) > 0
 
 
 # What is refused

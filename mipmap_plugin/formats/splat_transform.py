@@ -30,8 +30,8 @@ EXCHANGE = {
     "compressed": ("compressed PLY", ".compressed.ply"),
 }
 
-# Suffixes of the formats that it writes.
-WRITTEN = (".spz", ".sog", ".compressed.ply")
+# Suffixes of the formats that are written: by it, but for GLB, which is written here.
+WRITTEN = (".spz", ".sog", ".compressed.ply", ".glb")
 READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
 # Suffix -> the oldest version of splat-transform that writes it: SOG, by itself or as a ladder with a lod-meta.json, needs the options of
@@ -54,6 +54,10 @@ NO_SPZ = {
     **dict.fromkeys(("antimatter15", "aframe", "gsplat-js"), "antimatter15/splat, aframe-gaussian-splatting and gsplat.js read no .spz"),
     "mip": "Mip-Splatting reads PLYs only, with a column filter_3D that .spz has no place for",
 }
+
+# Viewers that read GLB, and names for whatever draws as 3DGS does; three.js by an extension of its loader, Babylon.js by the package of its loaders.
+# Cesium draws no splats of a GLB but those of SPZ (`levels.tiles`).
+READ_GLB = ("playcanvas", "playcanvas-webgpu", "playcanvas-aa", "three", "babylon", "classic", "antialiased")
 
 # From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them
 # in the frame in which they are stored.
@@ -78,7 +82,9 @@ def is_written(path: Path) -> bool:
 
 
 def refuse_exchange(path: Path) -> list[str]:
-    """The command of splat-transform. Raises SettingsError, naming the output `path`, if it is not installed, or too old for this format."""
+    """The command of splat-transform; none for a GLB. Raises SettingsError, naming the output `path`, if it is not installed, or too old for it."""
+    if is_glb(path):
+        return []
     tool = find_tool()
     if tool is None:
         instead = "; or give a .ply" if is_written(path) else ""  # of a file; the name of a folder may have a dot
@@ -92,11 +98,14 @@ def refuse_exchange(path: Path) -> list[str]:
 
 def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
     """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read."""
-    without = [viewer for viewer in viewers if viewer in NO_SPZ]
-    if not without or not _is_spz(path):
+    if is_glb(path):
+        reasons = {viewer: f"{viewer} reads no .glb" for viewer in viewers if viewer not in READ_GLB}
+    else:
+        reasons = {viewer: NO_SPZ[viewer] for viewer in viewers if viewer in NO_SPZ and _is_spz(path)}
+    if not reasons:
         return
-    advice = f"{path}: {'; '.join(dict.fromkeys(NO_SPZ[viewer] for viewer in without))}; give a .ply by --output"
-    if len(without) == len(viewers):
+    advice = f"{path}: {'; '.join(dict.fromkeys(reasons.values()))}; give a .ply by --output"
+    if len(reasons) == len(viewers):
         raise SettingsError(advice)
     warnings.warn(f"{advice} if it is for these too", stacklevel=3)
 
@@ -180,11 +189,21 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
         ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
         plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
         write(plain)
+        if is_glb(path):
+            _write_glb(plain, temporary)
+            return path
         _settle_frame(tool, converted, plain)
         if reason := _run(tool, [plain], converted):
             raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
         shutil.copyfile(converted, temporary)
     return path
+
+
+def _write_glb(ply: Path, glb: Path) -> None:
+    from mipmap_plugin.formats.glb import write_glb  # and NumPy, without which options are read
+    from mipmap_plugin.formats.ply import read_ply
+
+    write_glb(glb, read_ply(ply).columns)
 
 
 def find_tool() -> list[str] | None:
@@ -239,6 +258,11 @@ def _settle_frame(tool: Sequence[str], file: Path, ply: Path) -> None:
         from mipmap_plugin.formats.half_turn import half_turned  # and NumPy, without which options are read
 
         half_turned(ply)
+
+
+def is_glb(path: Path) -> bool:
+    """Whether a path is that of a binary glTF."""
+    return path.name.lower().endswith(".glb")
 
 
 def _is_spz(path: Path) -> bool:

@@ -5,23 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 
 from mipmap_plugin.errors import MipmapPluginError
-from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_ONLY, WRITTEN
+from mipmap_plugin.formats.splat_transform import EXCHANGE, READ_GLB, READ_ONLY, WRITTEN
 from mipmap_plugin.models.detect import detect
 from mipmap_plugin.models.families import BUILT_IN, find_family
 from mipmap_plugin.models.family import Files
 from mipmap_plugin.models.zipped_folder import opened
 
+GLTF = (".glb", ".gltf")
 COMPRESSED = EXCHANGE["compressed"][1]
 
 
 def adapted_name(checkpoint: Path, scale: float, viewer: str | None = None) -> str:
     """NAME_x0.25 or NAME_x0.25_spark, with the ending of what is saved; none for a folder.
 
-    Exchange formats that can only be read are written as a PLY, as are glTF and a PLY in a zip archive, and files of third-party families
-    as these say (`Family.saves`), but for a viewer as a PLY. Files that other projects save with torch become a folder, as those of INRIA are.
+    Exchange formats that can only be read are written as a PLY, as is a PLY in a zip archive. glTF is written as .glb, but as a PLY for a viewer
+    that does not read that, and files of third-party families as these say (`Family.saves`), but as a PLY for any. Files that other projects save
+    with torch become a folder, as those of INRIA are.
     """
     name = checkpoint.resolve().name
-    read, written = _endings(checkpoint, name, for_viewer=viewer is not None)
+    read, written = _endings(checkpoint, name, viewer)
     return f"{name[: len(name) - len(read)]}_x{scale:g}{f'_{viewer}' if viewer else ''}{written}"
 
 
@@ -34,10 +36,12 @@ def _is_plain(checkpoint: Path) -> bool:
         return False
 
 
-def _endings(checkpoint: Path, name: str, *, for_viewer: bool) -> tuple[str, str]:
+def _endings(checkpoint: Path, name: str, viewer: str | None) -> tuple[str, str]:
     """The ending of a checkpoint's name, and that of the adapted file; "" for none."""
     if not checkpoint.is_file() and checkpoint.suffix != ".ply":
         return "", ""
+    if name.lower().endswith(GLTF):
+        return Path(name).suffix, ".glb" if viewer is None or viewer in READ_GLB else ".ply"
     if ending := next((known for known in (*WRITTEN, ".ply", *READ_ONLY) if name.lower().endswith(known)), ""):
         return ending, ".ply" if ending in READ_ONLY or (ending == COMPRESSED and _is_plain(checkpoint)) else ending
     try:
@@ -49,4 +53,4 @@ def _endings(checkpoint: Path, name: str, *, for_viewer: bool) -> tuple[str, str
     if family in BUILT_IN:
         return (Path(name).suffix, ".ply") if family.name in ("zipped", "gltf") else ("", "")
     own = Path(name).suffix if family.saves is None else family.saves
-    return Path(name).suffix, ".ply" if for_viewer else own
+    return Path(name).suffix, own if viewer is None else ".ply"

@@ -13,7 +13,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_written, refuse_as_folder
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_written, refuse_as_folder
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE
@@ -75,7 +75,8 @@ def without_place(path: Path, extras: Iterable[str], sh_degree: int = 0) -> str:
         return ""
     names = ", ".join(extras)
     lost = [f"the extra columns {names} are dropped, since {_ending(path)} has no place for them; a .ply has"] if names else []
-    lost += [f"SH bands above degree {MOST_BANDS} are dropped, which {TOOL} does not write; a .ply has them"] if sh_degree > MOST_BANDS else []
+    without = "glTF has no place for" if is_glb(path) else f"{TOOL} does not write"
+    lost += [f"SH bands above degree {MOST_BANDS} are dropped, which {without}; a .ply has them"] if sh_degree > MOST_BANDS else []
     return "; ".join(lost)
 
 

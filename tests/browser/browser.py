@@ -96,9 +96,9 @@ class Browser:
         self._server.shutdown()
 
     def open(self, viewer: str, ply: Path, **settings: Any) -> Page:
-        """`ply` in a viewer (a name of VIEWERS), which stays open; `settings` are the viewer's own, beside those of its name."""
+        """`ply`, or a .glb, in a viewer (a name of VIEWERS), which stays open; `settings` are the viewer's own, beside those of its name."""
         page, of_name = VIEWERS[viewer]
-        url = f"/files/{len(self._files)}.ply"
+        url = f"/files/{len(self._files)}{Path(ply).suffix}"
         self._files[url] = Path(ply)
         shown = self._started(page, {**of_name, **settings})
         _told(viewer, shown, "url => viewer.open(url)", url)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
@@ -140,6 +141,17 @@ def test_an_unbounded_scene_looks_as_we_say(browser: Browser, shared_data: Path,
     """Where many splats share a bucket of depth; with an exact order three.js has 39 dB."""
     flowers = wrap_model(shared_data / "checkpoints" / "flowers_r8")
     assert likeness(browser, viewer, flowers, at(flowers.cameras[:2], 1 / 4)) > UNBOUNDED.get(viewer, ALIKE)
+
+
+@pytest.mark.parametrize("viewer", ["playcanvas", "three"])
+def test_a_glb_looks_as_its_ply_turned_to_y_up(browser: Browser, viewer: str, tmp_path: Path) -> None:
+    base = embedded()
+    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
+    views = [view.zoomed(1 / 2) for view in base.cameras[::8][:3]]
+    ply = browser.open(viewer, base.model.source).draw(views, WHITE)
+    glb = base.model.save(tmp_path / "a.glb", provenance={})
+    turned = browser.open(viewer, glb).draw([replace(view, viewmat=view.viewmat @ turn) for view in views], WHITE)
+    assert min(map(psnr, ply, turned)) > ALIKE
 
 
 @pytest.mark.parametrize("viewer", VIEWERS)

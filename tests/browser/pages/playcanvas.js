@@ -16,7 +16,7 @@ export async function start({ device: type = 'webgl2', ...settings }) {
   const options = new pc.AppOptions()
   options.graphicsDevice = device
   options.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem]
-  options.resourceHandlers = [pc.GSplatHandler, pc.TextureHandler]
+  options.resourceHandlers = [pc.GSplatHandler, pc.TextureHandler, pc.ContainerHandler]
   const app = new pc.AppBase(canvas)
   app.init(options)
   app.setCanvasFillMode(pc.FILLMODE_NONE)
@@ -43,7 +43,7 @@ export async function start({ device: type = 'webgl2', ...settings }) {
         app.assets.remove(shown.asset)
         shown.asset.unload()
       }
-      const asset = new pc.Asset('splats', 'gsplat', { url })
+      const asset = new pc.Asset('splats', url.endsWith('.glb') ? 'container' : 'gsplat', { url })
       await new Promise((resolve, reject) => {
         asset.once('load', resolve)
         asset.once('error', (message) => reject(new Error(message)))
@@ -51,7 +51,7 @@ export async function start({ device: type = 'webgl2', ...settings }) {
         app.assets.load(asset)
       })
       const entity = new pc.Entity('splats')
-      entity.addComponent('gsplat', { asset, ...component })
+      entity.addComponent('gsplat', { asset: asset.resource.gsplats?.[0] ?? asset, ...component })
       app.root.addChild(entity)
       shown = { asset, entity }
     },

@@ -1,4 +1,6 @@
 import { Color, LinearSRGBColorSpace, PerspectiveCamera, Scene, WebGPURenderer } from 'three/webgpu'
+import { GLTFGaussianSplatLoaderExtension } from 'three/addons/loaders/GLTFGaussianSplatLoaderExtension.js'
+import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js'
 import { GaussianSplatPLYLoader } from 'three/addons/loaders/GaussianSplatPLYLoader.js'
 import { GaussianSplat } from 'three/addons/objects/GaussianSplat.js'
 import { canvas, pose, readPixels } from './common.js'
@@ -16,7 +18,8 @@ export async function start(settings) {
   return {
     async open(url) {
       if (splats) scene.remove(splats)
-      splats = new GaussianSplat(await new GaussianSplatPLYLoader().loadAsync(url), { autoSort: false })
+      splats = url.endsWith('.glb') ? await splatsOfGltf(url) : new GaussianSplat(await new GaussianSplatPLYLoader().loadAsync(url))
+      splats.autoSort = false
       splats.frustumCulled = false
       scene.add(splats)
     },
@@ -32,4 +35,10 @@ export async function start(settings) {
       return readPixels(renderer.backend.gl, view)
     },
   }
+}
+
+async function splatsOfGltf(url) {
+  const loader = new GLTFLoader().register((parser) => new GLTFGaussianSplatLoaderExtension(parser))
+  const { scene } = await loader.loadAsync(url)
+  return scene.getObjectByProperty('isGaussianSplat', true)
 }

@@ -1,0 +1,78 @@
+"""Writes splats as binary glTF (KHR_gaussian_splatting, KhronosGroup/glTF), which PlayCanvas, three.js and Babylon.js read. Nothing is rounded."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mipmap_plugin.formats.gltf import BINARY_CHUNK, DISPLAY, JSON_CHUNK, MAGIC, SPLATTING
+
+# glTF's code of float32, and what its vectors are called by their lengths.
+FLOAT, VECTORS = 5126, {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+
+def write_glb(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write the columns of a 3DGS PLY, [N] each and finite, as one mesh, turned by half a turn about z: glTF has y up, and a PLY mostly y down."""
+    named = {"POSITION": _stacked([-columns["x"], -columns["y"], columns["z"]])}
+    w, x, y, z = _unit(_stacked([columns[f"rot_{i}"] for i in range(4)])).T
+    named[f"{SPLATTING}:ROTATION"] = _stacked([-y, x, w, -z])  # half a turn about z, after the splat's own
+    named[f"{SPLATTING}:SCALE"] = np.exp(_stacked([columns[f"scale_{i}"] for i in range(3)]))
+    named[f"{SPLATTING}:OPACITY"] = _stacked([1 / (1 + np.exp(-columns["opacity"].astype(np.float64)))])
+    named[f"{SPLATTING}:SH_DEGREE_0_COEF_0"] = _stacked([columns[f"f_dc_{i}"] for i in range(3)])
+    bands = sum(name.startswith("f_rest_") for name in columns) // 3
+    for number in range(1, bands + 1):
+        degree = math.isqrt(number)
+        order = number - degree**2 - degree
+        sign = -1 if order % 2 else 1  # harmonics of odd orders are odd in x and y together
+        named[f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{degree + order}"] = _stacked(
+            [sign * columns[f"f_rest_{channel * bands + number - 1}"] for channel in range(3)]
+        )
+    _write(path, _document(named), list(named.values()))
+
+
+def _document(named: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """The JSON of one mesh with these attributes, whose bytes follow one another."""
+    starts = np.cumsum([0, *(array.nbytes for array in named.values())]).tolist()
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": number, "componentType": FLOAT, "count": len(array), "type": VECTORS[array.shape[1]]}
+        for number, array in enumerate(named.values())
+    ]
+    accessors[0] |= {"min": named["POSITION"].min(axis=0).tolist(), "max": named["POSITION"].max(axis=0).tolist()}
+    splatting = {"kernel": "ellipse", "colorSpace": DISPLAY[0], "sortingMethod": "cameraDistance", "projection": "perspective"}
+    primitive = {"mode": 0, "attributes": {name: number for number, name in enumerate(named)}, "extensions": {SPLATTING: splatting}}
+    return {
+        "asset": {"version": "2.0", "generator": "mipmap_plugin"}, "extensionsUsed": [SPLATTING],
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}], "accessors": accessors,
+        "bufferViews": [{"buffer": 0, "byteOffset": start, "byteLength": end - start} for start, end in pairwise(starts)],
+        "buffers": [{"byteLength": starts[-1]}],
+    }  # fmt: skip
+
+
+def _write(path: Path, document: dict[str, Any], arrays: list[np.ndarray]) -> None:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    size = document["buffers"][0]["byteLength"]
+    with path.open("wb") as file:
+        file.write(struct.pack("<4sII", MAGIC, 2, 12 + 8 + len(text) + 8 + size))
+        file.write(struct.pack("<I4s", len(text), JSON_CHUNK) + text)
+        file.write(struct.pack("<I4s", size, BINARY_CHUNK))
+        for array in arrays:
+            file.write(array.tobytes())
+
+
+def _stacked(columns: list[np.ndarray]) -> np.ndarray:
+    return np.stack(columns, axis=1).astype("<f4")
+
+
+def _unit(quats: np.ndarray) -> np.ndarray:
+    """Quaternions wxyz [N, 4] of length 1; a zero quaternion becomes the identity."""
+    length = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
+    unit: np.ndarray = np.where(length > 0, quats / np.where(length > 0, length, 1), (1.0, 0.0, 0.0, 0.0))
+    return unit
