@@ -257,7 +257,7 @@ def test_meshes_without_splats(tmp_path):
         (("accessors", 0, "bufferView"), 99, "is a damaged glTF file"),
         (("bufferViews", 0, "buffer"), 1, "is a damaged glTF file"),
         (("accessors", 0, "type"), "MAT9", "which lacks 'MAT9'"),
-        (("nodes",), [{"children": [*range(1, 102)]}, *[{"mesh": 0}] * 101], "101 nodes repeat its meshes"),
+        (("nodes",), [{"children": [*range(1, 102)]}, *[{"mesh": 0}] * 101], "its nodes repeat splats 101 times"),
         (("buffers", 0, "uri"), "../a.bin", "does not lie in its folder"),
         (("buffers", 0, "uri"), "https://example.com/a.bin", "does not lie in its folder"),
     ],

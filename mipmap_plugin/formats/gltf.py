@@ -32,7 +32,7 @@ DISPLAY = ("srgb_rec709_display", "bt.709-srgb", "bt.709")
 # Attributes that splats are made of, after a prefix; files have others, for viewers that draw points.
 NEEDED = re.compile(r"POSITION|ROTATION|SCALE|OPACITY|COLOR_0|SH_DEGREE_\d+_COEF_\d+")
 
-# How often the nodes of a scene may repeat its meshes in the mean, each time as splats of their own: more would fill the memory.
+# How often the nodes of a scene may repeat splats in the mean, each time as splats of their own: more would fill the memory.
 MOST_TIMES = 100
 
 # Codes of types of numbers and of vectors, the magic number of a GLB, and its two kinds of chunks.
@@ -89,14 +89,12 @@ class _Document:
         self._buffers: dict[int, memoryview] = {}
 
     def splats(self) -> Iterator[Splats]:
-        placed = [(node, matrix) for node, matrix in self._nodes() if "mesh" in node]
-        if len(placed) > MOST_TIMES * len(self._json.get("meshes", [])):
-            raise CheckpointError(f"{self._path}: {len(placed):,} nodes repeat its meshes, which is not read here; export it as a PLY")
-        for node, matrix in placed:
-            for primitive in self._json["meshes"][node["mesh"]]["primitives"]:
-                extensions = primitive.get("extensions", {})
-                if SPLATTING in extensions or SPZ_ITSELF in extensions:
-                    yield self._primitive(primitive["attributes"], extensions, matrix)
+        meshes = [list(filter(_is_of_splats, mesh["primitives"])) for mesh in self._json.get("meshes", [])]
+        placed = [(primitive, matrix) for node, matrix in self._nodes() if "mesh" in node for primitive in meshes[node["mesh"]]]
+        if len(placed) > MOST_TIMES * sum(map(len, meshes)):
+            raise CheckpointError(f"{self._path}: its nodes repeat splats {len(placed):,} times, which is not read here; export it as a PLY")
+        for primitive, matrix in placed:
+            yield self._primitive(primitive["attributes"], primitive["extensions"], matrix)
 
     def _nodes(self) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
         """The nodes of the scene, each with its matrix to the scene; all nodes that no other holds where there is no scene."""
@@ -180,6 +178,10 @@ class _Document:
             raise CheckpointError(f"{self._path} lacks its buffer {file.name}; put that file beside it, or export a .glb")
         self.files.append(file)
         return file.read_bytes()
+
+
+def _is_of_splats(primitive: dict[str, Any]) -> bool:
+    return bool({SPLATTING, SPZ_ITSELF} & primitive.get("extensions", {}).keys())
 
 
 def _chunks(path: Path) -> tuple[memoryview, memoryview]:
