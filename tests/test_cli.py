@@ -340,8 +340,8 @@ def test_render_says_that_no_view_shows_anything(run, tmp_path):
 
 
 def test_render_says_that_a_viewer_draws_no_such_splats(run, tmp_path):
-    folder = moving.write_deformable(tmp_path / "moving")  # it comes with cameras
-    code, _, err = run("render", folder, "--output", tmp_path / "out", "--viewer", "spark")
+    folder, scene = moving.write_deformable(tmp_path / "moving"), write_cameras(tmp_path / "cameras.json", tiny.cameras(1))
+    code, _, err = run("render", folder, "--output", tmp_path / "out", "--viewer", "spark", "--cameras", scene, "--backend", "reference")
     assert code == 0 and "spark: a network moves its splats" in err and "what its settings would make of these splats" in " ".join(err.split())
 
 
