@@ -438,6 +438,22 @@ def test_gltf_of_spz_is_drawn_as_the_spz_says(tmp_path, tool, inside):
     assert len(model) == 60 and model.trained.screen_filter == "antialiased" and "SPZ in it rounds the trained values" in model.notes[1]
 
 
+@pytest.mark.parametrize("screen_filter", ["classic", "antialiased"])
+def test_meshes_of_gltf_have_to_be_drawn_alike(tmp_path, tool, screen_filter):
+    """One is SPZ, whose converted header has comments, the other is not, and is drawn as 3DGS does."""
+    tiny.model(trained=TrainedScale(screen_filter=screen_filter)).save(tool / "answer.ply", provenance={}, overwrite=True)
+    made, data = gltf_files.document(gltf_files.attributes(tiny.gaussians(10)))
+    compression = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": len(made["bufferViews"])}}
+    splats = {"attributes": {}, "extensions": {"KHR_gaussian_splatting": {"extensions": compression}}}
+    made["meshes"][0]["primitives"].append(splats)
+    made["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": len(SPZ)})
+    path = gltf_files.write_glb(tmp_path / "a.glb", made, data + SPZ)
+    if screen_filter == "classic":
+        assert len(load_model(path)) == 70
+    else:
+        assert "its meshes are to be drawn in different ways" in sentence(path)
+
+
 @needs_tool
 def test_a_tile_is_read_as_the_splats_that_it_was_made_of(shared_data, tmp_path):
     """glTF of SPZ, whose node turns it."""

@@ -222,10 +222,11 @@ def test_what_is_adapted_from_it_is_what_the_viewer_reads(tmp_path, viewer, endi
 
 def test_a_viewer_that_does_not_read_it_is_told_of(tmp_path):
     words = ["adapt", str(tiny.folder(tmp_path / "base")), "--scale", "1/4", "--recipe", "instant", "--output", str(tmp_path / "a.glb")]
-    with pytest.warns(UserWarning, match=r"spark reads no \.glb"):
+    with pytest.warns(UserWarning, match="spark reads no splats in glTF"):
         refuse_unread(tmp_path / "a.glb", ["spark", "three"])
-    with pytest.raises(SettingsError, match=r"spark reads no \.glb; give a \.ply by --output"):
+    with pytest.raises(SettingsError, match=r"spark reads no splats in glTF; give a \.ply by --output"):
         refuse_unread(tmp_path / "a.glb", ["spark"])
+    refuse_unread(tmp_path / "a.glb", ["kiosk"])  # of a package, of which nothing is known
     assert main([*words, "--viewer", "three"]) == 0 and len(load_model(tmp_path / "a.glb")) > 0
 
 

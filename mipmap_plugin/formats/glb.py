@@ -1,4 +1,4 @@
-"""Writes splats as binary glTF (KHR_gaussian_splatting, KhronosGroup/glTF), which PlayCanvas, three.js and Babylon.js read. Nothing is rounded."""
+"""Writes splats as binary glTF (KHR_gaussian_splatting, KhronosGroup/glTF) in float32, which PlayCanvas, three.js and Babylon.js read."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from mipmap_plugin.formats.atomic import new_file
 from mipmap_plugin.formats.gltf import BINARY_CHUNK, DISPLAY, JSON_CHUNK, MAGIC, SPLATTING
 
 # glTF's code of float32, and what its vectors are called by their lengths.
 FLOAT, VECTORS = 5126, {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
-def write_glb(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Write the columns of a 3DGS PLY, [N] each and finite, as one mesh, turned by half a turn about z: glTF has y up, and a PLY mostly y down."""
+def write_glb(path: Path, columns: Mapping[str, np.ndarray], *, overwrite: bool = False) -> Path:
+    """Write the columns of a 3DGS PLY, [N] each and finite, as one mesh, atomically; return `path`. Raises OutputExists, OutputError.
+
+    All is turned by half a turn about z: glTF has y up, and a PLY mostly y down.
+    """
     named = {"POSITION": _stacked([-columns["x"], -columns["y"], columns["z"]])}
     w, x, y, z = _unit(_stacked([columns[f"rot_{i}"] for i in range(4)])).T
     named[f"{SPLATTING}:ROTATION"] = _stacked([-y, x, w, -z])  # half a turn about z, after the splat's own
@@ -34,7 +38,19 @@ def write_glb(path: Path, columns: Mapping[str, np.ndarray]) -> None:
         named[f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{degree + order}"] = _stacked(
             [sign * columns[f"f_rest_{channel * bands + number - 1}"] for channel in range(3)]
         )
-    _write(path, _document(named), list(named.values()))
+    with new_file(path, overwrite) as temporary, temporary.open("wb") as file:
+        file.write(before_binary(_document(named), sum(array.nbytes for array in named.values())))
+        for array in named.values():
+            file.write(array.tobytes())
+    return path
+
+
+def before_binary(document: dict[str, Any], size: int) -> bytes:
+    """What a GLB begins with: all before its binary chunk, of `size` bytes, a multiple of 4."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", MAGIC, 2, 12 + 8 + len(text) + 8 + size)
+    return head + struct.pack("<I4s", len(text), JSON_CHUNK) + text + struct.pack("<I4s", size, BINARY_CHUNK)
 
 
 def _document(named: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -53,18 +69,6 @@ def _document(named: Mapping[str, np.ndarray]) -> dict[str, Any]:
         "bufferViews": [{"buffer": 0, "byteOffset": start, "byteLength": end - start} for start, end in pairwise(starts)],
         "buffers": [{"byteLength": starts[-1]}],
     }  # fmt: skip
-
-
-def _write(path: Path, document: dict[str, Any], arrays: list[np.ndarray]) -> None:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    size = document["buffers"][0]["byteLength"]
-    with path.open("wb") as file:
-        file.write(struct.pack("<4sII", MAGIC, 2, 12 + 8 + len(text) + 8 + size))
-        file.write(struct.pack("<I4s", len(text), JSON_CHUNK) + text)
-        file.write(struct.pack("<I4s", size, BINARY_CHUNK))
-        for array in arrays:
-            file.write(array.tobytes())
 
 
 def _stacked(columns: list[np.ndarray]) -> np.ndarray:

@@ -30,7 +30,7 @@ EXCHANGE = {
     "compressed": ("compressed PLY", ".compressed.ply"),
 }
 
-# Suffixes of the formats that are written: by it, but for GLB, which is written here.
+# Suffixes of the formats that are written: by it, but for GLB (`formats.glb`).
 WRITTEN = (".spz", ".sog", ".compressed.ply", ".glb")
 READ_ONLY = tuple(ending for _, ending in EXCHANGE.values() if ending not in WRITTEN)
 
@@ -55,9 +55,17 @@ NO_SPZ = {
     "mip": "Mip-Splatting reads PLYs only, with a column filter_3D that .spz has no place for",
 }
 
-# Viewers that read GLB, and names for whatever draws as 3DGS does; three.js by an extension of its loader, Babylon.js by the package of its loaders.
-# Cesium draws no splats of a GLB but those of SPZ (`levels.tiles`).
+# Viewers that read a .glb as it is written here, and names for whatever draws as 3DGS does: three.js by an extension of its loader, Babylon.js by the
+# package of its loaders. And viewers that do not, by their source; of others neither is known.
 READ_GLB = ("playcanvas", "playcanvas-webgpu", "playcanvas-aa", "three", "babylon", "classic", "antialiased")
+NO_GLB = {
+    **{
+        viewer: f"{viewer} reads no splats in glTF"
+        for viewer in ("spark", "gaussian-splats-3d", "gsplat-js", "antimatter15", "aframe", "mip", "brush", "web-splat", "visionary",
+                       "metalsplatter", "vk-gaussian-splatting", "splatapult", "gdgs", "3dgs.cpp")
+    },
+    "cesium": "Cesium draws no splats in glTF but SPZ, as levels --tiles writes them",
+}  # fmt: skip
 
 # From 2.1 until 3.0, splat-transform turned splats by half a turn about x when it read SPZ and when it wrote it; before and since, it leaves them
 # in the frame in which they are stored.
@@ -82,9 +90,7 @@ def is_written(path: Path) -> bool:
 
 
 def refuse_exchange(path: Path) -> list[str]:
-    """The command of splat-transform; none for a GLB. Raises SettingsError, naming the output `path`, if it is not installed, or too old for it."""
-    if is_glb(path):
-        return []
+    """The command of splat-transform. Raises SettingsError, naming the output `path`, if it is not installed, or too old for this format."""
     tool = find_tool()
     if tool is None:
         instead = "; or give a .ply" if is_written(path) else ""  # of a file; the name of a folder may have a dot
@@ -98,10 +104,8 @@ def refuse_exchange(path: Path) -> list[str]:
 
 def refuse_unread(path: Path, viewers: Sequence[str]) -> None:
     """Raise SettingsError for an output that none of the viewers it is made for reads; warn of one that only some of them read."""
-    if is_glb(path):
-        reasons = {viewer: f"{viewer} reads no .glb" for viewer in viewers if viewer not in READ_GLB}
-    else:
-        reasons = {viewer: NO_SPZ[viewer] for viewer in viewers if viewer in NO_SPZ and _is_spz(path)}
+    unread = NO_GLB if is_glb(path) else NO_SPZ if _is_spz(path) else {}
+    reasons = {viewer: unread[viewer] for viewer in viewers if viewer in unread}
     if not reasons:
         return
     advice = f"{path}: {'; '.join(dict.fromkeys(reasons.values()))}; give a .ply by --output"
@@ -189,21 +193,11 @@ def write_exchange(path: Path, write: Callable[[Path], Any], *, overwrite: bool)
         ending = next(suffix for suffix in WRITTEN if path.name.lower().endswith(suffix))
         plain, converted = Path(folder, "plain.ply"), Path(folder, f"made{ending}")
         write(plain)
-        if is_glb(path):
-            _write_glb(plain, temporary)
-            return path
         _settle_frame(tool, converted, plain)
         if reason := _run(tool, [plain], converted):
             raise OutputError(f"{path}: {TOOL} does not write it ({reason})")
         shutil.copyfile(converted, temporary)
     return path
-
-
-def _write_glb(ply: Path, glb: Path) -> None:
-    from mipmap_plugin.formats.glb import write_glb  # and NumPy, without which options are read
-    from mipmap_plugin.formats.ply import read_ply
-
-    write_glb(glb, read_ply(ply).columns)
 
 
 def find_tool() -> list[str] | None:

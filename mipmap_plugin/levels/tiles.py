@@ -11,7 +11,6 @@ wants a matrix, and no rotation, in the node.
 from __future__ import annotations
 
 import gzip
-import json
 import shutil
 import struct
 from functools import partial
@@ -25,7 +24,8 @@ from torch import Tensor
 from mipmap_plugin.camera import ONE_PIXEL
 from mipmap_plugin.errors import TEMPORARY
 from mipmap_plugin.formats.atomic import new_folder, write_json
-from mipmap_plugin.formats.gltf import BINARY_CHUNK, JSON_CHUNK, MAGIC, SPLATTING, SPZ_INSIDE
+from mipmap_plugin.formats.glb import FLOAT, before_binary
+from mipmap_plugin.formats.gltf import SPLATTING, SPZ_INSIDE
 from mipmap_plugin.formats.splat_transform import write_exchange
 from mipmap_plugin.levels.exported import readable
 from mipmap_plugin.levels.manifest import read_manifest
@@ -48,8 +48,7 @@ EXTENSIONS = {"extensionsUsed": [SPLATTING, COMPRESSION], "extensionsRequired": 
 # The header of an SPZ file, inside its gzip: magic number, version, count of splats, SH degree (github.com/nianticlabs/spz, 3).
 SPZ_HEADER = struct.Struct("<IIIB")
 
-# glTF 2.0: the codes of types of numbers.
-BYTE, FLOAT = 5121, 5126
+BYTE = 5121  # glTF 2.0's code of that type of numbers
 
 # Standard deviations at which a splat ends, for bounding boxes.
 REACH = 3.0
@@ -111,10 +110,8 @@ def glb(spz: bytes, low: list[float], high: list[float]) -> bytes:
         "meshes": [{"primitives": [primitive]}], "accessors": accessors,
         "bufferViews": [{"buffer": 0, "byteLength": len(spz)}], "buffers": [{"byteLength": len(spz)}],
     }  # fmt: skip
-    text = json.dumps(document).encode()
-    chunks = [(JSON_CHUNK, text + b" " * (-len(text) % 4)), (BINARY_CHUNK, spz + b"\0" * (-len(spz) % 4))]
-    body = b"".join(struct.pack("<I4s", len(content), kind) + content for kind, content in chunks)
-    return struct.pack("<4sII", MAGIC, 2, 12 + len(body)) + body
+    binary = spz + b"\0" * (-len(spz) % 4)
+    return before_binary(document, len(binary)) + binary
 
 
 def write_tiles(folder: Path, *, overwrite: bool = False) -> Path:

@@ -34,20 +34,21 @@ def load_gltf(path: str | Path, *, iteration: int | None = None) -> VanillaModel
     """Load the splats of a .glb or .gltf, in the frame of a PLY. Raises CheckpointError."""
     file = detect_as(path, ("gltf",), iteration=iteration).path
     primitives, files = read_gltf(file)
-    parts, comments = [], set[tuple[str, ...]]()
+    parts, comments = [], list[tuple[str, ...]]()
     for splats in primitives:
         raw, said = (_raw(splats.attributes, file), ()) if splats.spz is None else _from_spz(splats.spz, file)
         parts.append(_placed(raw, FROM_SCENE @ splats.matrix, file))
-        comments.add(said)
-    if len(comments) > 1:
+        comments.append(said)
+    trained = {trained_scale({}, said) for said in comments}
+    if len(trained) > 1:
         raise CheckpointError(f"{file}: its meshes are to be drawn in different ways, which is not read here; export them one by one")
-    parameters, said = _joined(parts), comments.pop()
+    parameters = _joined(parts)
     if not len(parameters["means"]):
         raise CheckpointError(f"{file} holds no splats; export it again")
     notes = ["read from glTF, and turned from y up to the frame of a PLY"]
-    notes += ["SPZ in it rounds the trained values: the base is what its viewers show"] if primitives[0].spz is not None else []
-    origin = Origin(file, sha256(*files), comments=said)
-    return without_invalid(VanillaModel(parameters, trained_scale({}, said), origin, notes))
+    notes += ["SPZ in it rounds the trained values: the base is what its viewers show"] if any(each.spz is not None for each in primitives) else []
+    origin = Origin(file, sha256(*files), comments=max(comments, key=len))
+    return without_invalid(VanillaModel(parameters, trained.pop(), origin, notes))
 
 
 def _raw(attributes: dict[str, np.ndarray], file: Path) -> dict[str, Tensor]:

@@ -13,7 +13,7 @@ from mipmap_plugin.errors import OutputExists, SettingsError
 from mipmap_plugin.formats.atomic import absolute, named, refuse_output, refuse_to_lose
 from mipmap_plugin.formats.magic import kind_of
 from mipmap_plugin.formats.ply import read_header
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_written, refuse_as_folder
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, TOOL, is_glb, is_written, refuse_as_folder, refuse_exchange
 from mipmap_plugin.formats.tags import provenance_of
 from mipmap_plugin.models.base import TrainedScale
 from mipmap_plugin.models.places import CONVERTED, PARTS, REPORT, STATE
@@ -62,11 +62,13 @@ def _is_of_a_training(ply: Path) -> bool:
     return kind_of(ply) == "ply" and provenance_of(read_header(ply).comments) is None
 
 
-def refuse_own_filter(path: Path, trained: TrainedScale) -> None:
-    """Raise SettingsError for an exchange format at `path` if the splats need the screen filter of their training."""
+def refuse_format(path: Path, trained: TrainedScale) -> None:
+    """Raise SettingsError for an exchange format at `path` if the splats need the screen filter of their training, or if it cannot be written."""
     if trained.keeps_filter:
         own = f"the filter of their own project ({trained.screen_filter}, {trained.eps2d:g} px²)"
         raise SettingsError(f"{path}: these splats need {own}; give a .ply or a folder, or adapt for a viewer if the family allows it")
+    if not is_glb(path):
+        refuse_exchange(path)
 
 
 def without_place(path: Path, extras: Iterable[str], sh_degree: int = 0) -> str:

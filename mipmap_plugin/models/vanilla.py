@@ -16,8 +16,9 @@ from torch import Tensor
 from mipmap_plugin.camera import Camera
 from mipmap_plugin.errors import SettingsError, ShapeError
 from mipmap_plugin.formats.atomic import sha256
+from mipmap_plugin.formats.glb import write_glb
 from mipmap_plugin.formats.ply import read_ply, write_ply
-from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_written, refuse_exchange, write_exchange
+from mipmap_plugin.formats.splat_transform import MOST_BANDS, is_glb, is_written, write_exchange
 from mipmap_plugin.formats.tags import recorded_filter, render_mode, with_tags
 from mipmap_plugin.gaussians import Gaussians
 from mipmap_plugin.models.base import TrainedScale, Traits
@@ -27,7 +28,7 @@ from mipmap_plugin.models.exposure import NO_EXPOSURES, Exposures, read_exposure
 from mipmap_plugin.models.health import LARGEST, without_invalid
 from mipmap_plugin.models.hosts import Capture, Host
 from mipmap_plugin.models.inria_folder import cfg_args_for, companion_notes, read_options, trained_scale, write_folder
-from mipmap_plugin.models.outputs import finite, refuse_own_filter, refuse_parts, without_place
+from mipmap_plugin.models.outputs import finite, refuse_format, refuse_parts, without_place
 from mipmap_plugin.models.raw import check, log, logit, moved, raw_parameters
 from mipmap_plugin.splatting.bands import joined, neighbors
 from mipmap_plugin.splatting.rotations import unit_quaternions
@@ -213,10 +214,11 @@ class VanillaModel:
         parameters = finite(self._parameters, LARGEST)
         comments = with_tags(self._origin.comments, self.trained.screen_filter, provenance, self.trained.eps2d)
         if is_written(path):
-            refuse_own_filter(path, self.trained)
             if lost := without_place(path, self._origin.extras, self.sh_degree):
                 warnings.warn(lost, stacklevel=2)
             exchanged = self._columns(parameters | {"shN": parameters["shN"][:, : (MOST_BANDS + 1) ** 2 - 1]})
+            if is_glb(path):
+                return write_glb(path, exchanged, overwrite=overwrite)
             return write_exchange(path, lambda ply: write_ply(ply, exchanged, comments), overwrite=overwrite)
         if self._origin.host and path.suffix.lower() != ".ply":
             return self._origin.host.write(path, parameters, comments, overwrite=overwrite)
@@ -234,8 +236,7 @@ class VanillaModel:
     def refuse_output(self, path: Path, *, overwrite: bool, networks_move: bool = False) -> None:
         """Check `path` as `save` would. Raises OutputExists, OutputError, SettingsError."""
         if is_written(path):
-            refuse_own_filter(path, self.trained)
-            refuse_exchange(path)
+            refuse_format(path, self.trained)
         is_file = path.suffix.lower() == ".ply" or is_written(path)
         host = None if is_file else self._origin.host
         holds = host.holds(path) if host else None if is_file else "point_cloud"
