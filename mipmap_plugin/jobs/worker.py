@@ -22,6 +22,9 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
 # A job whose worker dies is begun again this many times in all, and continues where its state was last saved.
 ATTEMPTS = 2
 
+# The exit code of a process that the system killed: less than nothing by the number of SIGKILL, a name that Windows lacks.
+KILLED = -9
+
 
 class WorkerDied(RuntimeError):
     """A worker ended in the middle of a job."""
@@ -63,7 +66,7 @@ class Worker:
     def stop(self) -> None:
         """Begin no other job, and let the running one save its state and end."""
         self.stopped = True
-        if self._process is not None and self._process.poll() is None:
+        if self._process is not None and self._process.poll() is None and os.name != "nt":  # on Windows, all of a console hear Ctrl-C
             self._process.send_signal(signal.SIGINT)
 
     def close(self) -> None:
@@ -81,7 +84,7 @@ class Worker:
             return WorkerDied("the worker was stopped")
         code = process.wait()
         _close(process)
-        if code == -signal.SIGKILL:
+        if code == KILLED:
             return WorkerDied("the process that did it was killed, perhaps for want of memory; run fewer jobs at a time")
         return WorkerDied(f"the process that did it ended with {f'signal {-code}' if code < 0 else f'exit code {code}'}")
 
