@@ -420,6 +420,17 @@ def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, mod
     refused(run("evaluate", model_folder, "--images", *scenes, "--scale", "1/4"), "--images is given 2 times")
 
 
+def test_a_lone_file_is_judged_by_photographs_with_the_cameras_that_are_given(run, tmp_path):
+    scene, lone = tiny.scene(tmp_path / "scene", train=tiny.cameras(2)), tiny.ply(tmp_path / "a.ply")
+    words = ["--images", scene, "--scale", "1/2", "--no-report", "--json"]
+    code, out, err = run("evaluate", lone, *words, "--cameras", scene)
+    assert code == 0 and {row["name"] for row in json.loads(out)["rows"]} > {"base", "scaled"}, err
+    refused(run("evaluate", lone, *words), "its base scale is not known; give its model folder, or its cameras (--cameras)")
+    quick = ["--output", tmp_path / "out", "--recipe", "instant", "--no-picture", "--no-renderers", "--repeats", "1", "--supersampling", "2"]
+    assert run("tradeoff", lone, "--images", scene, "--scale", "1/2", *quick, "--cameras", scene)[0] == 0
+    refused(run("evaluate", lone, *words, "--cameras", scene, scene), "give one --cameras PATH for each checkpoint: --cameras is given 2 times")
+
+
 def test_evaluate_refuses_what_cannot_be_judged(run, model_folder, tmp_path):
     scene = tiny.scene(tmp_path / "scene")
     refused(run("evaluate", tiny.ply(tmp_path / "a.ply"), "--images", scene, "--scale", "1"), "has no cameras, so its base scale is not known")

@@ -11,6 +11,7 @@ from ply_files import splat_columns, write, write_model_folder, write_splats
 
 from mipmap_plugin.errors import CheckpointError
 from mipmap_plugin.formats.cfg_args import format_cfg_args, read_cfg_args
+from mipmap_plugin.formats.magic import SPLAT_RECORD
 from mipmap_plugin.models import load_model
 from mipmap_plugin.models.detect import detect
 
@@ -113,6 +114,17 @@ def test_a_damaged_file_of_splats_is_called_so(tmp_path, name):
     file.write_bytes(random.Random(1).randbytes(320))
     with pytest.raises(CheckpointError, match=rf"{name} is damaged, cut off or no {file.suffix.lower()} file; download or export it again"):
         detect(file)
+
+
+@pytest.mark.parametrize(("quat", "scale"), [((255, 0, 0, 0), 0.01), ((0, 0, 0, 0), 0.01), ((128, 128, 128, 128), 0.01), ((255, 128, 128, 128), 0)])
+def test_a_splat_file_may_have_quaternions_of_any_length_and_sizes_of_zero(tmp_path, quat, scale):
+    rows = np.zeros(20, SPLAT_RECORD)
+    rows["scale"], rows["quat"], rows["color"] = scale, quat, 255
+    rows.tofile(tmp_path / "points.splat")
+    rows.tofile(tmp_path / "points.bin")  # without its name it could be anything
+    assert detect(tmp_path / "points.splat").family == "exchange"
+    with pytest.raises(CheckpointError, match="no checkpoint that is known here"):
+        detect(tmp_path / "points.bin")
 
 
 def test_a_capture_in_lcc_is_converted_first(tmp_path):

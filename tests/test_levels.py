@@ -17,7 +17,7 @@ import torch
 from mipmap_plugin import cli, load_model, recipes, wrap_model
 from mipmap_plugin.adaptation.optimization.run import Run
 from mipmap_plugin.adaptation.optimization.validation import Quality
-from mipmap_plugin.adaptation.report import AS_IT_IS
+from mipmap_plugin.adaptation.report import AS_IT_IS, Report
 from mipmap_plugin.adaptation.start import candidates
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.adaptation.target.base_images import BaseImages
@@ -337,7 +337,7 @@ def test_a_level_that_is_the_base_again_is_left_out(tmp_path, monkeypatch, capsy
     [("merged splats", 9, None), ("merged splats", 10, None), ("step 3", 11, MORE_SPLATS), (f"{AS_IT_IS}: 30 dB", 9, NOT_BETTER)],
 )
 def test_a_coarser_level_has_no_more_splats_than_a_finer_one(returned, splats, reason):
-    level = SimpleNamespace(adapted=SimpleNamespace(report=SimpleNamespace(returned=returned)), splats=splats)
+    level = SimpleNamespace(adapted=SimpleNamespace(report=Report.model_construct(returned=returned, validation={})), splats=splats)
     assert _no_use(level, SimpleNamespace(splats=10)) == reason
 
 

@@ -8,6 +8,7 @@ import torch
 
 from mipmap_plugin.adaptation.optimization.validation import Quality, Validation
 from mipmap_plugin.adaptation.parallel import VIEWS_AT_ONCE
+from mipmap_plugin.adaptation.report import AS_IT_IS, UNCHANGED, Report
 from mipmap_plugin.adaptation.start import candidates as start
 from mipmap_plugin.adaptation.start import compilation
 from mipmap_plugin.adaptation.start.blend_weights import blend_weights
@@ -35,6 +36,17 @@ def start_of(report) -> str:
 
 def test_the_closed_form_is_where_a_run_starts():
     assert start_of(adapted().report) == "the closed form"
+
+
+@pytest.mark.parametrize(("psnr", "told"), [(30.0, "holds the base as it is, for nothing was better: 30.00 dB"), (31.0, "30.00 -> 31.00 dB")])
+def test_a_start_with_which_nothing_was_done_to_the_base_is_told_as_the_base(psnr, told):
+    report = Report.model_construct(returned=UNCHANGED, validation={AS_IT_IS: 30.0, UNCHANGED: psnr})
+    assert report.gain() == f"{told} on views that nothing was adapted to"
+
+
+def test_a_start_with_which_nothing_was_done_to_the_base_has_its_name():
+    [unchanged] = {UNCHANGED} & adapted(closed_form=False).report.validation.keys()
+    assert unchanged == UNCHANGED
 
 
 @pytest.mark.parametrize("steps", [0, 2])

@@ -24,6 +24,7 @@ from mipmap_plugin.backends.reference import ReferenceBackend
 from mipmap_plugin.cli import main
 from mipmap_plugin.effects import Effects
 from mipmap_plugin.errors import CheckpointError, JobsFailed, OutputExists, SceneError, SettingsError
+from mipmap_plugin.formats.magic import SPLAT_RECORD
 from mipmap_plugin.formats.ply import read_header, read_ply, write_ply
 from mipmap_plugin.formats.ply_rows import PlyRows, concatenate
 from mipmap_plugin.jobs.base import Base
@@ -45,7 +46,7 @@ from mipmap_plugin.tiles.layers import draw_layers
 from mipmap_plugin.tiles.pictures import Album, write_pictures
 from mipmap_plugin.tiles.report import make_report
 from mipmap_plugin.tiles.run import adapt_all_in_tiles, adapt_in_tiles
-from mipmap_plugin.tiles.scene import make_cut, opened
+from mipmap_plugin.tiles.scene import find_splats, make_cut, opened
 from mipmap_plugin.tiles.slabs import Painter
 from mipmap_plugin.tiles.splats import Splats
 from mipmap_plugin.tiles.start import StartSearch
@@ -626,6 +627,14 @@ def test_requests_that_no_tiles_serve(job, changes, tiles, reason):
     with pytest.raises(SettingsError, match=reason):
         adapt_in_tiles(replace(job, **changes), tiles)
     assert not work_folder(job.target).exists()
+
+
+def test_files_of_the_web_are_converted_before_they_are_cut(tmp_path):
+    rows = np.zeros(9, SPLAT_RECORD)
+    rows["scale"] = 0.1
+    rows.tofile(tmp_path / "my room.splat")
+    with pytest.raises(SettingsError, match=r"convert it first \(splat-transform 'my room.splat' 'my room_plain.ply'\), or leave --tiles out"):
+        find_splats(tmp_path / "my room.splat")
 
 
 def test_anchors_cannot_be_cut(tmp_path, job):

@@ -18,6 +18,9 @@ from mipmap_plugin.scenes.trajectories import Orbit
 # The name of the base among a run's states.
 AS_IT_IS = "the base as it is"
 
+# The name of a start with which nothing was done to the base.
+UNCHANGED = "the start, the base"
+
 
 class Report(BaseModel):
     """Everything needed to assess an adapted model, or to make it again.
@@ -86,12 +89,17 @@ class Report(BaseModel):
             return self.written
         return next((psnr for state, psnr in self.validation.items() if self.returned.startswith(state)), None)
 
+    def holds_base(self) -> bool:
+        """Whether the file holds the base as it is, also where it is called a start with which nothing was done to it."""
+        unchanged = UNCHANGED in self.validation and self.validation[UNCHANGED] == self.psnr_before()
+        return self.returned.startswith((AS_IT_IS, UNCHANGED) if unchanged else AS_IT_IS)
+
     def gain(self) -> str:
         """The PSNR before and after in a sentence, as far as it was measured."""
         before, after = self.psnr_before(), self.psnr_after()
         if before is None or after is None:
             return f"holds {self.returned}"
-        if self.returned.startswith(AS_IT_IS):
+        if self.holds_base():
             return f"holds {AS_IT_IS}, for nothing was better: {after:.2f} dB on views that nothing was adapted to"
         return f"{before:.2f} -> {after:.2f} dB on views that nothing was adapted to"
 

@@ -39,6 +39,7 @@ def evaluate(
     steps: int | None = None,
     upsampler: str | None = None,
     appearance: Literal["mean", "upstream"] = "mean",
+    cameras: tuple[Path, ...] = (),
     background: Background = None,
     screen_filter: ScreenFilter = None,
     backend: BackendName = "auto",
@@ -52,7 +53,7 @@ def evaluate(
     """Evaluate checkpoints against real images: as they are, with training-free filters, resized, and adapted.
 
     Args:
-        checkpoint: A PLY or a model folder with its cameras, which define the base scale. Required; the results of several are also averaged.
+        checkpoint: A PLY or a model folder; its cameras, or those given, define the base scale. Required; the results of several are also averaged.
         images: Folder of the scene (transforms_*.json or COLMAP's sparse/0, and the images), one for each checkpoint.
         scale: Target focal length over base focal length, such as 1/4 or 4; 1 is the base itself. Required; may be given several times.
         recipe: Also adapt: default, thorough (more steps and views), instant (closed form only), paper (published method), or a registered one.
@@ -64,18 +65,20 @@ def evaluate(
         steps: Maximum number of optimizer steps, instead of the recipe's; a recipe without steps takes none.
         upsampler: What makes base images larger: a registered name, or the file of a network.
         appearance: Appearance of test views, if training views have their own: mean of these, or upstream (of the view with the same number).
+        cameras: Cameras of the base scale, one scene or cameras.json for each checkpoint, if there are none beside it, as of lone files; may be
+            the folder of the images, if it was trained on these at their size.
         output: Also write the rows, and notes on missing ones, as JSON to this file.
         report: Write a page that shows it all: beside `output`, or else NAME.evaluation.html in this folder, numbered if there is one already.
         overwrite: Replace files that exist.
         json: Print JSON instead of a table.
     """
     page = evaluation_page_path(checkpoint[0], output) if report else None
-    _refuse(checkpoint, images, [path for path in (output, page) if path], overwrite)
+    _refuse(checkpoint, images, cameras, [path for path in (output, page) if path], overwrite)
     settings = without_none(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with results.resumable():
-        for path, folder in zip(checkpoint, images, strict=True):
-            wrapped, photographs = wrap(Base(path, None, background, backend, screen_filter), threads), _scene(folder, appearance)
+        for path, folder, own in zip(checkpoint, images, cameras or [None] * len(checkpoint), strict=True):
+            wrapped, photographs = wrap(Base(path, own, background, backend, screen_filter), threads), _scene(folder, appearance)
             results.measure(wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, output, overwrite)
     print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)
@@ -151,9 +154,11 @@ def _scene(folder: Path, appearance: str) -> Scene:
     return read.numbered_as_upstream() if appearance == "upstream" else read
 
 
-def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
-    if len(checkpoint) != len(images):
-        raise SettingsError(f"give one --images DIR for each checkpoint: --images is given {len(images)} times, for {len(checkpoint)} of these")
+def _refuse(checkpoint: Sequence[Path], images: Sequence[Path], cameras: Sequence[Path], outputs: Sequence[Path], overwrite: bool) -> None:
+    for option, given in {"--images DIR": images, "--cameras PATH": cameras or checkpoint}.items():
+        if len(checkpoint) != len(given):
+            name, times = option.split()[0], f"is given {len(given)} times, for {len(checkpoint)} of these"
+            raise SettingsError(f"give one {option} for each checkpoint: {name} {times}")
     if len(set(outputs)) < len(outputs):
         raise SettingsError(f"{outputs[0]}: the page is written there; give the rows another name, such as {outputs[0].with_suffix('.json')}")
     read = [part for path in checkpoint for part in _parts(path)] + [file for folder in images for file in folder.glob("transforms*.json")]

@@ -179,7 +179,7 @@ def evaluator_of(
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
     scene = model.place(scene)
     if not model.cameras:
-        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
+        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder, or its cameras (--cameras)")
     views = test_views(scene, model.cameras, model.background)
     return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
 

@@ -74,7 +74,7 @@ def kind_of(path: Path) -> str:
     size = path.stat().st_size
     if head.startswith(b"\x00\x01\x00\x00") and size >= 5120 and int.from_bytes(head[20:22], "little") <= 2:
         return "ksplat"
-    return "splat" if _plausible_splat(head, size) else "unknown"
+    return "splat" if _plausible_splat(head, size, path.suffix.lower() == ".splat") else "unknown"
 
 
 def pickle_of(path: Path) -> bytes:
@@ -131,11 +131,17 @@ def _kind_of_zip(path: Path) -> str:
     return "sog" if "meta.json" in leaves and any(leaf.endswith(".webp") for leaf in leaves) else "zip"
 
 
-def _plausible_splat(head: bytes, size: int) -> bool:
-    """Whether the file consists of complete records with values that are plausible for splats."""
+def _plausible_splat(head: bytes, size: int, named: bool) -> bool:
+    """Whether the file consists of complete records with values that are plausible for splats.
+
+    `named`: it is called .splat. Then quaternions may be of any length, as converters of point clouds write them, whose round splats look
+    alike however they are turned, and sizes may be 0.
+    """
     if size % SPLAT_RECORD.itemsize:
         return False
     rows = np.frombuffer(head[: len(head) // SPLAT_RECORD.itemsize * SPLAT_RECORD.itemsize], SPLAT_RECORD)
-    length = np.linalg.norm(rows["quat"].astype(np.float32) / 128 - 1, axis=1)
     scale = rows["scale"]
-    return bool(np.isfinite(rows["position"]).all() and (scale > 0).all() and (scale < 1e6).all() and ((length > 0.5) & (length < 1.8)).all())
+    if not (np.isfinite(rows["position"]).all() and (scale >= 0).all() and (scale < 1e6).all()):
+        return False
+    length = np.linalg.norm(rows["quat"].astype(np.float32) / 128 - 1, axis=1)
+    return named or bool((scale > 0).all() and ((length > 0.5) & (length < 1.8)).all())

@@ -12,7 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 
 from mipmap_plugin.adaptation.adapted import Adapted
-from mipmap_plugin.adaptation.report import AS_IT_IS
 from mipmap_plugin.adaptation.start.problem import FinerLevel
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.frozen_base import FrozenBase
@@ -128,7 +127,7 @@ class _Work:
 
 def _no_use(level: Level, finer: Level) -> str | None:
     """Why a level is no use below a finer one, whose splats cost a viewer no more; None if it is."""
-    if level.adapted.report.returned.startswith(AS_IT_IS):
+    if level.adapted.report.holds_base():
         return NOT_BETTER
     return MORE_SPLATS if level.splats > finer.splats else None
 

@@ -24,7 +24,7 @@ CHUNK = 8192
 
 POSITION = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")  # always 0 in 3DGS, and never drawn
-GRUT_NORMAL = (0, 0, 1)  # that nv-tlabs/3dgrut writes for every splat
+GRUT_NORMAL = (0, 0, 1)  # that nv-tlabs/3dgrut writes for every splat, and scier/MetalSplatter
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALE = ("scale_0", "scale_1", "scale_2")
 QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -95,7 +95,7 @@ def notes_on(extras: Mapping[str, np.ndarray]) -> list[str]:
     notes = [f"extra columns are carried along: {', '.join(names)}"] if names else []
     if all(name in extras and (extras[name] == value).all() for name, value in zip(NORMAL, GRUT_NORMAL, strict=True)):
         kernel = "whose particles are Gaussians only of degree 2, which is not its default"
-        notes.append(f"its normals are those that 3DGRUT writes: if it was trained with 3DGRT, {kernel}, it is drawn otherwise here")
+        notes.append(f"its normals are those that 3DGRUT and MetalSplatter write: if it was trained with 3DGRT, {kernel}, it is drawn otherwise here")
     return notes
 
 

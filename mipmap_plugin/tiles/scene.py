@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import warnings
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -66,6 +67,10 @@ def find_splats(path: Path) -> tuple[Checkpoint, type[VanillaModel]]:
     """The checkpoint at `path`, and what reads its columns. Raises CheckpointError; SettingsError for a family that cannot be cut."""
     checkpoint = detect(path)
     kind = KINDS.get(checkpoint.family)
+    if checkpoint.family == "exchange":
+        plain = checkpoint.path.with_name(checkpoint.path.name.split(".")[0] + "_plain.ply").name
+        remedy = f"convert it first (splat-transform {shlex.join([checkpoint.path.name, plain])}), or leave --tiles out"
+        raise SettingsError(f"{checkpoint.path}: only a plain PLY is cut into tiles; {remedy}")
     if kind is None or checkpoint.path.suffix.lower() != ".ply":
         raise SettingsError(
             f"{checkpoint.path}: a checkpoint of {checkpoint.family} cannot be cut into tiles, only the PLY of 3DGS or 2DGS, whose splats are"

@@ -24,7 +24,8 @@ class Photographs:
     def __init__(self, scene: Scene, base: Sequence[Camera], background: tuple[float, float, float]) -> None:
         """`base`: the cameras of the base. Raises SettingsError if it has none, and for a scene without training images."""
         if not base:
-            raise SettingsError("the checkpoint has no cameras, so that the scale of the images is not known; give its model folder")
+            remedy = "give its model folder, or its cameras (--cameras)"
+            raise SettingsError(f"the checkpoint has no cameras, so that the scale of the images is not known; {remedy}")
         self._scene, self._background = scene, background
         originals = [camera for camera in scene.split("train") if camera in scene.images]
         self._originals = dict(zip(at_density_of(originals, base), originals, strict=True))
