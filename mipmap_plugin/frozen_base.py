@@ -25,12 +25,12 @@ from mipmap_plugin.backends import choose_backend
 from mipmap_plugin.backends.base import Backend, Needs, Rendered
 from mipmap_plugin.camera import ONE_PIXEL, Camera, checked, digest_of, of_base_scale
 from mipmap_plugin.config import AdaptConfig
-from mipmap_plugin.effects import Effects
+from mipmap_plugin.effects import Effects, as_outputs
 from mipmap_plugin.errors import BackendUnavailable, SettingsError
 from mipmap_plugin.formats.atomic import named, refuse_output, refuse_unwritable
 from mipmap_plugin.formats.splat_transform import refuse_unread
 from mipmap_plugin.gaussians import Gaussians
-from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale
+from mipmap_plugin.limits import check_image, check_kinds, check_names, check_scale, path_of
 from mipmap_plugin.models.base import Filtered, SplatModel, TrainedScale, checked_splats, why_no_viewer
 from mipmap_plugin.models.mip import filter_3d_of, smooth_3d
 from mipmap_plugin.models.outputs import parts_of
@@ -131,16 +131,14 @@ class FrozenBase:
         `screen_filter`: as in `effects`. `supersampling`: samples per pixel along each axis. `options`: see `RenderOptions`. Raises
         SettingsError.
         """
-        [camera], outputs = checked([camera]), options.get("outputs") or ()
-        if isinstance(outputs, str):
-            raise SettingsError(f"outputs must be a sequence of names, such as [{outputs!r}], got {outputs!r}")
-        check_names("render", options, RenderOptions)
+        [camera], outputs = checked([camera]), as_outputs(options.get("outputs") or ())
+        check_names("render", options, RenderOptions, ("scale", "screen_filter", "supersampling"))
         viewer, exposure = options.get("viewer"), options.get("exposure", False)
         scale = check_scale(scale)
         if not isinstance(supersampling, SupportsIndex) or supersampling < 1:
             raise SettingsError(f"supersampling: must be at least 1 sample per pixel along each axis, got {supersampling!r}")
         check_image(camera.width * supersampling, camera.height * supersampling, self.model.parameters()["means"].device)
-        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=tuple(outputs), exposure=exposure)
+        effects = replace(self.effects(scale, screen_filter, supersampling, viewer), outputs=outputs, exposure=exposure)
         backend, _ = self.backend(screen_filter=screen_filter, viewer=viewer)
         form = self._smoothed if options.get("filter_3d") else None
         with threads.limited(self.threads, shared=False) if self.threads is not None else nullcontext():
@@ -183,7 +181,8 @@ class FrozenBase:
         float32, and torch may have one thread, in the whole process: torch has one of each. Raises SettingsError and BackendUnavailable.
         """
         scale, cameras = check_scale(scale), None if cameras is None else of_base_scale(cameras, some=True)
-        check_kinds(images=(images, Scene), start=(start, FinerLevel), resume=(resume, str | Path), observe=(observe, Callable))
+        check_kinds(images=(images, Scene), start=(start, FinerLevel), observe=(observe, Callable))
+        state = None if resume is None else path_of(resume, "resume")
         model = self._fused if viewer is not None and self.model.traits.filtered else self.model
         settings = mergeable_settings(model, settings)
         if images is not None and self.model.traits.exposures.changed:
@@ -207,7 +206,7 @@ class FrozenBase:
         family, theirs = f"family {model.family!r}", {f"backend {backend.name!r}": getattr(backend, "theirs", backend)}
         alone = threads.limited_for(backend, self.threads)
         with alone, torch.enable_grad(), naming_any({family: model, **theirs}), unchanged(family, model.parameters()):
-            stages = Stages(request, list(cameras), photographs, None if resume is None else Path(resume), observe)
+            stages = Stages(request, list(cameras), photographs, state, observe)
             adapted = stages.adapt(scale, config, first)
         adapted.report.seconds["loading"] = self.loading_s
         adapted.report.cameras_from.update(self.cameras_from)

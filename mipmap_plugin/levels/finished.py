@@ -11,6 +11,7 @@ from mipmap_plugin.adaptation.adapted import Adapted
 from mipmap_plugin.levels.contents import Contents, Level
 from mipmap_plugin.levels.distance.manifest import Contents as DistanceContents
 from mipmap_plugin.levels.store import LevelStore
+from mipmap_plugin.limits import path_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +32,7 @@ class Ladder:
 
         `keep_resume`: leave what was kept to go on from until `forget`.
         """
-        saved = self._write(self.contents, Path(folder), overwrite)
+        saved = self._write(self.contents, path_of(folder), overwrite)
         if not keep_resume:
             self.forget()
         return saved

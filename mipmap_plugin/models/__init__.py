@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mipmap_plugin.errors import CheckpointError, MipmapPluginError, PluginError
+from mipmap_plugin.limits import path_of
 from mipmap_plugin.models.detect import Checkpoint, detect
 from mipmap_plugin.models.families import BUILT_IN, FAMILIES, find_family, not_loaded
 from mipmap_plugin.models.family import API_VERSION, BY_COMPANIONS, CERTAIN, PLAIN, Family, Files, Match
@@ -51,7 +52,8 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
     third-party loader cannot be imported, fails, or returns an object that is not a model.
     """
     checkpoint = detect(path, iteration=iteration)
-    if (folder := opened(Path(path))) != Path(path):
+    path = path_of(path)
+    if (folder := opened(path)) != path:
         with told_of_archives():
             return load_model(folder, iteration=iteration)
     from mipmap_plugin.models.contract import lacking
