@@ -4,6 +4,7 @@ import errno
 import gc
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -408,6 +409,18 @@ def test_evaluate_and_tradeoff_tell_of_photographs_that_are_absent(run, model_fo
     assert note in page and "photographs, protocol P1, 1 view" not in page and "photographs, protocol P3, 1 view" in page
     code, out, err = run("tradeoff", *words, "--output", tmp_path / "out", "--no-picture", "--no-renderers", "--repeats", "1")
     assert code == 0 and f"mipmap-plugin: {scene}: {note}\n" in err and json.loads(out)["scales"][0]["notes"] == [note]
+
+
+def test_a_lone_file_is_judged_by_the_cameras_that_are_given(run, model_folder, tmp_path):
+    scene, cameras = tiny.scene(tmp_path / "scene"), model_folder / "cameras.json"
+    [file] = model_folder.glob("point_cloud/*/point_cloud.ply")
+    lone = shutil.copy(file, tmp_path / "lone.ply")
+    words = ["--images", scene, "--scale", "1/2", "--json"]
+    rows = [json.loads(run("evaluate", each, *words, *more)[1])["rows"] for each, more in ((model_folder, ()), (lone, ("--cameras", cameras)))]
+    assert [row["psnr_db"] for row in rows[0]] == [row["psnr_db"] for row in rows[1]]
+    words = ["--scale", "1/2", "--recipe", "instant", "--output", tmp_path / "out", "--no-picture", "--no-renderers", "--repeats", "1"]
+    assert run("tradeoff", lone, "--images", scene, "--cameras", cameras, *words)[0] == 0
+    refused(run("evaluate", lone, lone, "--images", scene, scene, "--scale", "1", "--cameras", cameras), "--cameras are those of one checkpoint")
 
 
 def test_evaluate_averages_several_scenes_and_prints_the_published_rows(run, model_folder, tmp_path):

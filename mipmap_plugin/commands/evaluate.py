@@ -14,7 +14,7 @@ import tyro
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.pages import evaluation_gallery, evaluation_page_path, look_at, write_evaluation_page
 from mipmap_plugin.commands.resuming import resumable, resume_path
-from mipmap_plugin.commands.types import BackendName, Background, Scales, ScreenFilter, Seed, Threads, unique_scales
+from mipmap_plugin.commands.types import BackendName, Background, Cameras, Scales, ScreenFilter, Seed, Threads, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.errors import SettingsError
 from mipmap_plugin.formats.atomic import refuse_output, refuse_unwritable, write_json
@@ -39,6 +39,7 @@ def evaluate(
     steps: int | None = None,
     upsampler: str | None = None,
     appearance: Literal["mean", "upstream"] = "mean",
+    cameras: Cameras = None,
     background: Background = None,
     screen_filter: ScreenFilter = None,
     backend: BackendName = "auto",
@@ -69,13 +70,15 @@ def evaluate(
         overwrite: Replace files that exist.
         json: Print JSON instead of a table.
     """
+    if cameras is not None and len(checkpoint) > 1:
+        raise SettingsError(f"--cameras are those of one checkpoint, but {len(checkpoint)} are given; evaluate them one by one")
     page = evaluation_page_path(checkpoint[0], output) if report else None
     _refuse(checkpoint, images, [path for path in (output, page) if path], overwrite)
     settings = without_none(seed=seed, steps=steps, upsampler=upsampler, viewer=viewer)
     results = _Results(protocol, _perceptual(lpips, lpips_weights), unique_scales(scale), page, output)
     with results.resumable():
         for path, folder in zip(checkpoint, images, strict=True):
-            wrapped, photographs = wrap(Base(path, None, background, backend, screen_filter), threads), _scene(folder, appearance)
+            wrapped, photographs = wrap(Base(path, cameras, background, backend, screen_filter), threads), _scene(folder, appearance)
             results.measure(wrapped, photographs, appearance, recipe, settings)
     facts = results.write(checkpoint, output, overwrite)
     print_facts(facts, json) if json else results.print_tables(_title(checkpoint, images, protocol, results.judged), published)

@@ -12,7 +12,7 @@ import tyro
 from mipmap_plugin.commands.common import print_facts, scene, without_none, wrap
 from mipmap_plugin.commands.pages import look_at, tradeoff_page_path, write_tradeoff_page
 from mipmap_plugin.commands.resuming import resumable
-from mipmap_plugin.commands.types import Background, Checkpoint, Scales, ScreenFilter, Up, unique_scales
+from mipmap_plugin.commands.types import Background, Cameras, Checkpoint, Scales, ScreenFilter, Up, unique_scales
 from mipmap_plugin.commands.voice import say
 from mipmap_plugin.jobs.base import Base
 from mipmap_plugin.recipes import recipe as make_config
@@ -36,6 +36,7 @@ def tradeoff(
     renderers: bool = True,
     repeats: int = 3,
     views: int | None = None,
+    cameras: Cameras = None,
     up: Up = None,
     background: Background = None,
     screen_filter: ScreenFilter = None,
@@ -76,7 +77,7 @@ def tradeoff(
     refuse(output, picture, overwrite)
     page = tradeoff_page_path(output, overwrite) if report else None
     plan = Plan(recipe or ("default", "paper"), steps, backend or ("auto",), supersampling or (2, 4, 8), renderers, repeats, seed, viewer)
-    base = Base(checkpoint, None, background, screen_filter=screen_filter, up=up)
+    base = Base(checkpoint, cameras, background, screen_filter=screen_filter, up=up)
     model, photographs = wrap(base, threads), scene(images) if images else None
     _check(model, plan, scale)
     with resumable(output / KEPT, "cell"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -71,10 +72,9 @@ def _devices() -> list[str]:
 
 
 def check_table(rows: Sequence[Outcome]) -> str:
-    """A Markdown table of the outcomes of a conformance suite."""
-
-    def result(row: Outcome) -> str:
-        return "skipped: " + row.message if row.skipped else "pass" if row.passed else "FAIL: " + row.message
-
-    body = [[row.case, f"{row.max_error:.1e}", "yes" if row.finite else "NO", result(row)] for row in rows]
-    return markdown(["case", "max error", "finite", "result"], body)
+    """A Markdown table of the cases that were run, those that failed at its end, and how often each reason kept others from being run."""
+    ran = sorted((row for row in rows if not row.skipped), key=lambda row: not row.passed)
+    body = [[row.case, f"{row.max_error:.1e}", "yes" if row.finite else "NO", "pass" if row.passed else f"FAIL: {row.message}"] for row in ran]
+    reasons = Counter(reason for row in rows if row.skipped for reason in row.message.split("; "))
+    skipped = [f"skipped, {count} times: {reason}" for reason, count in reasons.most_common()]
+    return "\n".join([markdown(["case", "max error", "finite", "result"], body), *skipped])

@@ -179,7 +179,8 @@ def evaluator_of(
     """What compares a model with the photographs of its scene; `cells`: where finished rows are kept. Raises SettingsError."""
     scene = model.place(scene)
     if not model.cameras:
-        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
+        advice = "give its model folder, or the cameras of its training (--cameras)"
+        raise SettingsError(f"the checkpoint has no cameras, so its base scale is not known; {advice}")
     views = test_views(scene, model.cameras, model.background)
     return Evaluator(views, PROTOCOLS[protocol], perceptual, scene.source.name, cells=cells or Cells(), notes=scene.notes)
 

@@ -48,7 +48,8 @@ def photographs(model: Wrapped, scene: Scene, scale: float, most: int | None) ->
     """
     scene = model.place(scene)
     if not model.cameras:
-        raise SettingsError("the checkpoint has no cameras, so its base scale is not known; give its model folder")
+        advice = "give its model folder, or the cameras of its training (--cameras)"
+        raise SettingsError(f"the checkpoint has no cameras, so its base scale is not known; {advice}")
     judged: dict[Camera, TruthView] = {view.camera: view for view in test_views(scene, model.cameras, model.background)}
     train = [camera for camera in model.cameras if camera.split == "train"] or model.cameras
     views, adapt_on = list(judged), _others(train, list(judged))
