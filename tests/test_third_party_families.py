@@ -74,6 +74,24 @@ def test_an_adapted_file_keeps_the_suffix_by_which_its_family_knows_it(tmp_path,
     assert len(load_model(tmp_path / name).parameters()["means"])
 
 
+def test_an_archive_of_numpy_s_own_numbers_is_drawn_by_the_fast_backends(tmp_path):
+    register_model("npz", EXAMPLE["FAMILY"])
+    np.savez(tmp_path / "scene.npz", **{name: tensor.double().numpy() for name, tensor in tiny.model(40).parameters().items()})
+    assert {tensor.dtype for tensor in load_model(tmp_path / "scene.npz").parameters().values()} == {torch.float32}
+
+
+def test_a_family_that_loads_float64_is_told_what_draws_it(tmp_path):
+    class Doubles(VanillaModel):
+        family = "mine"
+
+    def doubles(path, iteration):
+        return Doubles.from_gaussians(tiny.gaussians(8).to(dtype=torch.float64))
+
+    register_model("mine", custom_family(load=doubles))
+    [note] = load_model(ply(tmp_path / "a.ply", "mine")).notes
+    assert note == "family 'mine' loads float64, which only the slow backend reference draws; its load should return float32"
+
+
 def test_a_numpy_archive_that_nobody_claims_is_told_to_be_one(tmp_path):
     with pytest.raises(CheckpointError, match=r"scene\.npz is a NumPy archive that no family knows; .* or register its family$"):
         detect(archive(tmp_path / "scene.npz"))

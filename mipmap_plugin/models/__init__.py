@@ -35,6 +35,9 @@ __all__ = [
     "register_model",
 ]  # fmt: skip
 
+# Of a float32, which all backends draw.
+BYTES = 4
+
 # Names from `base`, which is imported when one of them is first used.
 _OF_BASE = ("SplatModel", "TrainedScale", "Traits")
 
@@ -74,6 +77,8 @@ def load_model(path: str | Path, *, iteration: int | None = None) -> SplatModel:
         raise PluginError(f"family {family.name!r} loads {type(model).__name__}, which lacks {', '.join(missing)}; see mipmap_plugin.models.base")
     if is_third_party(model) and model.family != family.name:
         raise PluginError(f"family {family.name!r} loads {type(model).__name__}, whose `family` is {model.family!r}; set it to {family.name!r}")
+    if family not in BUILT_IN and any(tensor.element_size() > BYTES for tensor in model.parameters().values()):
+        model.notes.append(f"family {family.name!r} loads float64, which only the slow backend reference draws; its load should return float32")
     return model
 
 
